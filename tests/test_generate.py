@@ -1,0 +1,223 @@
+"""Datasets: resumable, the same bits for any number of workers, and never a file lost."""
+
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pyarrow.parquet as pq
+import pytest
+from conftest import ROOT, SMALL
+
+from vlcrender.dataset import problems_of
+from vlcrender.errors import InputError
+from vlcrender.generate import generate
+from vlcrender.recipe import Plan, load_plan
+
+RECIPE = ROOT / "datasets/quickstart.toml"
+
+
+def small_plan(*assignments: str) -> Plan:
+    return load_plan(RECIPE, [*SMALL, "poses.count=3", *assignments])
+
+
+def digests(directory: Path) -> dict[str, str]:
+    return {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(directory.glob("frames/*.exr"))}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("made") / "set"
+    assert generate(small_plan("expected=true"), directory)
+    return directory
+
+
+def test_a_dataset_is_complete_and_intact(made: Path) -> None:
+    assert problems_of(made) == []
+    assert not (made / "plan.json").exists()
+    assert not list(made.rglob("*.partial"))
+
+
+def test_the_same_recipe_gives_the_same_bytes(made: Path, tmp_path: Path) -> None:
+    generate(small_plan("expected=true"), tmp_path / "again")
+    assert digests(tmp_path / "again") == digests(made)
+    assert len(digests(made)) == 3
+
+
+def test_two_workers_give_the_same_bytes_as_one(made: Path, tmp_path: Path) -> None:
+    generate(small_plan("expected=true"), tmp_path / "pool", workers=2)
+    assert digests(tmp_path / "pool") == digests(made)
+    for table in ("frames.parquet", "truth.parquet"):
+        assert pq.read_table(tmp_path / "pool" / table).equals(pq.read_table(made / table))
+
+
+def test_a_longer_set_with_other_noise_shares_no_frame(made: Path, tmp_path: Path) -> None:
+    generate(small_plan("seed=2017"), tmp_path / "other")
+    assert not set(digests(tmp_path / "other").values()) & set(digests(made).values())
+
+
+class Crash(Exception):
+    pass
+
+
+def test_an_interrupted_run_goes_on_where_it_stopped(made: Path, tmp_path: Path) -> None:
+    directory = tmp_path / "set"
+
+    def crash_after_two(done: int, total: int) -> None:
+        if done == 2:
+            raise Crash
+
+    with pytest.raises(Crash):
+        generate(small_plan("expected=true"), directory, progress=crash_after_two)
+    assert not (directory / "dataset.json").exists()
+    # what a crash can leave: a cut journal line, a half-written file, a finished file damaged later
+    with (directory / "journal.jsonl").open("a") as journal:
+        journal.write('{"frame": 2, "dev')
+    (directory / "frames/000002.partial").write_bytes(b"half")
+    damaged = directory / "frames/000000.exr"
+    damaged.write_bytes(damaged.read_bytes()[:-100])
+    kept = (directory / "frames/000001.exr").stat().st_mtime_ns
+    counts: list[int] = []
+    assert generate(small_plan("expected=true"), directory, progress=lambda done, total: counts.append(done))
+    assert counts[0] == 1, "only the intact frame counts as done"
+    assert (directory / "frames/000001.exr").stat().st_mtime_ns == kept, "a finished frame is not made twice"
+    assert digests(directory) == digests(made)
+    assert problems_of(directory) == []
+
+
+def test_a_finished_set_is_left_alone(made: Path) -> None:
+    before = {p: p.stat().st_mtime_ns for p in made.rglob("*")}
+    assert generate(small_plan("expected=true"), made) is False
+    assert {p: p.stat().st_mtime_ns for p in made.rglob("*")} == before
+
+
+@pytest.mark.parametrize("state", ["another recipe", "unfinished other", "foreign files", "a file", "damaged"])
+def test_nothing_that_is_not_ours_is_overwritten(made: Path, tmp_path: Path, state: str) -> None:
+    directory = tmp_path / "set"
+    plan = small_plan("expected=true")
+    if state == "foreign files":
+        directory.mkdir()
+        (directory / "thesis.txt").write_text("years of work")
+    elif state == "a file":
+        directory.write_text("years of work")
+    elif state == "unfinished other":
+        directory.mkdir()
+        (directory / "plan.json").write_text('{"provenance": {}}')
+    else:
+        directory.mkdir()
+        for path in made.rglob("*"):
+            target = directory / path.relative_to(made)
+            target.mkdir(exist_ok=True) if path.is_dir() else target.write_bytes(path.read_bytes())
+        if state == "damaged":
+            (directory / "frames/000001.exr").write_bytes(b"x")
+        else:
+            plan = small_plan("expected=true", "seed=1")
+    before = {p: p.read_bytes() for p in [directory, *directory.rglob("*")] if p.is_file()}
+    with pytest.raises(InputError, match="choose another --out") as refusal:
+        generate(plan, directory)
+    assert "\n" not in str(refusal.value)
+    assert {p: p.read_bytes() for p in [directory, *directory.rglob("*")] if p.is_file()} == before
+
+
+def test_impossible_poses_are_said_before_the_first_frame(tmp_path: Path) -> None:
+    plan = load_plan(RECIPE, [*SMALL, "poses.min_leds=500"])
+    with pytest.raises(InputError, match=r"frame 0: no position .* 500 LEDs"):
+        generate(plan, tmp_path / "never")
+    assert not (tmp_path / "never").exists()
+
+
+def test_the_header_says_nothing_of_the_true_pose(made: Path) -> None:
+    with OpenEXR.File(str(made / "frames/000000.exr")) as file:
+        header = dict(file.header())  # gone once the file is closed
+    known = {
+        *("channels", "compression", "dataWindow", "displayWindow", "lineOrder", "pixelAspectRatio", "type"),
+        *("screenWindowCenter", "screenWindowWidth", "expTime", "aperture", "nominalFocalLength"),
+        *("sensorPhotositePitch", "sensorOverallDimensions", "vlcrender:frame", "vlcrender:camera"),
+    }
+    assert set(header) <= known
+    assert header["expTime"] == np.float32(1.6e-6)
+    assert header["aperture"] == np.float32(2.2)
+    assert header["nominalFocalLength"] == 18.0
+    assert header["sensorPhotositePitch"] == 12.0
+    assert np.allclose(header["sensorOverallDimensions"], [4.8, 3.6])
+
+
+def test_frames_are_poisson_draws_of_the_expected_images(made: Path) -> None:
+    """At 1 e/DN: z = (dn - expected) / sqrt(expected) has mean 0 and variance 1."""
+    dataset = json.loads((made / "dataset.json").read_text())
+    assert dataset["sensor"]["gain_e_per_dn"] == 1.0
+    for index in range(3):
+        with OpenEXR.File(str(made / f"frames/{index:06d}.exr"), separate_channels=True) as file:
+            dn = file.channels()["Y"].pixels
+        with OpenEXR.File(str(made / f"expected/{index:06d}.exr"), separate_channels=True) as file:
+            expected = file.channels()["Y"].pixels.astype(float)
+        assert dn.dtype == np.uint32
+        # the largest number is 4095: what comes within 6 sigma of it is biased by clipping
+        assert expected.max() < 4095 - 6 * np.sqrt(4095)
+        z = (dn - expected) / np.sqrt(expected)
+        assert abs(z.mean()) < 5 / np.sqrt(z.size)
+        # Var(z^2) = 2 + 1/mu for Poisson
+        assert abs((z**2).mean() - 1) < 5 * np.sqrt((2 + 1 / expected).mean() / z.size)
+
+
+def test_every_frame_sees_four_leds_and_its_tilts_fill_the_range(made: Path) -> None:
+    truth = pq.read_table(made / "truth.parquet").to_pylist()
+    for row in truth:
+        assert sum(led["visible_fraction"] == 1 for led in row["leds"]) >= 4
+    for axis in ("tilt_x_deg", "tilt_y_deg"):
+        strata = sorted(int(row[axis] // 20) for row in truth)  # three frames, 0 to 60 deg
+        assert strata == [0, 1, 2]
+
+
+def test_the_accelerometer_reads_gravity_in_camera_axes(made: Path) -> None:
+    frames = pq.read_table(made / "frames.parquet").to_pylist()
+    truth = pq.read_table(made / "truth.parquet").to_pylist()
+    for device, row in zip(frames, truth, strict=True):
+        up = np.array(row["R_cam_world"]).reshape(3, 3)[:, 2]
+        reading = np.array(device["accelerometer_m_s2"])
+        assert np.linalg.norm(reading) == pytest.approx(9.80665)
+        angle = np.degrees(np.arccos(np.clip(reading @ up / 9.80665, -1, 1)))
+        # two tilt errors of 0.1 deg: the angle is below their root sum of squares, 5 sigma of each
+        assert angle < 5 * 0.1 * np.sqrt(2)
+        assert angle > 0
+
+
+DAMAGES = {
+    "frame missing": lambda d: (d / "frames/000001.exr").unlink(),
+    "frame cut": lambda d: (d / "frames/000001.exr").write_bytes((d / "frames/000001.exr").read_bytes()[:1000]),
+    "frame changed": lambda d: (d / "frames/000001.exr").write_bytes(
+        (d / "frames/000001.exr").read_bytes()[:-1] + b"\0\1"
+    ),
+    "truth missing": lambda d: (d / "truth.parquet").unlink(),
+    "truth is not parquet": lambda d: (d / "truth.parquet").write_bytes(b"PAR1 no"),
+    "frames short": lambda d: pq.write_table(pq.read_table(d / "frames.parquet").slice(0, 2), d / "frames.parquet"),
+    "column gone": lambda d: pq.write_table(
+        pq.read_table(d / "frames.parquet").drop_columns(["exposure_s"]), d / "frames.parquet"
+    ),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_verify_finds(made: Path, tmp_path: Path, damage: str) -> None:
+    directory = tmp_path / "set"
+    for path in [made, *made.rglob("*")]:
+        target = directory / path.relative_to(made)
+        target.mkdir(exist_ok=True) if path.is_dir() else target.write_bytes(path.read_bytes())
+    assert problems_of(directory) == []
+    DAMAGES[damage](directory)
+    found = problems_of(directory)
+    assert found, damage
+    assert all("\n" not in line for line in found)
+
+
+def test_verify_finds_a_truth_that_is_another_pose(made: Path, tmp_path: Path) -> None:
+    directory = tmp_path / "set"
+    for path in [made, *made.rglob("*")]:
+        target = directory / path.relative_to(made)
+        target.mkdir(exist_ok=True) if path.is_dir() else target.write_bytes(path.read_bytes())
+    table = pq.read_table(directory / "truth.parquet")
+    rows = table.to_pylist()
+    rows[1]["position_m"][0] += 1e-4
+    pq.write_table(table.from_pylist(rows, schema=table.schema), directory / "truth.parquet")
+    assert any("frame 1" in line and "not where the pose puts it" in line for line in problems_of(directory))

@@ -1,0 +1,166 @@
+"""Rendered images: signs, closed-form brightness, agreement with Mitsuba's own integrator, determinism."""
+
+import numpy as np
+import pytest
+
+from vlcrender.camera import Camera, Pose, project
+from vlcrender.errors import InputError
+from vlcrender.photometry import Silicon, electron_rate_per_cd_m2
+from vlcrender.reference import reference_cd_m2
+from vlcrender.render import Renderer, View
+from vlcrender.scene import Scene
+
+
+@pytest.fixture(scope="module")
+def renderer(table1: Scene) -> Renderer:
+    return Renderer(table1)
+
+
+@pytest.fixture(scope="module")
+def office_renderer(office: Scene) -> Renderer:
+    return Renderer(office)
+
+
+def centroid(view: View, led_id: int) -> np.ndarray:
+    """(u, v) of the light of one LED in the image."""
+    patch = next(p for p in view.patches if p.led_id == led_id)
+    rows, columns = patch.electrons_per_s.shape
+    weight = patch.electrons_per_s.sum(dtype=float)
+    u = (patch.electrons_per_s.sum(axis=0) * (patch.column + 0.5 + np.arange(columns))).sum() / weight
+    v = (patch.electrons_per_s.sum(axis=1) * (patch.row + 0.5 + np.arange(rows))).sum() / weight
+    return np.array([u, v])
+
+
+LED_2 = (0.3, 1.9)
+"""LED 2 of Table 1, alone enough that neighbours do not matter."""
+
+
+@pytest.mark.parametrize(
+    ("pose", "direction"),
+    [
+        (Pose((LED_2[0] - 0.05, LED_2[1], 0.5)), (1, 0)),  # LED towards +x of the camera: +u
+        (Pose((LED_2[0], LED_2[1] - 0.05, 0.5)), (0, 1)),  # towards +y: +v
+        (Pose((*LED_2, 0.5), tilt_x_deg=1.0), (0, 1)),  # tilt_x raised: +v
+        (Pose((*LED_2, 0.5), tilt_y_deg=1.0), (-1, 0)),  # tilt_y raised: -u
+    ],
+    ids=["x", "y", "tilt_x", "tilt_y"],
+)
+def test_the_bright_spot_moves_the_written_way(
+    renderer: Renderer, small_camera: Camera, pose: Pose, direction: tuple[int, int]
+) -> None:
+    image = renderer.view(small_camera, pose).expected_electrons(1e-4)
+    row, column = np.unravel_index(np.argmax(image), image.shape)
+    shift = np.array([column + 0.5 - 200, row + 0.5 - 150])
+    assert shift @ direction > 10
+    assert abs(shift @ (direction[1], direction[0])) < 10
+
+
+def test_the_background_moves_with_the_spots(office_renderer: Renderer, small_camera: Camera) -> None:
+    """The rays cast for the surfaces and the projection of the LEDs agree: a panel's corner is where it projects."""
+    pose = Pose((3.15, 3.1, 1.0), tilt_x_deg=-4.0, tilt_y_deg=3.0, yaw_deg=20.0)
+    image = office_renderer.background_cd_m2(small_camera, pose)
+    inverse = np.linalg.inv(small_camera.matrix)
+    panel = next(s for s in office_renderer.scene.surfaces if s.name == "panel 24 underside")
+    corners, _ = project(
+        small_camera,
+        pose,
+        np.stack([panel.corner_m + a * panel.edge_u_m + b * panel.edge_v_m for a in (0, 1) for b in (0, 1)]),
+    )
+    inside = [c for c in corners if 5 < c[0] < 395 and 5 < c[1] < 295]
+    assert inside, "choose another pose: no corner in view"
+    middle = corners.mean(axis=0)
+    for corner in inside:
+        outward = (corner - middle) / np.linalg.norm(corner - middle)
+        values = []
+        for pixel in (corner - 2.5 * outward, corner + 2.5 * outward):
+            x, y, _ = inverse @ [*pixel, 1]
+            values.append(image[int(pixel[1]), int(pixel[0])] * (1 + x * x + y * y) ** 2)
+        assert values[0] == pytest.approx(0.7 * 400 / np.pi, rel=1e-3)  # the panel: rho E / pi
+        assert values[1] != pytest.approx(0.7 * 400 / np.pi, rel=1e-2)  # ceiling or the panel's side
+
+
+def test_a_filled_pixel_holds_the_leds_luminance(renderer: Renderer) -> None:
+    camera = Camera()
+    view = renderer.view(camera, Pose((*LED_2, 0.5)))
+    expected = view.expected_electrons(2.5e-4)
+    per_cd = 2.5e-4 * electron_rate_per_cd_m2(camera, "LED-B3", Silicon())
+    # 8000 cd/m2 of its own and 0.5 * 400 / pi reflected, on the axis. float32: 24 bits.
+    assert expected[1500, 2000] == pytest.approx(per_cd * (8000 + 0.5 * 400 / np.pi), rel=1e-5)
+
+
+def test_the_ceiling_dims_with_cos4_towards_the_corner(renderer: Renderer) -> None:
+    camera = Camera()
+    image = renderer.background_cd_m2(camera, Pose((3.5, 3.5, 0.5)))
+    tan2 = ((1999.5) ** 2 + (1499.5) ** 2) / 15000**2
+    assert image[0, 0] == pytest.approx(0.8 * 400 / np.pi / (1 + tan2) ** 2, rel=1e-5)
+    assert image[1500, 2000] == pytest.approx(0.8 * 400 / np.pi, rel=1e-5)
+
+
+def test_centroid_of_a_level_led_is_its_projection(renderer: Renderer) -> None:
+    camera = Camera()
+    pose = Pose((0.35, 1.8, 0.5))
+    view = renderer.view(camera, pose)
+    expected, _ = project(camera, pose, np.array([0.3, 1.9, 3.5]))
+    # cos^4 tilts the disc's brightness: d(cos^4)/du * r^2/4 = 4 * 500/15000^2 * 60^2/4 = 0.008 px at 500 px off axis
+    assert np.abs(centroid(view, 2) - expected).max() < 0.01
+
+
+VIEWS = [
+    (
+        Camera(width_px=200, height_px=150, pixel_pitch_um=24.0, principal_point_px=(90.0, 80.0)),
+        Pose((3.5, 3.2, 0.5), 5, 10, 30),
+    ),
+    (Camera(width_px=200, height_px=150, pixel_pitch_um=24.0), Pose((1.0, 3.0, 1.2), 40, -30, 170)),
+    (Camera(width_px=160, height_px=120, pixel_pitch_um=100.0), Pose((1.3, 1.3, 1.2), 25, -20, 0)),
+]
+
+
+@pytest.mark.parametrize(("camera", "pose"), VIEWS, ids=["off centre", "tilted", "wide, with walls"])
+def test_agrees_with_mitsubas_own_integrator(office_renderer: Renderer, camera: Camera, pose: Pose) -> None:
+    reference, variance = reference_cd_m2(office_renderer.scene, camera, pose, samples_per_pixel=256)
+    rate = electron_rate_per_cd_m2(camera, "LED-B3", Silicon())
+    u, v = np.meshgrid(np.arange(camera.width_px) + 0.5, np.arange(camera.height_px) + 0.5)
+    x, y, _ = np.einsum("ij,jrc->irc", np.linalg.inv(camera.matrix), np.stack([u, v, np.ones_like(u)]))
+    ours = office_renderer.view(camera, pose).expected_electrons(1.0) / rate * (1 + x**2 + y**2) ** 2
+    assert (reference > 1000).any(), "an LED has to be in view"
+    flat = np.isclose(ours, reference, rtol=3e-5)  # float32 on both sides, some ten roundings of 6e-8, and cos^4
+    mixed = ~flat
+    assert 0.0 < mixed.mean() < 0.25
+    # A mixed pixel of a share p of luminance L, sampled n times: variance p (1 - p) (L - b)^2 / n. The sample variance
+    # is useless where no sample hit (p << 1/n), so the largest LED bounds it: |ours - b| (16 000 cd/m2) / n.
+    background = np.median(reference)
+    bound = np.maximum(variance, np.abs(ours - background) * 16000 / 256)
+    # edges between surfaces: 8 x 8 grid, 1.3 % of a step of at most 0.8 * 400 / pi
+    z = (ours - reference)[mixed] / np.sqrt(bound[mixed] + (0.013 * 102) ** 2)
+    # family-wise over some thousand pixels; binomial tails are longer than normal ones
+    assert np.abs(z).max() < 6
+    # and no bias: the mean of m independent z of variance <= 1
+    assert abs(z.mean()) < 5 / np.sqrt(len(z))
+
+
+def test_two_renderings_are_identical(office_renderer: Renderer, office: Scene, small_camera: Camera) -> None:
+    pose = Pose((3.5, 3.2, 0.5), 25, 10, 30)
+    first = office_renderer.view(small_camera, pose).expected_electrons(1e-3)
+    second = Renderer(office).view(small_camera, pose).expected_electrons(1e-3)
+    assert first.tobytes() == second.tobytes()
+
+
+def test_gains_switch_single_leds(renderer: Renderer) -> None:
+    camera = Camera()
+    view = renderer.view(camera, Pose((*LED_2, 0.5)))
+    off = view.expected_electrons(1e-3, gains={2: 0.0})
+    assert np.array_equal(off, view.background_e_per_s * np.float32(1e-3))
+    half = view.expected_electrons(1e-3, gains={2: 0.5})
+    full = view.expected_electrons(1e-3)
+    assert np.allclose(half - off, (full - off) / 2, rtol=1e-4, atol=1e-3)
+
+
+@pytest.mark.parametrize("position", [(-0.1, 1.0, 1.0), (1.0, 7.0, 1.0), (1.0, 1.0, 3.6), (1.0, 1.0, 0.0)])
+def test_a_camera_outside_the_room_is_refused(renderer: Renderer, position: tuple[float, float, float]) -> None:
+    with pytest.raises(InputError, match="not inside the room"):
+        renderer.view(Camera(), Pose(position))
+
+
+def test_the_reference_has_no_skew(table1: Scene) -> None:
+    with pytest.raises(InputError, match="skew"):
+        reference_cd_m2(table1, Camera(skew_px=1.0), Pose((1, 1, 1)), 8)

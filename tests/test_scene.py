@@ -1,0 +1,161 @@
+"""Scenes: the shipped ones hold what they claim, and what cannot be is refused by name."""
+
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from vlcrender.camera import Camera
+from vlcrender.errors import InputError
+from vlcrender.scene import Scene, load_scene
+from vlcrender.visibility import level_coverage
+
+ROOT = Path(__file__).parent.parent
+TABLE1 = (ROOT / "scenes/table1.toml").read_text()
+OFFICE = (ROOT / "scenes/office.toml").read_text()
+
+
+def test_table1_holds_the_papers_leds_in_metres(table1: Scene) -> None:
+    assert table1.leds.ids.tolist() == [1, 2, 3, 4]
+    decimetres = [[5, 15, 35], [3, 19, 35], [8, 12, 35], [9, 11, 35]]
+    assert np.allclose(table1.leds.centers_m, np.array(decimetres) / 10)
+    assert table1.room_m.tolist() == [7.0, 7.0, 3.5]
+
+
+def test_three_leds_of_table1_lie_on_one_line(table1: Scene) -> None:
+    on_line = table1.leds.centers_m[[0, 2, 3], :2]
+    assert np.allclose(on_line.sum(axis=1), 2.0)
+    spread = np.linalg.svd(table1.leds.centers_m[:, :2] - table1.leds.centers_m[:, :2].mean(axis=0))[1]
+    assert spread == pytest.approx([0.78, 0.065], abs=0.005)
+
+
+def test_the_office_has_0_6_m_panels_of_leds_within_the_papers_luminances(office: Scene) -> None:
+    undersides = [s for s in office.surfaces if s.name.endswith("underside")]
+    assert len(undersides) == 49
+    assert all(np.allclose(sorted(np.abs(s.edge_u_m + s.edge_v_m)), [0, 0.6, 0.6]) for s in undersides)
+    assert len(office.leds) == 49 * 25
+    assert office.leds.luminances_cd_m2.min() >= 4000
+    assert office.leds.luminances_cd_m2.max() <= 16000
+    # uniform over the range: mean 10 000, se = 12000 / sqrt(12 * 1225) = 99; 5 sigma
+    assert abs(office.leds.luminances_cd_m2.mean() - 10000) < 495
+
+
+def test_surfaces_face_into_the_room(office: Scene) -> None:
+    for surface in office.surfaces[:6]:
+        normal = np.cross(surface.edge_u_m, surface.edge_v_m)
+        middle = surface.corner_m + (surface.edge_u_m + surface.edge_v_m) / 2
+        assert normal @ (office.room_m / 2 - middle) > 0, surface.name
+
+
+def test_led_ids_go_along_x_first_within_a_panel(office: Scene) -> None:
+    first = office.leds.centers_m[:6]
+    assert np.allclose(np.diff(first[:5, 0]), 0.13)
+    assert np.allclose(first[:5, 1], first[0, 1])
+    assert first[5] == pytest.approx([first[0, 0], first[0, 1] + 0.13, 3.45])
+
+
+def test_table1_as_printed_sees_four_leds_from_36_of_122500_level_poses(table1: Scene) -> None:
+    """Counted independently: |x_led - x| f / h within the half sensor, h = 3.5 m, f = 15 000 px."""
+    steps = (np.arange(350) + 0.5) * 0.02
+    for yaw, half_x, half_y in ((0.0, 2000, 1500), (90.0, 1500, 2000)):
+        in_x = np.abs(table1.leds.centers_m[:, 0] - steps[:, None]) * 15000 / 3.5 <= half_x + 1e-6
+        in_y = np.abs(table1.leds.centers_m[:, 1] - steps[:, None]) * 15000 / 3.5 <= half_y + 1e-6
+        seen = (in_x[:, None, :] & in_y[None, :, :]).sum(axis=2) >= 4
+        coverage = level_coverage(Camera(), table1, 0.0, yaw)
+        assert (coverage.poses, coverage.seen) == (122_500, int(seen.sum()))
+        assert coverage.seen == {0.0: 0, 90.0: 36}[yaw]
+
+
+BAD_TABLE1 = [
+    ("radius_m = 0.01", "radius_m = -0.01", r"led\[0\]\.radius_m = -0\.01: .*greater than 0"),
+    ("radius_m = 0.01", "radius_cm = 1.0", r"unknown key led\[0\]\.radius_cm; did you mean radius_m\?"),
+    ("radius_m = 0.01", "", r"led\[0\]\.radius_m is missing"),
+    ("radius_m = 0.01", 'radius_m = "1 cm"', r"led\[0\]\.radius_m = \"1 cm\": .*valid number"),
+    ("radius_m = 0.01", "radius_m = nan", r"led\[0\]\.radius_m"),
+    ("radius_m = 0.01", "radius_m = true", r"led\[0\]\.radius_m = true"),
+    ("radius_m = 0.01", "radius_m = 0.01\ncolour = 3", r"unknown key led\[0\]\.colour; allowed: id, luminance_cd_m2"),
+    ("position_m = [0.5, 1.5, 3.5]", "position_m = [5, 15, 35]", r"led\[0\]: LED 1 .*not inside the room"),
+    ("position_m = [0.5, 1.5, 3.5]", "position_m = [0.005, 1.5, 3.5]", r"LED 1 .*not inside the room"),
+    ("position_m = [0.5, 1.5, 3.5]", "position_m = [0.5, 1.5]", r"led\[0\]\.position_m"),
+    ("position_m = [0.5, 1.5, 3.5]", "position_m = [0.3, 1.9, 3.5]", r"LEDs 1 and 2 overlap"),
+    ("id = 2", "id = 1", r"LED id 1 is used twice"),
+    ("id = 2", "id = -2", r"led\[1\]\.id = -2"),
+    ("id = 2", "id = 2.5", r"led\[1\]\.id = 2\.5"),
+    ("floor = 0.2", "floor = 1.2", r"room\.reflectance\.floor = 1\.2: .*less than or equal to 1"),
+    (
+        "illuminance_lux = 400.0",
+        "illuminance_fc = 37",
+        r"unknown key ambient\.illuminance_fc; did you mean illuminance_lux",
+    ),
+    ("illuminance_lux = 400.0", "illuminance_lux = inf", r"ambient\.illuminance_lux"),
+    ('spectrum = "LED-B3"', 'spectrum = "sun"', r"spectrum = \"sun\": .*'LED-B1'"),
+    ("version = 1", "version = 2", r"version = 2: "),
+    ("[room]", "[room", r"is not TOML"),
+    ("size_m = [7.0, 7.0, 3.5]", "size_m = [7.0, 7.0, 0.0]", r"room\.size_m\[2\] = 0\.0"),
+]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"), BAD_TABLE1, ids=[row[1].replace("\n", " ") or "nothing" for row in BAD_TABLE1]
+)
+def test_a_bad_scene_is_refused_in_one_line(tmp_path: Path, old: str, new: str, message: str) -> None:
+    assert old in TABLE1
+    path = tmp_path / "bad.toml"
+    path.write_text(TABLE1.replace(old, new, 1))
+    with pytest.raises(InputError, match=message) as refusal:
+        load_scene(path)
+    assert "\n" not in str(refusal.value)
+    assert str(path) in str(refusal.value)
+
+
+BAD_OFFICE = [
+    ("columns = 7\nrows = 7", "columns = 8\nrows = 7", r"panels\[0\].*not inside the room"),
+    ("pitch_m = [1.0, 1.0]", "pitch_m = [0.5, 1.0]", r"panels\[0\]\.pitch_m: .*overlap"),
+    ("pitch_m = [0.13, 0.13]", "pitch_m = [0.15, 0.13]", r"panels\[0\]\.leds: 5 columns .*the panel is 0\.6 m"),
+    ("[4000.0, 16000.0]", "[16000.0, 4000.0]", r"the lower value comes first"),
+    ("columns = 7", "columns = 0", r"panels\[0\]\.columns = 0"),
+    ("first_id = 0", "frist_id = 0", r"did you mean first_id"),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "message"), BAD_OFFICE, ids=[row[1].replace("\n", " ") for row in BAD_OFFICE])
+def test_a_bad_panel_is_refused_in_one_line(tmp_path: Path, old: str, new: str, message: str) -> None:
+    assert old in OFFICE
+    path = tmp_path / "bad.toml"
+    path.write_text(OFFICE.replace(old, new, 1))
+    with pytest.raises(InputError, match=message) as refusal:
+        load_scene(path)
+    assert "\n" not in str(refusal.value)
+
+
+def test_a_room_without_leds_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "dark.toml"
+    path.write_text(TABLE1[: TABLE1.index("[[led]]")])
+    with pytest.raises(InputError, match="has no LED"):
+        load_scene(path)
+
+
+@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.data())
+def test_no_damage_to_a_scene_file_is_a_traceback(tmp_path: Path, data: st.DataObject) -> None:
+    """Cut, overwrite or splice the file anywhere: a scene or one line, nothing else."""
+    raw = TABLE1.encode()
+    start = data.draw(st.integers(0, len(raw)))
+    stop = data.draw(st.integers(start, min(len(raw), start + 40)))
+    filling = data.draw(
+        st.one_of(st.binary(max_size=8), st.sampled_from([b"-", b"1e999", b"[[", b"nan", b"{}", b"''"]))
+    )
+    path = tmp_path / "fuzzed.toml"
+    path.write_bytes(raw[:start] + filling + raw[stop:])
+    try:
+        outcome = f"{len(load_scene(path).leds)} LEDs"
+    except InputError as refusal:
+        outcome = str(refusal)
+    assert "\n" not in outcome
+
+
+def test_the_shipped_files_are_toml_with_units_in_their_keys() -> None:
+    assert tomllib.loads(OFFICE)["room"]["size_m"] == [7.0, 7.0, 3.5]

@@ -1,0 +1,81 @@
+"""Mitsuba and Dr.Jit with one variant, chosen once, and a usable LLVM found before the first kernel.
+
+Dr.Jit 1.5 needs LLVM 17 or newer. With an older one trivial kernels pass and real ones end the process, so the version
+is checked here. Everything else imports `mi` and `dr` from this module.
+"""
+
+import ctypes
+import os
+import re
+import sys
+from pathlib import Path
+
+from vlcrender.errors import InputError
+
+VARIANT = "llvm_ad_mono"
+"""Monochromatic: numbers pass through unchanged, so that a film holds cd/m2."""
+OLDEST_LLVM = 17
+SYSTEM_FOLDERS = ("/usr/lib", "/usr/lib64", "/usr/local/lib", "/opt/homebrew/opt/llvm/lib", "/usr/local/opt/llvm/lib")
+
+
+def llvm_version(library: Path) -> int:
+    """Major version a libLLVM reports of itself; 0 where it cannot be loaded or is too old (< 16) to say."""
+    try:
+        loaded = ctypes.CDLL(str(library))
+        numbers = [ctypes.c_uint() for _ in range(3)]
+        loaded.LLVMGetVersion(*(ctypes.byref(number) for number in numbers))
+    except (OSError, AttributeError):
+        return 0
+    return numbers[0].value
+
+
+def candidates(prefix: Path, folders: tuple[str, ...] = SYSTEM_FOLDERS) -> list[Path]:
+    """Shared LLVM libraries: the Python environment's own first, then the system's, newest name first."""
+    own = sorted((prefix / "lib").glob("libLLVM[-.]*"))
+    system: set[Path] = set()
+    for folder in map(Path, folders):
+        for pattern in ("libLLVM[-.]*", "*-linux-gnu/libLLVM[-.]*", "llvm-*/lib/libLLVM[-.]*"):
+            system.update(folder.glob(pattern))
+    newest = sorted(system, key=lambda path: (_number_in(path.name), path.name), reverse=True)
+    return [path for path in own + newest if re.search(r"\.(so|dylib)(\.|$)", path.name)]
+
+
+def _number_in(name: str) -> int:
+    found = re.search(r"\d+", name)
+    return int(found.group()) if found else 0
+
+
+def find_llvm() -> Path:
+    """The LLVM library to use. Raises InputError saying what to install where there is none."""
+    chosen = os.environ.get("DRJIT_LIBLLVM_PATH")
+    if chosen:
+        version = llvm_version(Path(chosen))
+        if version < OLDEST_LLVM:
+            raise InputError(
+                f"DRJIT_LIBLLVM_PATH={chosen}: is not a loadable LLVM {OLDEST_LLVM} or newer; "
+                f"unset it, or install karellen-llvm-core (pip) or libllvm19 (Debian)"
+            )
+        return Path(chosen)
+    seen = []
+    for path in candidates(Path(sys.prefix)):
+        seen.append(path.name)
+        # Names lie less often than they crash: a library whose name says 14 is not loaded at all.
+        if (_number_in(path.name) or OLDEST_LLVM) >= OLDEST_LLVM and llvm_version(path) >= OLDEST_LLVM:
+            return path
+    found = f"found only {', '.join(sorted(set(seen)))}" if seen else "none was found"
+    raise InputError(
+        f"LLVM {OLDEST_LLVM} or newer is needed ({found}): install karellen-llvm-core with pip (x86-64 Linux) "
+        f"or libllvm19 with apt, or point DRJIT_LIBLLVM_PATH at libLLVM"
+    )
+
+
+os.environ["DRJIT_LIBLLVM_PATH"] = str(find_llvm())
+
+import drjit as dr  # noqa: E402  the path has to be set first
+import mitsuba as mi  # noqa: E402
+
+mi.set_variant(VARIANT)
+# Without fast-math the same bits come out on every SIMD width.
+dr.set_flag(dr.JitFlag.FastMath, False)
+
+__all__ = ["dr", "find_llvm", "llvm_version", "mi"]

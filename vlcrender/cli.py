@@ -1,0 +1,152 @@
+"""The command line of vlcrender. Errors are one line; the exit code is 2 for bad input, 130 when interrupted."""
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import App, CycloptsError, Parameter
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from vlcrender import __version__
+from vlcrender.camera import Camera
+from vlcrender.dataset import problems_of, read_dataset_file
+from vlcrender.errors import InputError
+from vlcrender.recipe import load_plan
+from vlcrender.scene import load_scene
+from vlcrender.visibility import ENOUGH_LEDS, level_coverage, tilted_coverage
+
+app = App(name="vlcrender", help=__doc__.splitlines()[0], version=__version__, help_format="plaintext")
+HEIGHTS_M = (0.0, 0.75)
+"""Floor and desk."""
+
+
+@app.command
+def generate(
+    recipe: Path,
+    /,
+    *,
+    out: Path,
+    set_: Annotated[list[str] | None, Parameter(name="--set", negative=())] = None,
+    workers: int = 1,
+    scheduler: str | None = None,
+) -> None:
+    """Make the dataset of a recipe; goes on where an interrupted run stopped.
+
+    Parameters
+    ----------
+    recipe
+        Recipe file (TOML).
+    out
+        Folder of the dataset; new, empty, or an unfinished run of the same recipe.
+    set_
+        key=value that replaces a value of the recipe, e.g. camera.f_number=2.8. May be repeated.
+    workers
+        Processes that make frames.
+    scheduler
+        Address of a dask scheduler whose workers see the same folder.
+    """
+    if workers < 1:
+        raise InputError(f"--workers {workers}: is not 1 or more")
+    plan = load_plan(recipe, set_ or [])
+    from vlcrender.generate import generate as make  # starts Mitsuba: not before the recipe is known to be good
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("frames"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    bar = Progress(*columns, console=Console(stderr=True))
+    task = bar.add_task(plan.recipe.name, total=plan.recipe.poses.count)
+
+    def progress(done: int, total: int) -> None:
+        bar.start()  # not before the first report: a refusal is one line
+        bar.update(task, completed=done, total=total)
+
+    try:
+        made = make(plan, out, workers, scheduler, progress)
+    finally:
+        bar.stop()
+    print(f"{out}: {plan.recipe.poses.count} frames{'' if made else ' (was already complete and intact)'}")
+
+
+@app.command
+def verify(directory: Path, /) -> None:
+    """Check that a dataset is complete and intact; the exit code is 0 only then.
+
+    Parameters
+    ----------
+    directory
+        Folder of the dataset.
+    """
+    dataset = read_dataset_file(directory)
+    found = problems_of(directory)
+    for problem in found:
+        print(f"vlcrender: {problem}", file=sys.stderr)
+    if found:
+        sys.exit(2)
+    print(f"{directory}: {dataset.frame_count} frames, all there and intact")
+
+
+@app.command
+def show(scene: Path, /, *, out: Path | None = None) -> None:
+    """Draw a room's plan and a camera's view of it; print what share of poses sees four LEDs or more.
+
+    Parameters
+    ----------
+    scene
+        Scene file (TOML).
+    out
+        PNG to write; the scene's name with .png in the current folder where not given.
+    """
+    loaded = load_scene(scene)
+    path = out or Path(f"{scene.stem}.png")
+    if path.suffix.lower() != ".png":
+        raise InputError(f"--out {path}: has to end in .png")
+    camera = Camera()
+    across, down = camera.view_angles_deg()
+    table = Table(
+        title=f"{loaded.name}: poses that see {ENOUGH_LEDS} LEDs or more ({across:.2f} x {down:.2f} deg view)"
+    )
+    table.add_column("height, m", justify="right")
+    table.add_column("attitude")
+    table.add_column("poses", justify="right")
+    table.add_column("see enough", justify="right")
+    table.add_column("share", justify="right")
+    for height in HEIGHTS_M:
+        for coverage in (
+            level_coverage(camera, loaded, height, 0.0),
+            level_coverage(camera, loaded, height, 90.0),
+            tilted_coverage(camera, loaded, height),
+        ):
+            share = f"{100 * coverage.share:.2f} %"
+            table.add_row(f"{height:g}", coverage.attitude, str(coverage.poses), str(coverage.seen), share)
+    from vlcrender.show import draw  # starts Mitsuba
+
+    draw(loaded, camera, path)
+    Console(width=max(Console().width, 100)).print(table)
+    print(f"{path}: written")
+
+
+def main() -> None:
+    """Run the command line and exit."""
+    try:
+        app(exit_on_error=False, print_error=False)
+    except CycloptsError as error:
+        _fail(" ".join(str(error).split()))
+    except InputError as error:
+        _fail(str(error))
+    except OSError as error:
+        _fail(f"{error.filename or 'file system'}: {error.strerror or error}")
+    except KeyboardInterrupt:
+        print("vlcrender: interrupted; run the same command again to go on", file=sys.stderr)
+        sys.exit(130)
+
+
+def _fail(message: str) -> None:
+    print(f"vlcrender: {message}", file=sys.stderr)
+    sys.exit(2)

@@ -1,0 +1,142 @@
+"""TOML files into checked models; every refusal names file, key, value and what is allowed."""
+
+import difflib
+import json
+import tomllib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from types import UnionType
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from vlcrender.errors import InputError
+
+
+class Settings(BaseModel):
+    """A table of a TOML file: unknown keys, NaN, infinities and values of another type are refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)
+
+
+S = TypeVar("S", bound=Settings)
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Parse a TOML file. Raises InputError where it is missing, not text or not TOML."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: is not UTF-8 text; a TOML file is expected") from None
+    try:
+        return tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise InputError(f"{path}: is not TOML: {error}") from None
+
+
+def override(tree: dict[str, Any], assignments: Iterable[str]) -> dict[str, Any]:
+    """Return `tree` with `key=value` assignments applied; keys are dotted, values are TOML (or bare words)."""
+    result: dict[str, Any] = json.loads(json.dumps(tree, default=str))
+    for assignment in assignments:
+        key, equals, text = assignment.partition("=")
+        if not equals or not all(part.strip() for part in key.split(".")):
+            raise InputError(f"--set {assignment}: is not key=value, as in --set camera.f_number=2.8")
+        try:
+            value = tomllib.loads(f"value = {text}")["value"]
+        except tomllib.TOMLDecodeError:
+            value = text.strip()  # a bare word: noise=none
+        *parents, last = (part.strip() for part in key.split("."))
+        table = result
+        for parent in parents:
+            table = table.setdefault(parent, {})
+            if not isinstance(table, dict):
+                raise InputError(f"--set {assignment}: {parent} is not a table of the recipe")
+        table[last] = value
+    return result
+
+
+def check(tree: Mapping[str, Any], model: type[S], source: str) -> S:
+    """Check a tree against a model. `source` names it in the InputError raised for the first thing wrong."""
+    try:
+        # JSON in strict mode: 1 passes for 1.0 and a list for a tuple, but "1" and true do not pass for 1.
+        return model.model_validate_json(json.dumps(tree, default=str), strict=True)
+    except ValidationError as error:
+        # a key in another unit is both unknown and missing: the unknown one says more
+        problems = sorted(error.errors(include_url=False), key=lambda problem: problem["type"] != "extra_forbidden")
+        more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+        raise InputError(f"{source}: {_one_line(problems[0], model)}{more}") from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{source}: {error}") from None
+
+
+def _one_line(problem: Any, model: type[Settings]) -> str:
+    location = [part for part in problem["loc"] if not _is_tag(part, model)]
+    key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in location).lstrip(".")
+    kind, message, value = str(problem["type"]), str(problem["msg"]), problem["input"]
+    message = message.removeprefix("Value error, ").replace("\n", " ")
+    if kind == "extra_forbidden":
+        allowed = _keys_at(model, location[:-1])
+        unknown = str(location[-1])
+        near = [name for name in allowed if _stem(name) == _stem(unknown)] or difflib.get_close_matches(
+            unknown, allowed, n=1
+        )
+        hint = f"did you mean {near[0]}? " if near else ""
+        return f"unknown key {key}; {hint}allowed: {', '.join(sorted(allowed))}"
+    if kind == "missing":
+        return f"key {key} is missing"
+    shown = json.dumps(value, default=str)
+    shown = shown if len(shown) <= 60 else shown[:57] + "..."
+    if not key:
+        return message
+    return f"{key} = {shown}: {message[:1].lower() + message[1:]}"
+
+
+UNITS = (
+    *("m", "cm", "mm", "um", "nm", "ft", "in", "px", "s", "ms", "us", "deg", "rad", "lux", "lx", "fc"),
+    *("cd_m2", "nit", "nits", "e", "dn", "e_per_dn", "m_s2", "percent", "db"),
+)
+
+
+def _stem(key: str) -> str:
+    """A key without its unit, so that radius_cm is recognised as radius_m in another unit."""
+    for unit in sorted(UNITS, key=len, reverse=True):
+        if key.lower().endswith("_" + unit):
+            return key[: -len(unit) - 1]
+    return key
+
+
+def _is_tag(part: object, model: type[Settings]) -> bool:
+    """Whether a part of a location is the tag pydantic puts in for a member of a tagged union."""
+    return isinstance(part, str) and part in _tags(model)
+
+
+def _tags(annotation: Any) -> set[str]:
+    tags: set[str] = set()
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        for field in annotation.model_fields.values():
+            if field.discriminator:
+                for member in get_args(field.annotation):
+                    tags |= set(get_args(member.model_fields[str(field.discriminator)].annotation))
+            tags |= _tags(field.annotation)
+    for argument in get_args(annotation):
+        tags |= _tags(argument)
+    return tags
+
+
+def _keys_at(annotation: Any, location: list[Any]) -> set[str]:
+    """The keys a model allows at a location: follows tables, arrays and unions."""
+    origin = get_origin(annotation)
+    if origin in (Union, UnionType):
+        return set().union(*(_keys_at(member, location) for member in get_args(annotation)))
+    if origin is Annotated:
+        return _keys_at(get_args(annotation)[0], location)
+    if origin in (list, tuple):
+        return _keys_at(get_args(annotation)[0], location[1:] if location else location)
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        if not location:
+            return set(annotation.model_fields)
+        field = annotation.model_fields.get(str(location[0]))
+        return _keys_at(field.annotation, location[1:]) if field else set()
+    return set()
