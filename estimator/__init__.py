@@ -1,0 +1,1 @@
+"""Estimates camera positions from images of ceiling LEDs, and judges estimates, from a dataset on disk."""

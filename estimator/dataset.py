@@ -1,0 +1,264 @@
+"""Reads a dataset as a device would: its frames and what it knows of itself, never the truth (datasets/FORMAT.md)."""
+
+import hashlib
+import io
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Literal
+
+import numpy as np
+import OpenEXR
+import pyarrow as pa
+from numpy.typing import NDArray
+from pydantic import Field, Strict, ValidationError, field_validator
+
+from estimator.errors import InputError
+from estimator.tables import Number, Positive, Row, Triple, first_line, first_problem, read_rows
+
+INT64_MAX = 2**63 - 1
+LedId = Annotated[int, Field(ge=0, le=INT64_MAX)]
+# Within 1000 km of the origin: then no range, even a wrong one, is too large to be written down.
+Place = Annotated[float, Field(ge=-1e6, le=1e6)]
+
+SPOT_TYPE = pa.struct([("led", pa.int64()), ("u_px", pa.float64()), ("v_px", pa.float64())])
+FRAME_COLUMNS = {
+    "frame": pa.int64(),
+    "file": pa.string(),
+    "sha256": pa.string(),
+    "camera": pa.string(),
+    "exposure_s": pa.float64(),
+    "accelerometer_m_s2": pa.list_(pa.float64()),
+    "spots": pa.list_(SPOT_TYPE),
+}
+
+
+class Camera(Row):
+    """Pinhole intrinsics; `K` maps camera axes to continuous pixels with pixel centres at +0.5."""
+
+    width_px: int = Field(ge=1, le=65536)
+    height_px: int = Field(ge=1, le=65536)
+    K: tuple[Triple, Triple, Triple]
+    pixel_pitch_um: Positive
+    focal_length_mm: Positive
+    f_number: Positive
+
+    @field_validator("K")
+    @classmethod
+    def _upper_triangular(cls, k: tuple[Triple, Triple, Triple]) -> tuple[Triple, Triple, Triple]:
+        if k[0][0] <= 0 or k[1][1] <= 0 or k[1][0] != 0 or k[2] != (0.0, 0.0, 1.0):
+            raise ValueError("K has to be [[fx, skew, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0")
+        return k
+
+    def matrix(self) -> NDArray[np.float64]:
+        """`K` as a (3, 3) array, pixels."""
+        return np.array(self.K, dtype=np.float64)
+
+
+class Sensor(Row):
+    """How electrons became digital numbers: `dn = round(min(e, full_well_e) / gain_e_per_dn) + black_level_dn`."""
+
+    bits: int = Field(ge=1, le=32)
+    gain_e_per_dn: Positive
+    full_well_e: Positive
+    black_level_dn: float = Field(ge=0, le=2**32)
+    noise: Literal["shot", "none"]
+
+    def largest_dn(self) -> float:
+        """The digital number of a pixel that holds all it can: the full well's, or the converter's last."""
+        return min(2.0**self.bits - 1, float(np.rint(self.full_well_e / self.gain_e_per_dn)) + self.black_level_dn)
+
+
+class Led(Row):
+    """What an LED sends of itself: its identity, its centre in the world and its radius, metres."""
+
+    id: LedId
+    position_m: Annotated[tuple[Place, Place, Place], Strict(False)]
+    radius_m: Positive
+
+
+class DecodedSpot(Row):
+    """A demodulator's word that this LED is near this pixel; rough, it says which spot and not where."""
+
+    led: LedId
+    u_px: Number
+    v_px: Number
+
+
+class FrameRecord(Row):
+    """A row of frames.parquet."""
+
+    frame: int = Field(ge=0)
+    file: str
+    sha256: str = Field(pattern="^[0-9a-fA-F]{64}$")
+    camera: str
+    exposure_s: Positive
+    accelerometer_m_s2: Triple
+    spots: Annotated[tuple[DecodedSpot, ...], Strict(False)]
+
+    @field_validator("file")
+    @classmethod
+    def _inside(cls, file: str) -> str:
+        path = PurePosixPath(file)
+        if not file or path.is_absolute() or ".." in path.parts or "\\" in file or "\0" in file:
+            raise ValueError("has to be a path below the dataset, with /")
+        return file
+
+
+class _Accelerometer(Row):
+    error_deg: float = Field(ge=0)
+
+
+class _Description(Row):
+    """dataset.json without `provenance`: with the seed in it, the truth could be computed."""
+
+    format: Literal["vlcrender-dataset"]
+    version: Literal[1]
+    name: str
+    frame_count: int = Field(ge=0, le=INT64_MAX)
+    cameras: dict[str, Camera]
+    sensor: Sensor
+    accelerometer: _Accelerometer
+    led_map: tuple[Led, ...]
+    room_m: tuple[Positive, Positive, Positive]
+
+    @field_validator("led_map")
+    @classmethod
+    def _unique(cls, leds: tuple[Led, ...]) -> tuple[Led, ...]:
+        if len({led.id for led in leds}) != len(leds):
+            raise ValueError("LED ids have to be unique")
+        return leds
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A dataset's device knowledge; `frames` are the records, the images are read one at a time by `read_frame`."""
+
+    folder: Path
+    name: str
+    cameras: dict[str, Camera]
+    sensor: Sensor
+    accelerometer_error_deg: float
+    leds: dict[int, Led]
+    room_m: tuple[float, float, float]
+    frames: tuple[FrameRecord, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class DeviceFrame:
+    """One image, (height, width) digital numbers with row 0 on top, and all the device knows while taking it."""
+
+    image_dn: NDArray[np.uint32]
+    camera: Camera
+    sensor: Sensor
+    accelerometer_m_s2: tuple[float, float, float]
+    spots: tuple[DecodedSpot, ...]
+    leds: dict[int, Led]
+
+    def electrons(self) -> NDArray[np.float32]:
+        """The image in electrons above the black level, (height, width)."""
+        image = self.image_dn.astype(np.float32)
+        if self.sensor.black_level_dn != 0:
+            image -= np.float32(self.sensor.black_level_dn)
+        if self.sensor.gain_e_per_dn != 1:
+            image *= np.float32(self.sensor.gain_e_per_dn)
+        return image
+
+    def clipped(self) -> NDArray[np.bool_]:
+        """Where the pixel is full and its electrons are unknown, (height, width)."""
+        return self.image_dn >= self.sensor.largest_dn()
+
+
+def read_dataset(folder: Path) -> Dataset:
+    """Read dataset.json and frames.parquet; raises InputError naming the file and key where they break the format."""
+    path = folder / "dataset.json"
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder")
+    try:
+        description = _Description.model_validate_json(path.read_bytes())
+    except FileNotFoundError:
+        raise InputError(f"{folder}: not a dataset (it has no dataset.json)") from None
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror or error}") from None
+    except ValidationError as error:
+        raise InputError(f"{path}: {first_problem(error)}") from None
+    dataset = Dataset(
+        folder=folder,
+        name=description.name,
+        cameras=description.cameras,
+        sensor=description.sensor,
+        accelerometer_error_deg=description.accelerometer.error_deg,
+        leds={led.id: led for led in description.led_map},
+        room_m=description.room_m,
+        frames=read_rows(folder / "frames.parquet", FRAME_COLUMNS, FrameRecord),
+    )
+    _check_frames(folder / "frames.parquet", dataset, description.frame_count)
+    return dataset
+
+
+def _check_frames(path: Path, dataset: Dataset, frame_count: int) -> None:
+    """Refuse records that disagree with dataset.json or with each other."""
+    if len(dataset.frames) != frame_count:
+        raise InputError(f"{path}: {len(dataset.frames)} rows, but dataset.json says frame_count {frame_count}")
+    for index, record in enumerate(dataset.frames):
+        if record.frame != index:
+            raise InputError(f"{path}: row {index} holds frame {record.frame}; frames have to be 0, 1, 2, ... in order")
+        if record.camera not in dataset.cameras:
+            known = ", ".join(dataset.cameras) or "none"
+            raise InputError(f"{path}: frame {index}: unknown camera {record.camera!r}; cameras: {known}")
+        decoded = [spot.led for spot in record.spots]
+        if len(set(decoded)) != len(decoded):
+            raise InputError(f"{path}: frame {index}: an LED is decoded twice in spots")
+        if unknown := set(decoded) - dataset.leds.keys():
+            raise InputError(f"{path}: frame {index}: spots name LED {min(unknown)}, which is not in led_map")
+
+
+def read_frame(dataset: Dataset, record: FrameRecord) -> DeviceFrame:
+    """Read one frame's image; raises InputError where the file is missing, damaged, or not the image it should be."""
+    camera = dataset.cameras[record.camera]
+    image = _read_exr(dataset.folder, record, camera)
+    ceiling = 2**dataset.sensor.bits - 1
+    if image.max() > ceiling:
+        raise InputError(
+            f"{record.file}: digital number {image.max()}, but {dataset.sensor.bits} bits end at {ceiling}"
+        )
+    return DeviceFrame(image, camera, dataset.sensor, record.accelerometer_m_s2, record.spots, dataset.leds)
+
+
+def _read_exr(folder: Path, record: FrameRecord, camera: Camera) -> NDArray[np.uint32]:
+    try:
+        data = (folder / record.file).read_bytes()
+    except OSError as error:
+        raise InputError(f"{record.file}: {error.strerror or error}") from None
+    # The decoder takes most flipped bits for pixels, without a word: only the hash tells.
+    if hashlib.sha256(data).hexdigest() != record.sha256.lower():
+        raise InputError(f"{record.file}: damaged or changed (its sha256 is not the one in frames.parquet)")
+    try:
+        with OpenEXR.File(io.BytesIO(data), header_only=True) as file:
+            _check_header(record.file, [part.header for part in file.parts], camera)
+        with OpenEXR.File(io.BytesIO(data)) as file:
+            image = file.channels()["Y"].pixels
+    except (RuntimeError, ValueError, TypeError, KeyError) as error:
+        raise InputError(f"{record.file}: not a readable EXR image ({first_line(error)})") from None
+    if image is None or image.dtype != np.uint32 or image.shape != (camera.height_px, camera.width_px):
+        raise InputError(f"{record.file}: channel Y has to hold 32-bit unsigned integers, one a pixel")
+    return np.asarray(image, dtype=np.uint32)
+
+
+def _check_header(file: str, headers: list[dict[str, object]], camera: Camera) -> None:
+    """Refuse an image of the wrong kind or size before memory is set aside for it."""
+    if len(headers) != 1:
+        raise InputError(f"{file}: {len(headers)} parts, needed 1")
+    header = headers[0]
+    if header["type"] != OpenEXR.scanlineimage:
+        raise InputError(f"{file}: not stored as scan lines")
+    channels = [channel.name for channel in header["channels"]]  # type: ignore[attr-defined]
+    if channels != ["Y"]:
+        raise InputError(f"{file}: channels {', '.join(channels)}, needed Y alone")
+    data, display = np.array(header["dataWindow"]), np.array(header["displayWindow"])
+    if not np.array_equal(data, display):
+        raise InputError(f"{file}: dataWindow {data.tolist()} differs from displayWindow {display.tolist()}")
+    width_px, height_px = (data[1] - data[0] + 1).tolist()
+    if (width_px, height_px) != (camera.width_px, camera.height_px):
+        raise InputError(
+            f"{file}: {width_px} x {height_px} pixels, but the camera has {camera.width_px} x {camera.height_px}"
+        )

@@ -1,0 +1,203 @@
+"""Image to LED spots: where each lamp's image is, to a hundredth of a pixel, and how sure that is.
+
+Blobs are found in a lightly smoothed copy with one low threshold. Each is then looked at alone: the part above half of
+its own level gives an ellipse, and the centroid is taken over that ellipse grown by a margin, so that all of the spot's
+light is in it, blurred or not, and the background around it cancels.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.errors import EstimationFailure
+
+# The 5 x 5 mean that blobs are searched in: keeps a spot whole that is but a few electrons a pixel.
+SMOOTHING_PX = 5
+# Ceiling and walls at 1/100 of a lamp stay below this share of the brightest; a lamp at a quarter of it stays above.
+THRESHOLD_OF_BRIGHTEST = 0.05
+THRESHOLD_SIGMA = 6.0
+# One bright pixel smoothed covers 25; smaller blobs are noise near the threshold.
+SMALLEST_BLOB_PX = 16
+# No scene has as many lamps: what is smaller than the thousand largest blobs is noise in an image that holds no lamp.
+MOST_BLOBS = 1000
+# A blob over a tenth of the frame is a wall or a window.
+LARGEST_BLOB_OF_FRAME = 0.1
+# Pieces of a blob above half level count as lamps of their own from a fifth of the largest piece's area on.
+SMALLEST_PIECE = 0.2
+MARGIN_PX = 2.0
+RING_PX = 3.0
+LEAST_SIGNAL_TO_NOISE = 5.0
+
+
+@dataclass(frozen=True, eq=False)
+class Spot:
+    """A lamp's image, in continuous pixels with pixel centres at +0.5.
+
+    `covariance_px2` is (2, 2), of the centroid (u, v), from shot noise alone. The brightest pixel is given by its
+    centre; on a flat-topped or clipped lamp noise alone decides which one it is, and ties go to the first row's first.
+    """
+
+    u_px: float
+    v_px: float
+    covariance_px2: NDArray[np.float64]
+    brightest_u_px: float
+    brightest_v_px: float
+    area_px: int
+    peak_e: float
+    touches_border: bool
+    saturated: bool
+
+
+@dataclass(frozen=True, eq=False)
+class _Ellipse:
+    """The part of a blob above half level: its centroid (u, v) and the ellipse of the same second moments."""
+
+    centre_px: NDArray[np.float64]
+    axes: NDArray[np.float64]
+    semi_axes_px: NDArray[np.float64]
+    area_px: int
+
+    def radius(self, u_px: NDArray[np.float64], v_px: NDArray[np.float64], grown_px: float) -> NDArray[np.float64]:
+        """Distance from the centre in units of the grown ellipse: at most 1 inside. Takes a row of u, a column of v."""
+        du, dv = u_px - self.centre_px[0], v_px - self.centre_px[1]
+        first, second = (self.axes / (self.semi_axes_px + grown_px)).T
+        along, across = first[0] * du + first[1] * dv, second[0] * du + second[1] * dv
+        return np.asarray(np.sqrt(along**2 + across**2))
+
+    def half_extent(self, grown_px: float) -> NDArray[np.float64]:
+        """Half width and half height of the upright box around the grown ellipse."""
+        return np.asarray(np.sqrt((self.axes**2) @ (self.semi_axes_px + grown_px) ** 2))
+
+
+def detect(
+    image_e: NDArray[np.float32], raw_e: NDArray[np.float32], clipped: NDArray[np.bool_], reach_px: int
+) -> tuple[Spot, ...]:
+    """Find the lamps in an image of electrons, (height, width).
+
+    `raw_e` is the image before the denoiser, `clipped` where it was full, and `reach_px` the half width of the box that
+    the denoiser averaged over, 0 where `image_e` is the raw image. A spot whose light may go over the image's border is
+    reported and flagged: its centroid is biased. Raises EstimationFailure where there is no spot at all.
+    """
+    smooth = cv2.blur(image_e, (SMOOTHING_PX, SMOOTHING_PX), borderType=cv2.BORDER_REPLICATE)
+    background_e, threshold_e = _levels(smooth)
+    ellipses = _ellipses(smooth, background_e, threshold_e)
+    margin_px = MARGIN_PX + reach_px
+    centres = np.array([ellipse.centre_px for ellipse in ellipses]).reshape(-1, 2)
+    extents = np.array([ellipse.half_extent(margin_px + RING_PX) for ellipse in ellipses]).reshape(-1, 2)
+    spots = []
+    for index, ellipse in enumerate(ellipses):
+        overlaps = (np.abs(centres - centres[index]) < extents + extents[index]).all(axis=1)
+        overlaps[index] = False
+        others = [ellipses[other] for other in np.flatnonzero(overlaps)]
+        spot = _measure(image_e, raw_e, clipped, ellipse, others, reach_px)
+        if spot is not None:
+            spots.append(spot)
+    if not spots:
+        raise EstimationFailure("detect", "no spot found")
+    return tuple(spots)
+
+
+def _levels(smooth: NDArray[np.float32]) -> tuple[float, float]:
+    """Median background and the threshold for blobs, electrons; every few pixels are enough for either."""
+    step = max(1, smooth.shape[1] // 500)
+    sample = smooth[::step, ::step]
+    background = float(np.median(sample))
+    sigma = 1.4826 * float(np.median(np.abs(sample - background)))
+    above_walls = THRESHOLD_OF_BRIGHTEST * (float(smooth.max()) - background)
+    return background, background + max(THRESHOLD_SIGMA * sigma, above_walls)
+
+
+def _ellipses(smooth: NDArray[np.float32], background_e: float, threshold_e: float) -> list[_Ellipse]:
+    """The blobs above the threshold, cut at half of their own level, as ellipses."""
+    mask = (smooth > threshold_e).view(np.uint8)
+    _, labels, boxes, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
+    ellipses = []
+    by_area = np.argsort(-boxes[1:, cv2.CC_STAT_AREA], kind="stable") + 1
+    for label in by_area[:MOST_BLOBS]:
+        left, top, width, height, area = (int(value) for value in boxes[label])
+        if not SMALLEST_BLOB_PX <= area <= LARGEST_BLOB_OF_FRAME * smooth.size:
+            continue
+        window = np.s_[top : top + height, left : left + width]
+        own = labels[window] == label
+        # The upper quartile is the plateau of a lamp; the maximum would be its noise.
+        half_e = background_e + (float(np.percentile(smooth[window][own], 75)) - background_e) / 2
+        core = (own & (smooth[window] >= half_e)).view(np.uint8)
+        pieces, piece_labels, piece_boxes, _ = cv2.connectedComponentsWithStats(core, connectivity=8)
+        areas = piece_boxes[:, cv2.CC_STAT_AREA]
+        for piece in range(1, pieces):
+            if areas[piece] >= SMALLEST_PIECE * areas[1:].max():
+                ellipses.append(_ellipse(piece_labels == piece, left, top))
+    return ellipses
+
+
+def _ellipse(core: NDArray[np.bool_], left: int, top: int) -> _Ellipse:
+    """The ellipse with the centroid and second moments of the pixels set; (left, top) is the window's first pixel."""
+    rows, columns = np.nonzero(core)
+    pixels = np.stack([columns + left + 0.5, rows + top + 0.5])
+    centre = pixels.mean(axis=1)
+    offsets = pixels - centre[:, None]
+    variances, axes = np.linalg.eigh(offsets @ offsets.T / len(rows))
+    # A uniform ellipse has variance a^2 / 4 along its semi-axis a.
+    return _Ellipse(centre, axes, 2 * np.sqrt(np.maximum(variances, 0)) + 0.5, len(rows))
+
+
+def _measure(
+    image_e: NDArray[np.float32],
+    raw_e: NDArray[np.float32],
+    clipped: NDArray[np.bool_],
+    ellipse: _Ellipse,
+    others: list[_Ellipse],
+    reach_px: int,
+) -> Spot | None:
+    """Centroid and covariance of one spot, or None where it does not stand out of its own noise."""
+    margin_px = MARGIN_PX + reach_px
+    height_px, width_px = image_e.shape
+    reach = ellipse.half_extent(margin_px + RING_PX)
+    left, top = np.maximum(np.floor(ellipse.centre_px - reach), 0).astype(int)
+    right, bottom = np.minimum(np.ceil(ellipse.centre_px + reach), (width_px, height_px)).astype(int)
+    window = np.s_[top:bottom, left:right]
+    u_px, v_px = np.arange(left, right)[None, :] + 0.5, np.arange(top, bottom)[:, None] + 0.5
+    electrons = image_e[window].astype(np.float64)
+
+    distance = ellipse.radius(u_px, v_px, margin_px)
+    support = distance <= 1
+    ring = ~support & (ellipse.radius(u_px, v_px, margin_px + RING_PX) <= 1)
+    for other in others:
+        # Where two supports meet, a pixel belongs to the spot it is nearer to.
+        other_distance = other.radius(u_px, v_px, margin_px)
+        support &= distance <= other_distance
+        ring &= other_distance > 1
+    background_e = electrons[ring].mean() if ring.any() else 0.0
+
+    signal = np.where(support, electrons - background_e, 0.0)
+    # Shot noise: a raw pixel's variance is its electrons.
+    variance = np.maximum(raw_e[window].astype(np.float64), 0.0)
+    flux = signal.sum()
+    if flux <= LEAST_SIGNAL_TO_NOISE * np.sqrt(variance[support].sum()):
+        return None
+    u, v = float((signal * u_px).sum() / flux), float((signal * v_px).sum() / flux)
+    # A centroid of box means is a sum over the raw pixels, whose weights are the box means of the centroid's weights.
+    box = (2 * reach_px + 1, 2 * reach_px + 1)
+    weights = [
+        cv2.blur(np.where(support, lever / flux, 0.0), box, borderType=cv2.BORDER_CONSTANT).ravel()
+        for lever in (u_px - u, v_px - v)
+    ]
+    covariance = np.einsum("ik,k,jk->ij", weights, variance.ravel(), weights)
+
+    inside = ellipse.radius(u_px, v_px, 0.0) <= 1
+    brightest = np.unravel_index(np.argmax(np.where(inside, electrons, -np.inf)), inside.shape)
+    light = ellipse.half_extent(margin_px)
+    low, high = ellipse.centre_px - light, ellipse.centre_px + light
+    return Spot(
+        u_px=u,
+        v_px=v,
+        covariance_px2=covariance,
+        brightest_u_px=float(u_px[0, brightest[1]]),
+        brightest_v_px=float(v_px[brightest[0], 0]),
+        area_px=ellipse.area_px,
+        peak_e=float(electrons[brightest]),
+        touches_border=bool((low < 0).any() or high[0] > width_px or high[1] > height_px),
+        saturated=bool(clipped[window][inside].any()),
+    )

@@ -1,0 +1,89 @@
+"""Parquet files as checked rows, and the one-line wording of what is wrong with them."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, TypeVar
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+from pydantic import BaseModel, ConfigDict, Field, Strict, TypeAdapter, ValidationError
+
+from estimator.errors import InputError
+
+
+class Row(BaseModel):
+    """A checked, unchangeable record: types are meant (no "1" for 1), and no number is NaN or infinite."""
+
+    model_config = ConfigDict(strict=True, frozen=True, allow_inf_nan=False, extra="ignore")
+
+
+# Every number that is reckoned with has a square that is a number too.
+LARGEST = 1e100
+Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
+Positive = Annotated[float, Field(gt=0, le=LARGEST)]
+# Arrow hands over lists; only the container is converted, the numbers in it stay strict.
+Triple = Annotated[tuple[Number, Number, Number], Strict(False)]
+
+RowT = TypeVar("RowT", bound=Row)
+
+
+def first_problem(error: ValidationError) -> str:
+    """The first of pydantic's complaints on one line: `where: what is allowed (got value)`."""
+    problem = error.errors(include_url=False)[0]
+    where = ".".join(str(part) for part in problem["loc"]) or "the document"
+    value = repr(problem["input"])
+    value = value if len(value) <= 60 else value[:57] + "..."
+    got = "" if problem["type"] in ("missing", "json_invalid") else f" (got {value})"
+    return f"{where}: {problem['msg']}{got}"
+
+
+def read_rows(path: Path, columns: Mapping[str, pa.DataType], row: type[RowT]) -> tuple[RowT, ...]:
+    """Read the named columns of a Parquet file as rows of the given model; other columns are ignored.
+
+    Raises InputError where the file is missing or damaged, a column is missing or of another type, or a value is not
+    allowed.
+    """
+    try:
+        with pq.ParquetFile(path) as file:
+            _check_columns(path, file.schema_arrow, columns)
+            records = file.read(columns=list(columns)).to_pylist()
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except (pa.ArrowException, OSError, ValueError, MemoryError) as error:
+        raise InputError(f"{path}: not a readable Parquet file ({first_line(error)})") from None
+    try:
+        return tuple(TypeAdapter(list[row]).validate_python(records))  # type: ignore[valid-type]
+    except ValidationError as error:
+        raise InputError(f"{path}: row {first_problem(error)}") from None
+
+
+def _check_columns(path: Path, schema: pa.Schema, columns: Mapping[str, pa.DataType]) -> None:
+    for name, wanted in columns.items():
+        found = schema.get_all_field_indices(name)
+        if len(found) != 1:
+            has = ", ".join(schema.names) or "none"
+            raise InputError(f"{path}: column {name!r} is there {len(found)} times, needed once; columns: {has}")
+        actual = schema.field(found[0]).type
+        if not _same_type(actual, wanted):
+            raise InputError(f"{path}: column {name!r} has type {actual}, needed {wanted}")
+
+
+def _same_type(actual: pa.DataType, wanted: pa.DataType) -> bool:
+    """Whether two Arrow types hold the same values: fixed-size and large lists are lists, large strings strings."""
+    if pa.types.is_list(wanted):
+        is_list = pa.types.is_list(actual) or pa.types.is_large_list(actual) or pa.types.is_fixed_size_list(actual)
+        return is_list and _same_type(actual.value_type, wanted.value_type)
+    if pa.types.is_struct(wanted):
+        if not pa.types.is_struct(actual):
+            return False
+        fields = {field.name: field.type for field in actual}
+        return all(field.name in fields and _same_type(fields[field.name], field.type) for field in wanted)
+    if pa.types.is_string(wanted):
+        return bool(pa.types.is_string(actual) or pa.types.is_large_string(actual))
+    return bool(actual == wanted)
+
+
+def first_line(error: BaseException) -> str:
+    """An exception's text on one line of at most 120 characters, its type where it has no text."""
+    lines = str(error).splitlines()
+    return lines[0][:120] if lines else type(error).__name__

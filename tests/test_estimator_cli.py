@@ -1,0 +1,182 @@
+"""The commands and the page: what they print, and that every error is one line with exit code 2."""
+
+import json
+from html.parser import HTMLParser
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from estimator_synthetic import small_dataset
+
+from estimator import cli
+from estimator.cli import main
+from estimator.variants import VARIANTS
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = small_dataset(tmp_path_factory.mktemp("cli"))
+    (folder / "previews").mkdir()
+    for index in range(3):
+        cv2.imwrite(str(folder / f"previews/{index:06d}.png"), np.full((30, 40), 50, np.uint8))
+    assert main(["run", str(folder)]) == 0
+    return folder
+
+
+def test_run_writes_the_estimates_of_each_variant(dataset: Path) -> None:
+    assert sorted(path.stem for path in (dataset / "estimates").iterdir()) == sorted(VARIANTS)
+
+
+def test_run_takes_some_variants(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = small_dataset(tmp_path)
+    assert main(["run", str(folder), "--variant", "pnp", "--variant", "pnp"]) == 0
+    assert [path.name for path in (folder / "estimates").iterdir()] == ["pnp.parquet"]
+    assert capsys.readouterr().out.startswith("pnp: 3 of 3 frames ok")
+
+
+def test_variants_are_listed_a_line_each(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["variants"]) == 0
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == list(VARIANTS)
+
+
+def test_score_prints_a_row_a_variant(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["score", str(dataset)]) == 0
+    out = capsys.readouterr().out
+    assert all(name in out for name in VARIANTS)
+    assert "synthetic <&>" in out
+
+
+def test_score_prints_json(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["score", str(dataset), "--json"]) == 0
+    scores = json.loads(capsys.readouterr().out)
+    assert scores == json.loads((dataset / "scores.json").read_text())
+    assert {v["variant"]: v["ok"] for v in scores["variants"]}["pnp"] == 3
+
+
+class Page(HTMLParser):
+    """Collects what a page refers to, and checks that its elements close."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.sources: list[str] = []
+        self.text = ""
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.sources += [value or "" for name, value in attrs if name in ("src", "href")]
+        if tag not in ("meta", "img"):
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        pass
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+def test_report_is_one_page_that_needs_nothing_else(dataset: Path, tmp_path: Path) -> None:
+    out = tmp_path / "report.html"
+    assert main(["report", str(dataset), str(dataset), "--out", str(out)]) == 0
+    page = Page()
+    html = out.read_text()
+    page.feed(html)
+    assert page.open == []
+    assert len(page.sources) == 6
+    assert all(source.startswith("data:image/png;base64,") for source in page.sources)
+    assert "http" not in html
+    assert "synthetic <&>" in page.text
+    assert "synthetic <&>" not in html
+    assert "position: the ranges are too short" in page.text
+    # A dot or a cross for each frame of each variant, in the error plot and in the plans, for both datasets.
+    marks = html.count("<title>") - 1
+    assert marks == 2 * 2 * 3 * len(VARIANTS)
+
+
+def test_a_report_is_the_same_without_the_truth_once_scored(dataset: Path, tmp_path: Path) -> None:
+    assert main(["score", str(dataset)]) == 0
+    assert main(["report", str(dataset), "--out", str(tmp_path / "a.html")]) == 0
+    hidden = tmp_path / "truth.parquet"
+    (dataset / "truth.parquet").rename(hidden)
+    try:
+        assert main(["report", str(dataset), "--out", str(tmp_path / "b.html")]) == 0
+    finally:
+        hidden.rename(dataset / "truth.parquet")
+    assert (tmp_path / "a.html").read_text() == (tmp_path / "b.html").read_text()
+
+
+ERRORS = [
+    (["run", "{tmp}/nowhere"], "nowhere: no such folder"),
+    (["run", "{tmp}"], "not a dataset"),
+    (["run"], "DATASET"),
+    (["run", "{data}", "--variant", "best"], "--variant best: unknown; allowed: huynh2016, huynh2016-as-printed, pnp"),
+    (["run", "{data}", "--variant"], "--variant"),
+    (["run", "{data}", "more"], "more"),
+    (["run", "{data}", "--fast"], "--fast"),
+    (["walk", "{data}"], "walk"),
+    (["--fast"], "--fast"),
+    (["score", "{tmp}/nowhere"], "nowhere: no such folder"),
+    (["score", "{data}", "--jsn"], "--jsn"),
+    (["report", "--out", "{tmp}/x.html"], "DATASETS"),
+    (["report", "{data}"], "--out"),
+    (["report", "{data}", "--out", "{tmp}"], "is a folder"),
+    (["report", "{data}", "--out", "{tmp}/nowhere/x.html"], "nowhere/x.html: No such file or directory"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "words"), ERRORS, ids=[" ".join(arguments) for arguments, _ in ERRORS])
+def test_a_user_s_error_is_one_line_and_exit_code_2(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], words: str
+) -> None:
+    filled = [argument.format(data=dataset, tmp=tmp_path) for argument in arguments]
+    assert main(filled) == 2
+    output = capsys.readouterr()
+    assert output.out == ""
+    assert output.err.count("\n") == 1
+    assert output.err.startswith("estimator: ")
+    assert words in output.err
+
+
+def test_damage_is_one_line_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = small_dataset(tmp_path)
+    (folder / "dataset.json").write_text('{"format": "vlcrender-dataset"}')
+    assert main(["run", str(folder)]) == 2
+    output = capsys.readouterr()
+    assert output.err == f"estimator: {folder}/dataset.json: version: Field required\n"
+
+
+def raises(error: BaseException) -> object:
+    def command(*_: object, **__: object) -> None:
+        raise error
+
+    return command
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "words"),
+    [
+        (OSError(28, "No space left on device", "x.parquet"), 2, "x.parquet: No space left on device"),
+        (PermissionError(13, "Permission denied", "x"), 2, "x: Permission denied"),
+        (KeyboardInterrupt(), 130, "interrupted"),
+        (ZeroDivisionError("a\nb"), 1, "internal error, please report it: ZeroDivisionError: a b"),
+    ],
+)
+def test_no_traceback_reaches_anybody(
+    dataset: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    error: BaseException,
+    code: int,
+    words: str,
+) -> None:
+    monkeypatch.setattr(cli, "score_dataset", raises(error))
+    assert main(["score", str(dataset)]) == code
+    assert capsys.readouterr().err == f"estimator: {words}\n"
+
+
+def test_version_is_the_installed_one(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out.strip()[0].isdigit()

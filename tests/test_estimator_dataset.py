@@ -1,0 +1,334 @@
+"""The dataset is read as the format says, and anything else is refused in one line."""
+
+import contextlib
+import copy
+import hashlib
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenEXR
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from estimator_synthetic import FRAMES_SCHEMA, small_dataset, write_exr
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from estimator.dataset import FrameRecord, read_dataset, read_frame
+from estimator.errors import InputError
+from estimator.estimates import EstimateRow, LedRange, estimates_path, read_estimates, write_estimates
+
+Rows = list[dict[str, Any]]
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return small_dataset(tmp_path_factory.mktemp("dataset"))
+
+
+@pytest.fixture
+def folder(good: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(good, tmp_path / "copy"))
+
+
+def refused(folder: Path) -> str:
+    """The one line that says why the dataset cannot be read."""
+    with pytest.raises(InputError) as caught:
+        read_dataset(folder)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def read_or_refuse(folder: Path) -> None:
+    """Any exception but InputError fails the test that calls this."""
+    with contextlib.suppress(InputError):
+        read_dataset(folder)
+
+
+def change_json(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    content = json.loads((folder / "dataset.json").read_text())
+    change(content)
+    (folder / "dataset.json").write_text(json.dumps(content))
+
+
+def change_rows(folder: Path, change: Callable[[Rows], object], schema: pa.Schema = FRAMES_SCHEMA) -> None:
+    rows: Rows = pq.read_table(folder / "frames.parquet").to_pylist()
+    change(rows)
+    pq.write_table(pa.Table.from_pylist(rows, schema), folder / "frames.parquet")
+
+
+def test_a_good_dataset_is_read_as_written(good: Path) -> None:
+    dataset = read_dataset(good)
+    assert (len(dataset.frames), len(dataset.leds), min(dataset.leds)) == (3, 20, 10)
+    frame = read_frame(dataset, dataset.frames[1])
+    with OpenEXR.File(str(good / "frames/000001.exr")) as file:
+        np.testing.assert_array_equal(frame.image_dn, file.channels()["Y"].pixels)
+    np.testing.assert_array_equal(frame.camera.matrix(), [[1500, 0, 200], [0, 1500, 150], [0, 0, 1]])
+    assert frame.accelerometer_m_s2 == pytest.approx((9.80665 * np.sin(np.radians(20)), 4.6076, 7.9806), abs=1e-4)
+
+
+def test_electrons_undo_the_black_level_and_the_gain(folder: Path) -> None:
+    change_json(folder, lambda c: c["sensor"].update(gain_e_per_dn=2.5, black_level_dn=16))
+    dataset = read_dataset(folder)
+    frame = read_frame(dataset, dataset.frames[0])
+    np.testing.assert_allclose(frame.electrons(), (frame.image_dn.astype(float) - 16) * 2.5)
+
+
+def test_a_full_pixel_is_clipped_at_the_full_well_or_at_the_last_number(folder: Path) -> None:
+    change_json(folder, lambda c: c["sensor"].update(full_well_e=4000, gain_e_per_dn=2, black_level_dn=10))
+    dataset = read_dataset(folder)
+    assert dataset.sensor.largest_dn() == 2010
+    frame = read_frame(dataset, dataset.frames[0])
+    np.testing.assert_array_equal(frame.clipped(), frame.image_dn >= 2010)
+    change_json(folder, lambda c: c["sensor"].update(bits=10))
+    assert read_dataset(folder).sensor.largest_dn() == 1023
+
+
+def test_provenance_is_not_needed_and_not_kept(folder: Path) -> None:
+    change_json(folder, lambda c: c.pop("provenance"))
+    assert "seed" not in repr(read_dataset(folder))
+
+
+def test_only_the_scorer_knows_of_the_truth() -> None:
+    sources = (Path(__file__).parent.parent / "estimator").glob("*.py")
+    assert [
+        path.name for path in sources if "truth.parquet" in re.sub(r'""".*?"""', "", path.read_text(), flags=re.S)
+    ] == ["score.py"]
+
+
+JSON_KEYS = ["format", "version", "name", "frame_count", "cameras", "sensor", "accelerometer", "led_map", "room_m"]
+
+
+@pytest.mark.parametrize("key", JSON_KEYS)
+def test_a_missing_key_is_named(folder: Path, key: str) -> None:
+    change_json(folder, lambda c: c.pop(key))
+    assert f"dataset.json: {key}" in refused(folder)
+
+
+WRONG_VALUES: list[tuple[str, Callable[[dict[str, Any]], object]]] = [
+    ("version", lambda c: c.update(version=2)),
+    ("format", lambda c: c.update(format="other")),
+    ("frame_count", lambda c: c.update(frame_count="3")),
+    ("frame_count", lambda c: c.update(frame_count=4)),
+    ("cameras.main.width_px", lambda c: c["cameras"]["main"].update(width_px=400.5)),
+    ("cameras.main.width_px", lambda c: c["cameras"]["main"].update(width_px=10**9)),
+    ("cameras.main.K", lambda c: c["cameras"]["main"].update(K=[[1, 0, 0], [0, 1, 0]])),
+    ("cameras.main.K", lambda c: c["cameras"]["main"].update(K=[[1, 0, 0], [0, 0, 0], [0, 0, 1]])),
+    ("cameras.main.K", lambda c: c["cameras"]["main"]["K"][1].__setitem__(0, 1)),
+    ("cameras.main.K.0.2", lambda c: c["cameras"]["main"]["K"][0].__setitem__(2, float("nan"))),
+    ("sensor.noise", lambda c: c["sensor"].update(noise="loud")),
+    ("sensor.gain_e_per_dn", lambda c: c["sensor"].update(gain_e_per_dn=0)),
+    ("sensor.bits", lambda c: c["sensor"].update(bits=33)),
+    ("accelerometer.error_deg", lambda c: c["accelerometer"].update(error_deg=-1)),
+    ("led_map", lambda c: c["led_map"].append(c["led_map"][0])),
+    ("led_map.0.id", lambda c: c["led_map"][0].update(id=-1)),
+    ("led_map.2.position_m", lambda c: c["led_map"][2].update(position_m=[1, 2])),
+    ("led_map.0.radius_m", lambda c: c["led_map"][0].update(radius_m=float("inf"))),
+    ("room_m", lambda c: c.update(room_m=[1, 2, -3])),
+]
+
+
+@pytest.mark.parametrize(("key", "change"), WRONG_VALUES, ids=[f"{i}-{k}" for i, (k, _) in enumerate(WRONG_VALUES)])
+def test_a_wrong_value_is_named(folder: Path, key: str, change: Callable[[dict[str, Any]], object]) -> None:
+    change_json(folder, change)
+    message = refused(folder)
+    assert str(folder) in message
+    assert key in message
+
+
+def test_all_wrong_types_everywhere_in_the_json_are_input_errors(folder: Path) -> None:
+    """Each value of the document replaced by each of a few others: read or refused, never another exception."""
+    original = json.loads((folder / "dataset.json").read_text())
+    places: list[tuple[Any, ...]] = []
+
+    def walk(node: Any, path: tuple[Any, ...]) -> None:
+        places.append(path)
+        for key, value in node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ():
+            if path != ("led_map",) or key == 0:
+                walk(value, (*path, key))
+
+    walk(original, ())
+    for path in places:
+        for value in (None, "x", -1, 10**400, 1e308, 1e-320, [], {}, True):
+            content = copy.deepcopy(original)
+            if path:
+                node = content
+                for key in path[:-1]:
+                    node = node[key]
+                node[path[-1]] = value
+            else:
+                content = value
+            (folder / "dataset.json").write_text(json.dumps(content))
+            read_or_refuse(folder)
+
+
+WRONG_ROWS: list[tuple[str, Callable[[Rows], object]]] = [
+    ("row 1", lambda rows: rows[1].update(frame=2)),
+    ("3 rows", lambda rows: rows.append({**rows[0], "frame": 3})),
+    ("camera 'other'", lambda rows: rows[0].update(camera="other")),
+    ("2.sha256", lambda rows: rows[2].update(sha256="0123")),
+    ("0.exposure_s", lambda rows: rows[0].update(exposure_s=0.0)),
+    ("0.accelerometer_m_s2", lambda rows: rows[0].update(accelerometer_m_s2=[0.0, float("nan"), 9.8])),
+    ("0.accelerometer_m_s2", lambda rows: rows[0].update(accelerometer_m_s2=None)),
+    ("0.spots.0.u_px", lambda rows: rows[0]["spots"][0].update(u_px=float("inf"))),
+    ("0.spots.0.led", lambda rows: rows[0]["spots"][0].update(led=None)),
+    ("LED 99", lambda rows: rows[0]["spots"][0].update(led=99)),
+    ("twice", lambda rows: rows[0]["spots"][0].update(led=rows[0]["spots"][1]["led"])),
+    ("0.file", lambda rows: rows[0].update(file="../frames/000000.exr")),
+    ("0.file", lambda rows: rows[0].update(file="/etc/passwd")),
+    ("0.file", lambda rows: rows[0].update(file=None)),
+]
+
+
+@pytest.mark.parametrize(("words", "change"), WRONG_ROWS, ids=[f"{i}-{w}" for i, (w, _) in enumerate(WRONG_ROWS)])
+def test_a_wrong_row_is_named(folder: Path, words: str, change: Callable[[Rows], object]) -> None:
+    if words == "3 rows":
+        change_json(folder, lambda c: c.update(frame_count=3))
+        words = "4 rows"
+    change_rows(folder, change)
+    message = refused(folder)
+    assert "frames.parquet" in message
+    assert words in message
+
+
+def test_a_missing_or_retyped_column_is_named(folder: Path) -> None:
+    table = pq.read_table(folder / "frames.parquet")
+    pq.write_table(table.drop_columns(["exposure_s"]), folder / "frames.parquet")
+    assert "column 'exposure_s'" in refused(folder)
+    numbers = table.set_column(0, "frame", table["frame"].cast(pa.float64()))
+    pq.write_table(numbers, folder / "frames.parquet")
+    assert "column 'frame' has type double, needed int64" in refused(folder)
+
+
+def test_lists_of_any_length_type_are_read(folder: Path) -> None:
+    """The synthetic writer uses fixed-size lists; plain and large ones hold the same."""
+    for maker in (pa.list_, pa.large_list):
+        at = FRAMES_SCHEMA.get_field_index("accelerometer_m_s2")
+        schema = FRAMES_SCHEMA.set(at, pa.field("accelerometer_m_s2", maker(pa.float64())))
+        change_rows(folder, lambda rows: None, schema)
+        assert len(read_dataset(folder).frames) == 3
+
+
+def test_missing_parts_are_named(folder: Path, tmp_path: Path) -> None:
+    assert refused(tmp_path / "nowhere").endswith("nowhere: no such folder")
+    (folder / "frames.parquet").unlink()
+    assert refused(folder).endswith("frames.parquet: no such file")
+    (folder / "dataset.json").unlink()
+    assert "not a dataset" in refused(folder)
+
+
+@pytest.mark.parametrize("file", ["dataset.json", "frames.parquet"])
+@settings(max_examples=60, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@given(data=st.data())
+def test_damaged_bytes_are_read_or_refused(good: Path, tmp_path: Path, file: str, data: st.DataObject) -> None:
+    folder = Path(shutil.copytree(good, tmp_path / "damaged", dirs_exist_ok=True))
+    content = bytearray((good / file).read_bytes())
+    if data.draw(st.booleans()):
+        content = content[: data.draw(st.integers(0, len(content) - 1))]
+        (folder / file).write_bytes(content)
+        refused(folder)
+    else:
+        for _ in range(data.draw(st.integers(1, 3))):
+            content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+        (folder / file).write_bytes(content)
+        read_or_refuse(folder)
+
+
+def refused_frame(folder: Path, **changes: Any) -> str:
+    dataset = read_dataset(folder)
+    record = dataset.frames[0].model_copy(update=changes)
+    with pytest.raises(InputError) as caught:
+        read_frame(dataset, record)
+    assert "frames/000000.exr" in str(caught.value)
+    return str(caught.value)
+
+
+def rehash(folder: Path) -> dict[str, str]:
+    return {"sha256": hashlib.sha256((folder / "frames/000000.exr").read_bytes()).hexdigest()}
+
+
+def test_a_missing_truncated_or_changed_image_is_refused(folder: Path) -> None:
+    path = folder / "frames/000000.exr"
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+    assert "damaged" in refused_frame(folder)
+    refused_frame(folder, **rehash(folder))
+    flipped = bytearray(content)
+    flipped[-100] ^= 1
+    path.write_bytes(flipped)
+    assert "damaged" in refused_frame(folder)
+    path.write_bytes(b"no image")
+    assert "not a readable EXR" in refused_frame(folder, **rehash(folder))
+    path.unlink()
+    assert "No such file" in refused_frame(folder)
+
+
+def test_an_image_of_another_size_kind_or_range_is_refused(folder: Path) -> None:
+    path = folder / "frames/000000.exr"
+    write_exr(path, np.zeros((300, 399), np.uint32))
+    assert "399 x 300 pixels, but the camera has 400 x 300" in refused_frame(folder, **rehash(folder))
+    write_exr(path, np.zeros((300, 400), np.float32))  # type: ignore[arg-type]
+    assert "unsigned integers" in refused_frame(folder, **rehash(folder))
+    write_exr(path, np.full((300, 400), 65536, np.uint32))
+    assert "16 bits end at 65535" in refused_frame(folder, **rehash(folder))
+    header = {"type": OpenEXR.scanlineimage}
+    with OpenEXR.File(header, {"Z": np.zeros((300, 400), np.uint32)}) as file:
+        file.write(str(path))
+    assert "needed Y alone" in refused_frame(folder, **rehash(folder))
+    window = (np.array([0, 0], np.int32), np.array([499, 299], np.int32))
+    with OpenEXR.File({**header, "displayWindow": window}, {"Y": np.zeros((300, 400), np.uint32)}) as file:
+        file.write(str(path))
+    assert "displayWindow" in refused_frame(folder, **rehash(folder))
+
+
+def test_records_are_unchangeable(good: Path) -> None:
+    record: FrameRecord = read_dataset(good).frames[0]
+    with pytest.raises(ValueError, match="frozen"):
+        record.frame = 7  # type: ignore[misc]
+
+
+ROWS = (
+    EstimateRow(frame=0, status="ok", reason="", position_m=(1.0, 2.0, 0.5), ranges=(), time_s=0.1),
+    EstimateRow(
+        frame=1,
+        status="failed",
+        reason="position: why",
+        position_m=None,
+        ranges=(LedRange(led=10, range_m=3.5),),
+        time_s=0.2,
+    ),
+)
+
+
+def test_estimates_come_back_as_written_in_the_formats_types(folder: Path) -> None:
+    path = write_estimates(folder, "some", ROWS)
+    assert path == estimates_path(folder, "some") == folder / "estimates/some.parquet"
+    assert read_estimates(path, 2) == ROWS
+    types = {field.name: str(field.type) for field in pq.read_schema(path)}
+    assert types == {
+        "frame": "int64",
+        "status": "string",
+        "reason": "string",
+        "position_m": "list<element: double>",
+        "ranges": "list<element: struct<led: int64, range_m: double>>",
+        "time_s": "double",
+    }
+    assert [entry.name for entry in path.parent.iterdir()] == ["some.parquet"]
+
+
+def test_estimates_for_other_frames_are_refused(folder: Path) -> None:
+    path = write_estimates(folder, "some", ROWS)
+    with pytest.raises(InputError, match="2 rows, needed one for each of the 3 frames"):
+        read_estimates(path, 3)
+
+
+def test_a_failed_row_has_a_reason_and_no_position() -> None:
+    good = ROWS[0].model_dump()
+    for change in ({"status": "failed"}, {"reason": "x: y"}, {"position_m": None}, {"status": "unsure"}):
+        with pytest.raises(ValueError, match="1 validation error"):
+            EstimateRow(**{**good, **change})

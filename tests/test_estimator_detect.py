@@ -1,0 +1,152 @@
+"""Where a spot is, how sure that is, and what is said about spots that cannot be trusted."""
+
+import numpy as np
+import pytest
+from estimator_synthetic import Array, View, grid, poisson, render, view_of
+
+from estimator.denoise import REACH_PX, neighbourhood_mean
+from estimator.detect import Spot, detect
+from estimator.errors import EstimationFailure
+
+SMALL = (400, 300, 1500.0)
+# A tenth of the full frame's width with the full frame's pixels.
+SHARP = (480, 360, 15000.0)
+
+
+def spots_of(expected_e: Array, denoised: bool = False) -> list[Spot]:
+    image = expected_e.astype(np.float32)
+    none_full = np.zeros(image.shape, bool)
+    if denoised:
+        return list(detect(neighbourhood_mean(image), image, none_full, REACH_PX))
+    return list(detect(image, image, none_full, 0))
+
+
+def centroids(spots: list[Spot]) -> Array:
+    return np.array([(spot.u_px, spot.v_px) for spot in spots])
+
+
+def by_nearest(spots: list[Spot], pixels: Array) -> Array:
+    """Centroid minus pixel, for the spot nearest to each pixel."""
+    found = centroids(spots)
+    return np.array([found[np.argmin(np.hypot(*(found - pixel).T))] - pixel for pixel in pixels])
+
+
+def test_pixel_centres_are_at_half() -> None:
+    """A square of 7 x 7 pixels from row 10 and column 20 on has its centre at u = 23.5, v = 13.5."""
+    image = np.full((40, 60), 5.0)
+    image[10:17, 20:27] = 1000
+    (spot,) = spots_of(image)
+    np.testing.assert_allclose((spot.u_px, spot.v_px), (23.5, 13.5), atol=1e-9)
+
+
+def test_the_brightest_pixel_is_given_by_its_centre() -> None:
+    image = np.full((40, 60), 5.0)
+    image[10:17, 20:27] = 1000
+    image[12, 25] = 1001
+    (spot,) = spots_of(image)
+    assert (spot.brightest_u_px, spot.brightest_v_px, spot.peak_e) == (25.5, 12.5, 1001)
+
+
+@pytest.mark.parametrize("denoised", [False, True])
+@pytest.mark.parametrize(("size", "radius_px"), [(SMALL, 5.0), (SHARP, 50.0)])
+def test_a_uniform_disc_has_its_centroid_at_its_centre(
+    size: tuple[int, int, float], radius_px: float, denoised: bool
+) -> None:
+    """Level and noise-free, the image of a disc is a disc around the image of its centre."""
+    view = view_of((3, 3, 3), 3.0, size=size)
+    # 16 x 16 samples err by 0.3 / 16^1.5 of the lamp in each of some 2 pi r edge pixels, at a lever of r / sqrt(2).
+    edge = 0.3 / 16**1.5 * np.sqrt(2 * np.pi * radius_px) * radius_px / np.sqrt(2) / (np.pi * radius_px**2)
+    for shift in [(0, 0), (0.0007, 0.0003), (-0.004, 0.0021)]:
+        led = np.array([[3 + shift[0], 3 + shift[1], 3.0]])
+        (spot,) = spots_of(render(view, led), denoised)
+        np.testing.assert_allclose([(spot.u_px, spot.v_px)], view.project(led), atol=5 * edge)
+
+
+@pytest.mark.parametrize("denoised", [False, True])
+@pytest.mark.parametrize(("led_e", "background_e"), [(4000.0, 40.0), (60.0, 2.0)])
+def test_scatter_agrees_with_the_stated_covariance(denoised: bool, led_e: float, background_e: float) -> None:
+    """Squared Mahalanobis distances of n centroids sum to chi^2 with 2 n degrees of freedom: 2 n +- sqrt(4 n)."""
+    view = view_of((3, 3, 3), 3.0, 20, 10, size=(70, 60, 1500.0))
+    expected = render(view, np.array([[3.001, 3.0, 3.0]]), led_e=led_e, background_e=background_e)
+    (clean,) = spots_of(expected, denoised)
+    n, total = 800, 0.0
+    for seed in range(n):
+        (spot,) = spots_of(poisson(expected, seed), denoised)
+        error = np.array([spot.u_px - clean.u_px, spot.v_px - clean.v_px])
+        total += error @ np.linalg.inv(spot.covariance_px2) @ error
+    assert abs(total / (2 * n) - 1) < 5 * np.sqrt(4 * n) / (2 * n)
+
+
+@pytest.mark.parametrize("size", [SMALL, (1200, 900, 4500.0)])
+def test_dim_and_bright_lamps_are_all_found_before_walls_and_panels(size: tuple[int, int, float]) -> None:
+    """Lamps of 4000 to 16000 electrons before a background of 40 to 100 with straight edges in it."""
+    view = view_of((3, 3, 3), 3.0, 25, -15, size=size)
+    leds = grid(4, 3, 0.16, (3, 3, 3))
+    expected = render(view, leds, led_e=np.tile([4000.0, 16000.0, 8000.0], 4), background_e=40)
+    expected[:, : size[0] // 3] += 60
+    expected[size[1] // 2 :] += 20
+    spots = spots_of(poisson(expected, 1))
+    assert len(spots) == len(leds)
+    # The wall's edge through a lamp's window pulls by a few hundredths; the rest is shot noise of 0.01 px.
+    assert np.abs(by_nearest(spots, view.project(leds))).max() < 0.1
+
+
+def test_a_neighbour_in_the_window_does_not_pull() -> None:
+    """Two lamps whose rims are 7 pixels apart, one 4 times brighter: shared windows are split between them."""
+    view = view_of((3, 3, 3), 3.0, size=(80, 60, 1500.0))
+    leds = np.array([[2.983, 3.0, 3.0], [3.017, 3.0, 3.0]])
+    spots = spots_of(render(view, leds, led_e=[2000, 8000]))
+    assert len(spots) == 2
+    assert np.abs(by_nearest(spots, view.project(leds))).max() < 0.01
+
+
+def test_a_neighbour_s_blurred_light_does_not_pull() -> None:
+    """Rims 10 px apart: the denoiser brings each lamp's light 5 px closer, into the other's window of 7 px."""
+    view = view_of((3, 3, 3), 3.0, size=(400, 300, 7500.0))
+    leds = np.array([[2.988, 3.0, 3.0], [3.012, 3.0, 3.0]])
+    spots = spots_of(render(view, leds), denoised=True)
+    assert len(spots) == 2
+    assert np.abs(by_nearest(spots, view.project(leds))).max() < 0.01
+
+
+def test_lamps_of_one_electron_are_found() -> None:
+    """Noise level 0 dB: mean 1 electron in the brightest pixel, over discs of 7800 pixels."""
+    view = view_of((3, 3, 3), 3.0, size=(900, 700, 15000.0))
+    leds = grid(2, 2, 0.08, (3, 3, 3))
+    spots = spots_of(poisson(render(view, leds, led_e=1.0, background_e=0.01, samples=4), 1))
+    assert len(spots) == 4
+    # sigma = (r / 2) / sqrt(electrons) = 25 / sqrt(7854) = 0.28 px.
+    assert np.abs(by_nearest(spots, view.project(leds))).max() < 5 * 0.28
+
+
+@pytest.mark.parametrize(("du", "dv"), [(0.01, 0), (0, 0.01)])
+def test_a_lamp_moved_along_x_or_y_moves_right_or_down(du: float, dv: float) -> None:
+    view = view_of((3, 3, 3), 3.0, size=SMALL)
+    (before,) = spots_of(render(view, np.array([[3.0, 3, 3]])))
+    (after,) = spots_of(render(view, np.array([[3 + du, 3 + dv, 3]])))
+    # 1 cm at 3 m with f = 1500 px is 5 px.
+    np.testing.assert_allclose([after.u_px - before.u_px, after.v_px - before.v_px], [500 * du, 500 * dv], atol=0.01)
+
+
+def test_spots_at_the_border_are_flagged_and_others_are_not() -> None:
+    view = View(400, 300, 1500.0, (3, 3, 0))
+    # Image at u = 200 + 500 (x - 3): the first is cut, the second ends 3 px inside, the third is well inside.
+    leds = np.array([[3.398, 3, 3], [3.0, 3.284, 3], [2.7, 3, 3]])
+    spots = spots_of(render(view, leds))
+    flags = {round(spot.u_px / 50): spot.touches_border for spot in spots}
+    assert flags == {8: True, 4: False, 1: False}
+    blurred = spots_of(render(view, leds), denoised=True)
+    assert {round(spot.u_px / 50): spot.touches_border for spot in blurred} == {8: True, 4: True, 1: False}
+
+
+def test_saturation_is_told_from_the_raw_image() -> None:
+    view = view_of((3, 3, 3), 3.0, size=SMALL)
+    image = render(view, np.array([[2.9, 3, 3], [3.1, 3, 3]]), led_e=[900, 1000]).astype(np.float32)
+    spots = detect(neighbourhood_mean(image), image, image >= 1000, REACH_PX)
+    assert {spot.u_px > 200: spot.saturated for spot in spots} == {False: False, True: True}
+
+
+@pytest.mark.parametrize("background_e", [0.0, 0.01, 40.0])
+def test_an_image_without_lamps_is_a_named_failure(background_e: float) -> None:
+    with pytest.raises(EstimationFailure, match="detect: no spot"):
+        spots_of(poisson(np.full((300, 400), background_e), 1))

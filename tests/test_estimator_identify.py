@@ -1,0 +1,59 @@
+"""Whose spot is whose, and when that is not said."""
+
+import numpy as np
+import pytest
+
+from estimator.dataset import DecodedSpot, Led
+from estimator.detect import Spot
+from estimator.errors import EstimationFailure
+from estimator.identify import GATE_PX, identify
+
+LEDS = {k: Led(id=k, position_m=(0.1 * k, 0.0, 3.0), radius_m=0.01) for k in range(10)}
+
+
+def spot(u_px: float, v_px: float, touches_border: bool = False) -> Spot:
+    return Spot(u_px, v_px, np.eye(2), u_px, v_px, 50, 1000.0, touches_border, saturated=False)
+
+
+def claim(led: int, u_px: float, v_px: float) -> DecodedSpot:
+    return DecodedSpot(led=led, u_px=u_px, v_px=v_px)
+
+
+def matches(spots: list[Spot], decoded: list[DecodedSpot]) -> dict[int, float]:
+    return {sighting.led.id: sighting.spot.u_px for sighting in identify(spots, decoded, LEDS)}
+
+
+def test_each_identity_gets_the_spot_next_to_it() -> None:
+    spots = [spot(300, 50), spot(100, 50), spot(200, 50)]
+    assert matches(spots, [claim(7, 108, 44), claim(3, 195, 57), claim(5, 290, 50)]) == {7: 100, 3: 200, 5: 300}
+
+
+def test_nothing_is_matched_beyond_the_gate() -> None:
+    assert matches([spot(100, 50), spot(300, 50)], [claim(1, 100, 50), claim(2, 300 + GATE_PX + 1, 50)]) == {1: 100}
+
+
+@pytest.mark.parametrize("second_u_px", [111.0, 130.0])
+def test_two_identities_with_one_spot_are_both_left_out(second_u_px: float) -> None:
+    """Two lamps melted into one: the spot may lie much nearer to the brighter one, and is still neither's."""
+    spots = [spot(100, 50), spot(300, 50)]
+    assert matches(spots, [claim(1, 95, 50), claim(2, second_u_px, 50), claim(3, 300, 50)]) == {3: 300}
+
+
+def test_an_identity_that_has_its_own_spot_does_not_stand_in_anothers_way() -> None:
+    assert matches([spot(100, 50), spot(120, 50)], [claim(1, 106, 50), claim(2, 119, 50)]) == {1: 100, 2: 120}
+
+
+def test_one_identity_between_two_spots_is_left_out() -> None:
+    assert matches([spot(100, 50), spot(121, 50), spot(300, 50)], [claim(1, 110, 50), claim(3, 300, 50)]) == {3: 300}
+
+
+def test_a_spot_at_the_border_keeps_its_identity_to_itself() -> None:
+    spots = [spot(2, 50, touches_border=True), spot(35, 50), spot(300, 50)]
+    assert matches(spots, [claim(1, 5, 50), claim(3, 300, 50)]) == {3: 300}
+
+
+def test_no_match_is_a_named_failure() -> None:
+    with pytest.raises(EstimationFailure, match="identify: no whole spot"):
+        matches([spot(100, 50)], [claim(1, 200, 50)])
+    with pytest.raises(EstimationFailure, match="identify: no identity was decoded"):
+        matches([spot(100, 50)], [])
