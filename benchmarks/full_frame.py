@@ -1,0 +1,88 @@
+"""Speed of a full office frame as ratios within one run: stages, bare work, and Mitsuba's path integrator.
+
+    python benchmarks/full_frame.py [REPEATS]
+
+Prints medians over the repeats. Machines differ and are shared: only the ratios mean something.
+"""
+
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from vlcrender.backend import dr, mi
+from vlcrender.camera import Camera, Pose
+from vlcrender.dataset import exr_attributes, write_exr, write_preview
+from vlcrender.reference import scene_dict
+from vlcrender.render import Renderer
+from vlcrender.scene import load_scene
+from vlcrender.sensor import Sensor
+from vlcrender.streams import stream
+
+POSE = Pose((3.15, 3.1, 0.6), tilt_x_deg=6.0, tilt_y_deg=-8.0, yaw_deg=20.0)
+EXPOSURE_S = 160e-6
+
+
+def median_s(work: Callable[[], object], repeats: int) -> float:
+    """Median wall time of a call after one that does not count."""
+    work()
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        work()
+        times.append(time.perf_counter() - start)
+    return statistics.median(times)
+
+
+def render(loaded: "mi.Scene", integrator: "mi.Integrator", samples_per_pixel: int) -> None:
+    """Render and wait: kernels run on after the call that starts them returns."""
+    dr.eval(mi.render(loaded, integrator=integrator, spp=samples_per_pixel))
+    dr.sync_thread()
+
+
+def main() -> None:
+    """Measure and print."""
+    repeats = int(sys.argv[1]) if len(sys.argv) > 1 else 5
+    scene = load_scene(Path(__file__).parent.parent / "scenes/office.toml")
+    camera, sensor, renderer = Camera(), Sensor(), Renderer(scene)
+    view = renderer.view(camera, POSE)
+    expected = view.expected_electrons(EXPOSURE_S)
+    dn = sensor.expose(expected, stream(0, 0, "bench"))
+    loaded = mi.load_dict(scene_dict(scene, camera, POSE), optimize=False)
+    depth, path = mi.load_dict({"type": "depth"}), mi.load_dict({"type": "path", "max_depth": 4})
+    with tempfile.TemporaryDirectory() as folder:
+        exr, png = Path(folder) / "frame.exr", Path(folder) / "frame.png"
+        attributes = exr_attributes(camera, "main", EXPOSURE_S, 0)
+        stages: dict[str, Callable[[], object]] = {
+            "rays and LED patches": lambda: renderer.view(camera, POSE),
+            "expected electrons": lambda: view.expected_electrons(EXPOSURE_S),
+            "Poisson noise and digital numbers": lambda: sensor.expose(expected, stream(0, 0, "bench")),
+            "EXR (PIZ) and its SHA-256": lambda: write_exr(exr, dn, attributes),
+            "preview": lambda: write_preview(png, dn, sensor.largest_dn),
+        }
+        seconds = {name: median_s(work, repeats) for name, work in stages.items()}
+        frame = sum(seconds.values())
+        bare = median_s(lambda: render(loaded, depth, 1), repeats) + seconds["EXR (PIZ) and its SHA-256"]
+    path_16 = median_s(lambda: render(loaded, path, 16), 1)
+    print(f"office, 4000 x 3000, {len(view.patches)} LEDs in view, medians of {repeats}")
+    for name, value in seconds.items():
+        print(f"  {100 * value / frame:5.1f} %  {name}")
+    print(f"full frame / (Mitsuba depth at 1 sample a pixel + one PIZ write)   {frame / bare:6.2f}")
+    print(f"Mitsuba path at 16 samples a pixel / full frame                    {path_16 / frame:6.1f}")
+    peak_gib = _peak_memory_gib()
+    print(f"peak memory of this process, the path render included              {peak_gib:6.2f} GiB")
+    assert np.isfinite(expected).all()
+
+
+def _peak_memory_gib() -> float:
+    import resource
+
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+
+
+if __name__ == "__main__":
+    main()

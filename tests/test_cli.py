@@ -1,0 +1,166 @@
+"""The commands as a user meets them: every mistake is one line that names it, and exit code 2."""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+from conftest import ROOT, SMALL
+
+RECIPE = str(ROOT / "datasets/quickstart.toml")
+TABLE1 = str(ROOT / "scenes/table1.toml")
+SETS = [part for assignment in SMALL for part in ("--set", assignment)]
+
+
+def run(program: str, *arguments: str, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
+    """Run an installed console script, as a user would."""
+    script = Path(sys.executable).parent / program
+    return subprocess.run([script, *arguments], cwd=cwd, capture_output=True, text=True)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("cli") / "set"
+    made = run("vlcrender", "generate", RECIPE, "--out", str(directory), *SETS, "--set", "poses.count=2")
+    assert made.returncode == 0, made.stderr
+    return directory
+
+
+def copy_of(dataset: Path, to: Path) -> Path:
+    return Path(shutil.copytree(dataset, to / "set"))
+
+
+def assert_refused(result: subprocess.CompletedProcess[str], *mentions: str) -> None:
+    assert result.returncode == 2, (result.stdout, result.stderr)
+    lines = [line for line in result.stderr.splitlines() if line.strip()]
+    assert len(lines) == 1, result.stderr
+    assert "Traceback" not in result.stderr
+    for mention in mentions:
+        assert mention in lines[0], lines[0]
+
+
+GENERATE_MISTAKES: dict[str, tuple[list[str], list[str]]] = {
+    "unknown key": (["--set", "camera.iso=100"], ["unknown key camera.iso", "allowed:", "f_number"]),
+    "wrong unit": (["--set", "camera.focal_length_m=0.018"], ["focal_length_m", "did you mean focal_length_mm"]),
+    "negative exposure": (["--set", "exposure_s=-1"], ["exposure_s = -1", "greater than 0"]),
+    "not a number": (["--set", "exposure_s=soon"], ["exposure_s", "soon", "number"]),
+    "infinite": (["--set", "exposure_s=inf"], ["exposure_s"]),
+    "bits": (["--set", "sensor.bits=9"], ["sensor.bits = 9", "8, 10 or 12"]),
+    "negative gain": (["--set", "sensor.gain_e_per_dn=-2"], ["sensor.gain_e_per_dn = -2"]),
+    "noise": (["--set", "sensor.noise=gaussian"], ["sensor.noise", "gaussian", "shot"]),
+    "no --set value": (["--set", "exposure_s"], ["--set exposure_s", "key=value"]),
+    "range upside down": (["--set", "poses.tilt_x_deg=[60, 0]"], ["tilt_x_deg = [60", "lower value comes first"]),
+    "tilt": (["--set", "poses.tilt_x_deg=[0, 89]"], ["poses.tilt_x_deg[1] = 89", "85"]),
+    "kind of poses": (["--set", "poses.kind=spiral"], ["poses", "spiral", "aimed", "list"]),
+    "no poses": (["--set", "poses.count=0"], ["poses.count = 0"]),
+    "no such scene": (["--set", "scene=nowhere.toml"], ["nowhere.toml", "no such file"]),
+    "seed": (["--set", "seed=-3"], ["seed = -3"]),
+    "pixels": (["--set", "camera.width_px=4000.5"], ["camera.width_px = 4000.5"]),
+    "principal point": (["--set", "camera.principal_point_px=[99999, 0]"], ["principal_point_px = [99999"]),
+    "workers": (["--workers", "0"], ["--workers 0", "1 or more"]),
+    "workers is a word": (["--workers", "many"], ["--workers", "many"]),
+    "unknown option": (["--frobnicate"], ["--frobnicate"]),
+    "unreachable": (["--set", "poses.min_leds=900"], ["frame 0", "900 LEDs", "lower min_leds"]),
+}
+
+
+@pytest.mark.parametrize("mistake", GENERATE_MISTAKES)
+def test_generate_refuses(tmp_path: Path, mistake: str) -> None:
+    options, mentions = GENERATE_MISTAKES[mistake]
+    assert_refused(run("vlcrender", "generate", RECIPE, "--out", str(tmp_path / "x"), *SETS, *options), *mentions)
+    assert not (tmp_path / "x").exists()
+
+
+def test_generate_refuses_recipes_that_are_no_recipes(tmp_path: Path) -> None:
+    assert_refused(run("vlcrender", "generate", "no.toml", "--out", "x", cwd=tmp_path), "no.toml", "No such file")
+    assert_refused(run("vlcrender", "generate", TABLE1, "--out", "x", cwd=tmp_path), "table1.toml", "format")
+    (tmp_path / "binary.toml").write_bytes(bytes(range(256)))
+    assert_refused(run("vlcrender", "generate", "binary.toml", "--out", "x", cwd=tmp_path), "binary.toml", "UTF-8")
+    assert_refused(run("vlcrender", "generate", ".", "--out", "x", cwd=tmp_path), "directory")
+    assert_refused(run("vlcrender", "generate", cwd=tmp_path), "RECIPE")
+
+
+def test_generate_does_not_write_where_it_may_not(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("mine")
+    out = str(tmp_path / "file" / "below")
+    assert_refused(run("vlcrender", "generate", RECIPE, "--out", out, *SETS), str(tmp_path / "file"))
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_a_recipe_with_an_out_of_room_pose_is_refused(tmp_path: Path) -> None:
+    text = Path(RECIPE).read_text()
+    recipe = tmp_path / "recipe.toml"
+    recipe.write_text(
+        text[: text.index("[poses]")].replace("../scenes", str(ROOT / "scenes"))
+        + '[poses]\nkind = "list"\npose = [{ position_m = [1.0, 9.0, 1.0] }]\n'
+    )
+    assert_refused(
+        run("vlcrender", "generate", str(recipe), "--out", str(tmp_path / "x")), "9.0", "not inside the room"
+    )
+
+
+def test_verify_accepts_what_is_intact_and_names_what_is_not(dataset: Path, tmp_path: Path) -> None:
+    assert run("vlcrender", "verify", str(dataset)).returncode == 0
+    assert_refused(run("vlcrender", "verify", str(tmp_path)), str(tmp_path), "dataset.json")
+    damaged = copy_of(dataset, tmp_path)
+    frame = damaged / "frames/000001.exr"
+    frame.write_bytes(frame.read_bytes()[:5000])
+    assert_refused(run("vlcrender", "verify", str(damaged)), "000001.exr", "SHA-256")
+    (damaged / "dataset.json").write_text('{"format": "something else"}')
+    assert_refused(run("vlcrender", "verify", str(damaged)), "dataset.json", "format")
+    (damaged / "dataset.json").write_text("{" * 100_000)
+    assert_refused(run("vlcrender", "verify", str(damaged)), "dataset.json", "JSON")
+
+
+def test_show_refuses(tmp_path: Path) -> None:
+    assert_refused(run("vlcrender", "show", "no.toml", cwd=tmp_path), "no.toml")
+    assert_refused(run("vlcrender", "show", RECIPE, cwd=tmp_path), "quickstart.toml", "format")
+    assert_refused(run("vlcrender", "show", TABLE1, "--out", "picture.jpg", cwd=tmp_path), "picture.jpg", ".png")
+    assert_refused(run("vlcrender", "show", TABLE1, "--out", "no/such/x.png", cwd=tmp_path), "no/such")
+
+
+def test_show_draws_and_counts(tmp_path: Path) -> None:
+    result = run("vlcrender", "show", TABLE1, "--out", str(tmp_path / "table1.png"))
+    assert result.returncode == 0, result.stderr
+    assert (tmp_path / "table1.png").read_bytes().startswith(b"\x89PNG")
+    assert " 36 " in result.stdout  # of 122 500 level poses, as the errata say
+
+
+def test_unknown_commands_are_refused() -> None:
+    assert_refused(run("vlcrender", "genrate"), "genrate")
+    assert_refused(run("estimator", "estimate"), "estimate")
+
+
+def test_version_and_help_are_no_errors() -> None:
+    for program in ("vlcrender", "estimator"):
+        assert run(program, "--version").stdout.strip() == "0.1.0"
+        assert "Usage" in run(program, "--help").stdout
+
+
+def test_the_whole_chain_on_small_frames_without_the_truth(dataset: Path, tmp_path: Path) -> None:
+    """Estimates are the same with and without truth.parquet and provenance; scoring needs the truth and says so."""
+    blind = copy_of(dataset, tmp_path)
+    truth = (blind / "truth.parquet").read_bytes()
+    (blind / "truth.parquet").unlink()
+    tree = json.loads((blind / "dataset.json").read_text())
+    tree["provenance"] = {}
+    (blind / "dataset.json").write_text(json.dumps(tree))
+    whole = copy_of(dataset, tmp_path / "whole")
+    for directory in (blind, whole):
+        result = run("estimator", "run", str(directory))
+        assert result.returncode == 0, result.stderr
+    for variant in ("huynh2016", "pnp"):
+        tables = [pq.read_table(d / f"estimates/{variant}.parquet").drop_columns(["time_s"]) for d in (blind, whole)]
+        assert tables[0].equals(tables[1])
+        assert tables[0]["status"].to_pylist() == ["ok", "ok"]
+    assert_refused(run("estimator", "score", str(blind)), "truth.parquet")
+    (blind / "truth.parquet").write_bytes(truth)
+    assert run("estimator", "score", str(blind)).returncode == 0
+    report = tmp_path / "report.html"
+    assert run("estimator", "report", str(blind), "--out", str(report)).returncode == 0
+    page = report.read_text()
+    assert "huynh2016-as-printed" in page
+    assert not [word for word in ('src="http', 'href="http', "url(http") if word in page], "the page has to stand alone"

@@ -1,0 +1,78 @@
+"""What one package writes the other reads, and both mean the same by it."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from conftest import ROOT, SMALL
+
+from estimator.dataset import DeviceFrame, read_dataset, read_frame
+from estimator.rectify import level, rotation, tilt_from_gravity
+from vlcrender.camera import Camera, Pose, project
+from vlcrender.generate import generate
+from vlcrender.inertial import Accelerometer
+from vlcrender.recipe import load_plan
+from vlcrender.streams import stream
+
+
+@pytest.fixture(scope="module")
+def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("contract") / "set"
+    plan = load_plan(
+        ROOT / "datasets/quickstart.toml",
+        [*SMALL, "poses.count=2", "camera.skew_px=3.0", "camera.principal_point_px=[190.0, 160.0]"],
+    )
+    generate(plan, out)
+    return out
+
+
+def device_frames(directory: Path) -> list[DeviceFrame]:
+    dataset = read_dataset(directory)
+    return [read_frame(dataset, record) for record in dataset.frames]
+
+
+def test_the_reader_sees_what_the_writer_wrote(directory: Path) -> None:
+    rows = pq.read_table(directory / "frames.parquet").to_pylist()
+    tree = json.loads((directory / "dataset.json").read_text())
+    assert tree["cameras"]["main"]["K"] == [[1500.0, 3.0, 190.0], [0.0, 1500.0, 160.0], [0.0, 0.0, 1.0]]
+    for row, frame in zip(rows, device_frames(directory), strict=True):
+        assert frame.camera.matrix().tolist() == tree["cameras"]["main"]["K"]
+        assert list(frame.accelerometer_m_s2) == row["accelerometer_m_s2"]
+        assert frame.image_dn.shape == (300, 400)
+        assert [(s.led, s.u_px, s.v_px) for s in frame.spots] == [
+            (s["led"], s["u_px"], s["v_px"]) for s in row["spots"]
+        ]
+
+
+def test_the_brightest_pixels_are_at_the_decoded_spots(directory: Path) -> None:
+    """Row, column, u and v are the same way round in both packages: the images of LEDs are where the table says."""
+    truth = pq.read_table(directory / "truth.parquet").to_pylist()
+    for frame, row in zip(device_frames(directory), truth, strict=True):
+        whole = [led for led in row["leds"] if led["visible_fraction"] == 1]
+        for led in whole:
+            assert frame.image_dn[int(led["v_px"]), int(led["u_px"])] > 10 * np.median(frame.image_dn)
+
+
+@pytest.mark.parametrize("tilts", [(0.0, 0.0), (30.0, 0.0), (0.0, 45.0), (60.0, 60.0), (-20.0, 35.0)])
+def test_a_gravity_reading_levels_the_pixels_that_the_pose_tilted(tilts: tuple[float, float]) -> None:
+    """One side projects under a tilt, the other undoes it by gravity; what is left is the level view, turned by yaw."""
+    camera = Camera()
+    pose = Pose((3.0, 3.0, 1.0), *tilts, yaw_deg=25.0)
+    axis = pose.rotation[2]
+    aim = np.array(pose.position_m) + axis * 2.45 / axis[2]
+    leds = aim + np.array([[0, 0, 0], [0.13, 0, 0], [0, 0.13, 0], [-0.13, 0.26, 0]])
+    seen, _ = project(camera, pose, leds)
+    reading = Accelerometer(error_deg=0.0).reading_m_s2(pose, stream(0, 0, "none"))
+    levelled = level(seen, camera.matrix, rotation(*tilt_from_gravity(tuple(reading))))
+    expected, _ = project(camera, Pose(pose.position_m, yaw_deg=25.0), leds)
+    # double precision; the horizon is near at 75.5 deg from the zenith: pixels of 1e5, so 1e5 * 1e-15 * amplification
+    assert np.abs(levelled - expected).max() < 1e-6
+
+
+def test_a_hand_computed_point() -> None:
+    """Camera at (1, 2, 0.5), level, LED at (1.3, 1.8, 3.5): 0.3/3 * 15000 = 1500 right of and 1000 above the centre."""
+    pixels, depth = project(Camera(), Pose((1.0, 2.0, 0.5)), np.array([1.3, 1.8, 3.5]))
+    assert depth == pytest.approx(3.0)
+    assert pixels == pytest.approx([3500.0, 500.0])
