@@ -4,6 +4,7 @@ import os
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated
 
@@ -105,6 +106,10 @@ def report(*datasets: Annotated[Path, Parameter(required=True)], out: Path) -> N
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code; errors of the user's are one line on stderr, never a traceback."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            # A terminal without a micro sign gets a question mark, not an error.
+            stream.reconfigure(errors="replace")
     try:
         app(arguments)
         sys.stdout.flush()

@@ -20,7 +20,7 @@ STYLE = """
   :root { --ink: #e6e9ec; --soft: #9aa4ad; --line: #363d44; --paper: #1d2126; --back: #14171a; }
 }
 * { box-sizing: border-box; }
-body { margin: 0 auto; max-width: 1080px; padding: 32px 20px 64px; background: var(--back); color: var(--ink);
+body { margin: 0 auto; max-width: 1200px; padding: 32px 20px 64px; background: var(--back); color: var(--ink);
   font: 15px/1.5 system-ui, sans-serif; }
 h1 { font-size: 26px; margin: 0 0 4px; }
 h2 { font-size: 21px; margin: 48px 0 4px; }

@@ -1,6 +1,9 @@
 """The commands and the page: what they print, and that every error is one line with exit code 2."""
 
 import json
+import os
+import subprocess
+import sys
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -45,6 +48,13 @@ def test_score_prints_a_row_a_variant(dataset: Path, capsys: pytest.CaptureFixtu
     out = capsys.readouterr().out
     assert all(name in out for name in VARIANTS)
     assert "synthetic <&>" in out
+
+
+def test_score_prints_to_a_terminal_without_a_micro_sign(dataset: Path) -> None:
+    command = [sys.executable, "-c", "import sys; from estimator.cli import main; sys.exit(main())", "score"]
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    result = subprocess.run([*command, str(dataset)], env=environment, capture_output=True, check=False)
+    assert (result.returncode, result.stderr) == (0, b"")
 
 
 def test_score_prints_json(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -29,7 +29,10 @@ def test_each_identity_gets_the_spot_next_to_it() -> None:
 
 
 def test_nothing_is_matched_beyond_the_gate() -> None:
-    assert matches([spot(100, 50), spot(300, 50)], [claim(1, 100, 50), claim(2, 300 + GATE_PX + 1, 50)]) == {1: 100}
+    spots = [spot(100, 50), spot(300, 50)]
+    beyond = claim(2, 300 + GATE_PX + 1, 50)
+    assert matches(spots, [claim(1, 100, 50), beyond]) == {1: 100}
+    assert matches(spots, [claim(1, 100, 50), beyond, claim(3, 301, 50)]) == {1: 100, 3: 300}
 
 
 @pytest.mark.parametrize("second_u_px", [111.0, 130.0])

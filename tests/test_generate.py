@@ -2,6 +2,9 @@
 
 import hashlib
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -50,6 +53,18 @@ def test_two_workers_give_the_same_bytes_as_one(made: Path, tmp_path: Path) -> N
     assert digests(tmp_path / "pool") == digests(made)
     for table in ("frames.parquet", "truth.parquet"):
         assert pq.read_table(tmp_path / "pool" / table).equals(pq.read_table(made / table))
+
+
+def test_one_thread_gives_the_same_bytes_as_all(made: Path, tmp_path: Path) -> None:
+    """In a process of its own with every library held to one thread."""
+    code = (
+        "from pathlib import Path; from test_generate import small_plan; from vlcrender.backend import dr; "
+        "from vlcrender.generate import generate; dr.set_thread_count(1); "
+        f"generate(small_plan('expected=true'), Path({str(tmp_path / 'one')!r}))"
+    )
+    single = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL")}
+    subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parent, env={**os.environ, **single}, check=True)
+    assert digests(tmp_path / "one") == digests(made)
 
 
 def test_a_longer_set_with_other_noise_shares_no_frame(made: Path, tmp_path: Path) -> None:

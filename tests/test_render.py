@@ -1,5 +1,7 @@
 """Rendered images: signs, closed-form brightness, agreement with Mitsuba's own integrator, determinism."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 
@@ -143,6 +145,14 @@ def test_two_renderings_are_identical(office_renderer: Renderer, office: Scene, 
     first = office_renderer.view(small_camera, pose).expected_electrons(1e-3)
     second = Renderer(office).view(small_camera, pose).expected_electrons(1e-3)
     assert first.tobytes() == second.tobytes()
+
+
+def test_another_thread_renders_the_same_bytes(office_renderer: Renderer) -> None:
+    """Dr.Jit's flags hold for one thread, and workers of a cluster render in threads of their own."""
+    arguments = Camera(), Pose((1.5, 2.0, 1.2), 40.0, 35.0, 110.0)
+    with ThreadPoolExecutor(1) as pool:
+        there = pool.submit(office_renderer.background_cd_m2, *arguments).result()
+    assert there.tobytes() == office_renderer.background_cd_m2(*arguments).tobytes()
 
 
 def test_gains_switch_single_leds(renderer: Renderer) -> None:

@@ -8,6 +8,7 @@ import ctypes
 import os
 import re
 import sys
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 from vlcrender.errors import InputError
@@ -75,7 +76,12 @@ import drjit as dr  # noqa: E402  the path has to be set first
 import mitsuba as mi  # noqa: E402
 
 mi.set_variant(VARIANT)
-# Without fast-math the same bits come out on every SIMD width.
-dr.set_flag(dr.JitFlag.FastMath, False)
 
-__all__ = ["dr", "find_llvm", "llvm_version", "mi"]
+
+def exact_math() -> AbstractContextManager[None]:
+    """Within it kernels give the same bits on every SIMD width. Dr.Jit's flags hold for one thread only."""
+    scope: AbstractContextManager[None] = dr.scoped_set_flag(dr.JitFlag.FastMath, False)
+    return scope
+
+
+__all__ = ["dr", "exact_math", "find_llvm", "llvm_version", "mi"]

@@ -96,19 +96,30 @@ def project(
     camera: Camera, pose: Pose, points_m: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Project world points (..., 3). Returns pixels (..., 2) and depth z_cam in metres; pixels are NaN behind."""
-    p_cam = (points_m - np.array(pose.position_m)) @ pose.rotation.T
+    p_cam = transform(pose.rotation, points_m - np.array(pose.position_m))
     depth = p_cam[..., 2]
     with np.errstate(divide="ignore", invalid="ignore"):
-        pixels = (p_cam / depth[..., None]) @ camera.matrix[:2].T
+        pixels = transform(camera.matrix[:2], p_cam / depth[..., None])
     return np.where(depth[..., None] > 0, pixels, np.nan), depth
 
 
 def rays_world(camera: Camera, pose: Pose, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
     """Directions in the world, not normalised (z_cam = 1), of pixels (..., 2). Shape (..., 3)."""
     ones = np.ones((*pixels.shape[:-1], 1))
-    p_cam = np.concatenate([pixels, ones], axis=-1) @ np.linalg.inv(camera.matrix).T
-    directions: NDArray[np.float64] = p_cam @ pose.rotation
-    return directions
+    inverse = np.linalg.inv(camera.matrix).astype(np.float64)
+    p_cam = transform(inverse, np.concatenate([pixels, ones], axis=-1))
+    return transform(pose.rotation.T, p_cam)
+
+
+def transform(matrix: NDArray[np.float64], vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Apply a matrix (rows, 3) to vectors (..., 3). Shape (..., rows).
+
+    Written out, not `@`: the last bits of a matrix product may depend on threads and processor, and frames may not.
+    """
+    result: NDArray[np.float64] = (
+        vectors[..., 0:1] * matrix[:, 0] + vectors[..., 1:2] * matrix[:, 1] + vectors[..., 2:3] * matrix[:, 2]
+    )
+    return result
 
 
 def mitsuba_to_world(pose: Pose) -> NDArray[np.float64]:

@@ -17,7 +17,12 @@ from vlcrender.recipe import load_plan
 from vlcrender.scene import load_scene
 from vlcrender.visibility import ENOUGH_LEDS, level_coverage, tilted_coverage
 
-app = App(name="vlcrender", help=__doc__.splitlines()[0], version=__version__, help_format="plaintext")
+app = App(
+    name="vlcrender",
+    help="Render what a tilted camera sees of ceiling LED panels, with ground truth.",
+    version=__version__,
+    help_format="plaintext",
+)
 HEIGHTS_M = (0.0, 0.75)
 """Floor and desk."""
 

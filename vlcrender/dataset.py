@@ -110,10 +110,17 @@ def led_map(leds: Leds) -> tuple[LedMapEntry, ...]:
 
 
 def write_exr(path: Path, image: NDArray[np.uint32] | NDArray[np.float32], attributes: Mapping[str, Any]) -> str:
-    """Write a one-channel (Y) image losslessly and return the file's SHA-256. The file appears whole or not at all."""
+    """Write a one-channel (Y) image losslessly and return the file's SHA-256.
+
+    The file appears whole or not at all. Raises InputError where it cannot be written.
+    """
     header = {"compression": OpenEXR.PIZ_COMPRESSION, "type": OpenEXR.scanlineimage, **attributes}
     partial = path.with_suffix(".partial")
-    OpenEXR.File(header, {"Y": np.ascontiguousarray(image)}).write(str(partial))
+    try:
+        OpenEXR.File(header, {"Y": np.ascontiguousarray(image)}).write(str(partial))
+    except RuntimeError as error:  # OpenEXR's word for a full disk as well
+        partial.unlink(missing_ok=True)
+        raise InputError(f"{path}: cannot be written: {' '.join(str(error).split())}") from None
     digest = sha256_of(partial)
     os.replace(partial, path)
     return digest

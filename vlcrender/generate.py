@@ -78,7 +78,8 @@ def generate(
     job = Job(plan.recipe.model_dump_json(), plan.scene.settings.model_dump_json(), str(directory))
     done = _journal(directory)
     missing = [frame for frame in range(plan.recipe.poses.count) if frame not in done]
-    progress(len(done), plan.recipe.poses.count)
+    if done:
+        progress(len(done), plan.recipe.poses.count)
     with (directory / "journal.jsonl").open("a", encoding="utf-8") as journal:
         for record in _records(job, missing, workers, scheduler):
             done[record["frame"]] = record

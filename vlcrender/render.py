@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vlcrender.backend import dr, mi
+from vlcrender.backend import dr, exact_math, mi
 from vlcrender.camera import Camera, Pose, project
 from vlcrender.errors import InputError
 from vlcrender.irradiance import led_face_luminance_cd_m2, surface_luminance_cd_m2
@@ -87,17 +87,18 @@ class Renderer:
 
     def background_cd_m2(self, camera: Camera, pose: Pose) -> Image:
         """Luminance of the surfaces times cos^4 of the field angle, averaged over each pixel, (height, width)."""
-        width, height = camera.width_px, camera.height_px
-        index = dr.arange(mi.UInt32, width * height)
-        row = index // width
-        u, v = mi.Float(index - row * width) + 0.5, mi.Float(row) + 0.5
-        value, surface = self._look(camera, pose, u, v)
-        dr.eval(value, surface)
-        image: Image = value.numpy().reshape(height, width)
-        edges = np.flatnonzero(_differs_from_neighbour(surface.numpy().reshape(height, width)))
-        if len(edges):
-            image.ravel()[edges] = self._supersample(camera, pose, edges)
-        return image
+        with exact_math():
+            width, height = camera.width_px, camera.height_px
+            index = dr.arange(mi.UInt32, width * height)
+            row = index // width
+            u, v = mi.Float(index - row * width) + 0.5, mi.Float(row) + 0.5
+            value, surface = self._look(camera, pose, u, v)
+            dr.eval(value, surface)
+            image: Image = value.numpy().reshape(height, width)
+            edges = np.flatnonzero(_differs_from_neighbour(surface.numpy().reshape(height, width)))
+            if len(edges):
+                image.ravel()[edges] = self._supersample(camera, pose, edges)
+            return image
 
     def _look(self, camera: Camera, pose: Pose, u: "mi.Float", v: "mi.Float") -> "tuple[mi.Float, mi.UInt32]":
         """Luminance times cos^4 and surface number that pixels (u, v) see."""

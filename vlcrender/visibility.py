@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from vlcrender.camera import Camera, Pose, project, rays_world
+from vlcrender.camera import Camera, Pose, project, rays_world, transform
 from vlcrender.scene import Scene
 from vlcrender.streams import stream
 
@@ -35,7 +35,8 @@ class Coverage:
 def leds_in_view(camera: Camera, pose: Pose, scene: Scene, margin_px: float = 0.0) -> NDArray[np.int64]:
     """Indices of the LEDs whose whole disc is on the sensor, at least `margin_px` from its border."""
     leds = scene.leds
-    candidates = np.flatnonzero(_on_sensor(camera, (leds.centers_m - np.array(pose.position_m)) @ pose.rotation.T))
+    centers_cam = transform(pose.rotation, leds.centers_m - np.array(pose.position_m))
+    candidates = np.flatnonzero(_on_sensor(camera, centers_cam))
     angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     rim = np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=1)
     # The circumscribed 24-gon: what holds it holds the disc.
@@ -62,7 +63,7 @@ def level_coverage(camera: Camera, scene: Scene, height_m: float, yaw_deg: float
     for center in scene.leds.centers_m[scene.leds.centers_m[:, 2] > height_m]:
         reach = np.hypot(corners[:, 0], corners[:, 1]).max() * (center[2] - height_m)
         near = np.array(tree.query_ball_point(center[:2], reach), dtype=np.int64)
-        counts[near] += _on_sensor(camera, (center - positions[near]) @ pose.rotation.T)
+        counts[near] += _on_sensor(camera, transform(pose.rotation, center - positions[near]))
     side = "x" if yaw_deg == 0 else "y"
     return Coverage(height_m, f"level, long side along {side}", len(positions), int((counts >= ENOUGH_LEDS).sum()))
 
@@ -91,7 +92,7 @@ def tilted_coverage(camera: Camera, scene: Scene, height_m: float) -> Coverage:
 def _on_sensor(camera: Camera, p_cam: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Whether points in camera axes (n, 3) are imaged on the sensor, shape (n,)."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        pixels = (p_cam / p_cam[:, 2:]) @ camera.matrix[:2].T
+        pixels = transform(camera.matrix[:2], p_cam / p_cam[:, 2:])
     tolerance = 1e-6  # a point on the border counts, whichever way its last digit rounds
     seen: NDArray[np.bool_] = (p_cam[:, 2] > 0) & (
         (pixels >= -tolerance) & (pixels <= np.array([camera.width_px, camera.height_px]) + tolerance)
