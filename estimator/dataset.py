@@ -16,6 +16,8 @@ from estimator.errors import InputError
 from estimator.tables import Number, Positive, Row, Triple, first_line, first_problem, read_rows
 
 INT64_MAX = 2**63 - 1
+MOST_PIXELS = 16
+"""How many times the sensor's pixels the windows of a frame may hold, which may reach beyond it."""
 LedId = Annotated[int, Field(ge=0, le=INT64_MAX)]
 # Within 1000 km of the origin: then no range, even a wrong one, is too large to be written down.
 Place = Annotated[float, Field(ge=-1e6, le=1e6)]
@@ -23,10 +25,12 @@ Place = Annotated[float, Field(ge=-1e6, le=1e6)]
 SPOT_TYPE = pa.struct([("led", pa.int64()), ("u_px", pa.float64()), ("v_px", pa.float64())])
 FRAME_COLUMNS = {
     "frame": pa.int64(),
+    "shot": pa.int64(),
     "file": pa.string(),
     "sha256": pa.string(),
     "camera": pa.string(),
     "exposure_s": pa.float64(),
+    "capturable": pa.bool_(),
     "accelerometer_m_s2": pa.list_(pa.float64()),
     "spots": pa.list_(SPOT_TYPE),
 }
@@ -41,6 +45,8 @@ class Camera(Row):
     pixel_pitch_um: Positive
     focal_length_mm: Positive
     f_number: Positive
+    R_cam_rig: tuple[Triple, Triple, Triple]
+    offset_m: Triple
 
     @field_validator("K")
     @classmethod
@@ -88,10 +94,12 @@ class FrameRecord(Row):
     """A row of frames.parquet."""
 
     frame: int = Field(ge=0)
+    shot: int = Field(ge=0)
     file: str
     sha256: str = Field(pattern="^[0-9a-fA-F]{64}$")
     camera: str
     exposure_s: Positive
+    capturable: bool
     accelerometer_m_s2: Triple
     spots: Annotated[tuple[DecodedSpot, ...], Strict(False)]
 
@@ -112,7 +120,7 @@ class _Description(Row):
     """dataset.json without `provenance`: with the seed in it, the truth could be computed."""
 
     format: Literal["vlcrender-dataset"]
-    version: Literal[1]
+    version: Literal[2]
     name: str
     frame_count: int = Field(ge=0, le=INT64_MAX)
     cameras: dict[str, Camera]
@@ -144,28 +152,37 @@ class Dataset:
 
 
 @dataclass(frozen=True, eq=False)
-class DeviceFrame:
-    """One image, (height, width) digital numbers with row 0 on top, and all the device knows while taking it."""
+class Part:
+    """A window of the sensor: `image_dn` (rows, columns), row 0 on top, from pixel (row, column) of the sensor on."""
 
+    row: int
+    column: int
     image_dn: NDArray[np.uint32]
+
+
+@dataclass(frozen=True, eq=False)
+class DeviceFrame:
+    """What was read out, which is one part for a full frame, and all the device knows while taking it."""
+
+    parts: tuple[Part, ...]
     camera: Camera
     sensor: Sensor
     accelerometer_m_s2: tuple[float, float, float]
     spots: tuple[DecodedSpot, ...]
     leds: dict[int, Led]
 
-    def electrons(self) -> NDArray[np.float32]:
-        """The image in electrons above the black level, (height, width)."""
-        image = self.image_dn.astype(np.float32)
+    def electrons(self, part: Part) -> NDArray[np.float32]:
+        """A part in electrons above the black level, (rows, columns)."""
+        image = part.image_dn.astype(np.float32)
         if self.sensor.black_level_dn != 0:
             image -= np.float32(self.sensor.black_level_dn)
         if self.sensor.gain_e_per_dn != 1:
             image *= np.float32(self.sensor.gain_e_per_dn)
         return image
 
-    def clipped(self) -> NDArray[np.bool_]:
-        """Where the pixel is full and its electrons are unknown, (height, width)."""
-        return self.image_dn >= self.sensor.largest_dn()
+    def clipped(self, part: Part) -> NDArray[np.bool_]:
+        """Where a pixel of a part is full and its electrons are unknown, (rows, columns)."""
+        return part.image_dn >= self.sensor.largest_dn()
 
 
 def read_dataset(folder: Path) -> Dataset:
@@ -199,9 +216,13 @@ def _check_frames(path: Path, dataset: Dataset, frame_count: int) -> None:
     """Refuse records that disagree with dataset.json or with each other."""
     if len(dataset.frames) != frame_count:
         raise InputError(f"{path}: {len(dataset.frames)} rows, but dataset.json says frame_count {frame_count}")
+    shot = -1
     for index, record in enumerate(dataset.frames):
         if record.frame != index:
             raise InputError(f"{path}: row {index} holds frame {record.frame}; frames have to be 0, 1, 2, ... in order")
+        if record.shot not in (max(shot, 0), shot + 1):
+            raise InputError(f"{path}: frame {index}: shot {record.shot}; shots have to be 0, 1, 2, ... in order")
+        shot = record.shot
         if record.camera not in dataset.cameras:
             known = ", ".join(dataset.cameras) or "none"
             raise InputError(f"{path}: frame {index}: unknown camera {record.camera!r}; cameras: {known}")
@@ -215,16 +236,15 @@ def _check_frames(path: Path, dataset: Dataset, frame_count: int) -> None:
 def read_frame(dataset: Dataset, record: FrameRecord) -> DeviceFrame:
     """Read one frame's image; raises InputError where the file is missing, damaged, or not the image it should be."""
     camera = dataset.cameras[record.camera]
-    image = _read_exr(dataset.folder, record, camera)
+    parts = _read_exr(dataset.folder, record, camera)
     ceiling = 2**dataset.sensor.bits - 1
-    if image.max() > ceiling:
-        raise InputError(
-            f"{record.file}: digital number {image.max()}, but {dataset.sensor.bits} bits end at {ceiling}"
-        )
-    return DeviceFrame(image, camera, dataset.sensor, record.accelerometer_m_s2, record.spots, dataset.leds)
+    largest = max(part.image_dn.max() for part in parts)
+    if largest > ceiling:
+        raise InputError(f"{record.file}: digital number {largest}, but {dataset.sensor.bits} bits end at {ceiling}")
+    return DeviceFrame(parts, camera, dataset.sensor, record.accelerometer_m_s2, record.spots, dataset.leds)
 
 
-def _read_exr(folder: Path, record: FrameRecord, camera: Camera) -> NDArray[np.uint32]:
+def _read_exr(folder: Path, record: FrameRecord, camera: Camera) -> tuple[Part, ...]:
     try:
         data = (folder / record.file).read_bytes()
     except OSError as error:
@@ -234,31 +254,47 @@ def _read_exr(folder: Path, record: FrameRecord, camera: Camera) -> NDArray[np.u
         raise InputError(f"{record.file}: damaged or changed (its sha256 is not the one in frames.parquet)")
     try:
         with OpenEXR.File(io.BytesIO(data), header_only=True) as file:
-            _check_header(record.file, [part.header for part in file.parts], camera)
-        with OpenEXR.File(io.BytesIO(data)) as file:
-            image = file.channels()["Y"].pixels
+            boxes = _check_headers(record, [part.header for part in file.parts], camera)
+        # In a file of several parts the channels would otherwise be merged by their names.
+        with OpenEXR.File(io.BytesIO(data), separate_channels=True) as file:
+            images = [part.channels["Y"].pixels for part in file.parts]
     except (RuntimeError, ValueError, TypeError, KeyError) as error:
         raise InputError(f"{record.file}: not a readable EXR image ({first_line(error)})") from None
-    if image is None or image.dtype != np.uint32 or image.shape != (camera.height_px, camera.width_px):
-        raise InputError(f"{record.file}: channel Y has to hold 32-bit unsigned integers, one a pixel")
-    return np.asarray(image, dtype=np.uint32)
+    if len(images) != len(boxes):  # a part whose pixels cannot be read is left out without a word
+        raise InputError(f"{record.file}: not a readable EXR image ({len(images)} of {len(boxes)} parts)")
+    parts = []
+    for box, image in zip(boxes, images, strict=True):
+        rows, columns = (box[1] - box[0] + 1)[::-1].tolist()
+        if image is None or image.dtype != np.uint32 or image.shape != (rows, columns):
+            raise InputError(f"{record.file}: channel Y has to hold 32-bit unsigned integers, one a pixel")
+        parts.append(Part(int(box[0, 1]), int(box[0, 0]), np.asarray(image, dtype=np.uint32)))
+    return tuple(parts)
 
 
-def _check_header(file: str, headers: list[dict[str, object]], camera: Camera) -> None:
-    """Refuse an image of the wrong kind or size before memory is set aside for it."""
-    if len(headers) != 1:
-        raise InputError(f"{file}: {len(headers)} parts, needed 1")
-    header = headers[0]
-    if header["type"] != OpenEXR.scanlineimage:
-        raise InputError(f"{file}: not stored as scan lines")
-    channels = [channel.name for channel in header["channels"]]  # type: ignore[attr-defined]
-    if channels != ["Y"]:
-        raise InputError(f"{file}: channels {', '.join(channels)}, needed Y alone")
-    data, display = np.array(header["dataWindow"]), np.array(header["displayWindow"])
-    if not np.array_equal(data, display):
-        raise InputError(f"{file}: dataWindow {data.tolist()} differs from displayWindow {display.tolist()}")
-    width_px, height_px = (data[1] - data[0] + 1).tolist()
-    if (width_px, height_px) != (camera.width_px, camera.height_px):
-        raise InputError(
-            f"{file}: {width_px} x {height_px} pixels, but the camera has {camera.width_px} x {camera.height_px}"
-        )
+def _check_headers(record: FrameRecord, headers: list[dict[str, object]], camera: Camera) -> list[NDArray[np.int64]]:
+    """Refuse an image of the wrong kind or size before memory is set aside; else its windows, [first, last] (u, v)."""
+    sensor = np.array([[0, 0], [camera.width_px - 1, camera.height_px - 1]], dtype=np.int64)
+    boxes: list[NDArray[np.int64]] = []
+    for header in headers:
+        if header["type"] != OpenEXR.scanlineimage:
+            raise InputError(f"{record.file}: not stored as scan lines")
+        channels = [channel.name for channel in header["channels"]]  # type: ignore[attr-defined]
+        if channels != ["Y"]:
+            raise InputError(f"{record.file}: channels {', '.join(channels)}, needed Y alone")
+        shown = np.array(header["displayWindow"], dtype=np.int64)
+        if not np.array_equal(shown, sensor):
+            width_px, height_px = (shown[1] - shown[0] + 1).tolist()
+            raise InputError(
+                f"{record.file}: displayWindow {shown.tolist()}, {width_px} x {height_px} pixels, "
+                f"but the camera has {camera.width_px} x {camera.height_px}"
+            )
+        box = np.array(header["dataWindow"], dtype=np.int64)
+        if record.capturable and ((box[0] < sensor[0]) | (box[1] > sensor[1])).any():
+            raise InputError(f"{record.file}: dataWindow {box.tolist()} reaches beyond the sensor, but is capturable")
+        if any(((box[0] <= other[1]) & (other[0] <= box[1])).all() for other in boxes):
+            raise InputError(f"{record.file}: dataWindow {box.tolist()} overlaps another part's")
+        boxes.append(box)
+    pixels = sum(int((box[1] - box[0] + 1).prod()) for box in boxes)
+    if pixels > MOST_PIXELS * camera.width_px * camera.height_px:
+        raise InputError(f"{record.file}: {pixels} pixels, more than {MOST_PIXELS} times the sensor's")
+    return boxes

@@ -5,6 +5,7 @@ its own level gives an ellipse, and the centroid is taken over that ellipse grow
 light is in it, blurred or not, and the background around it cancels.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -51,6 +52,20 @@ class Spot:
 
 
 @dataclass(frozen=True, eq=False)
+class Readout:
+    """A window of the sensor in electrons, (rows, columns), from pixel (row, column) of the sensor on.
+
+    `raw_e` is the image before the denoiser and `clipped` where it was full.
+    """
+
+    row: int
+    column: int
+    image_e: NDArray[np.float32]
+    raw_e: NDArray[np.float32]
+    clipped: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
 class _Ellipse:
     """The part of a blob above half level: its centroid (u, v) and the ellipse of the same second moments."""
 
@@ -71,18 +86,28 @@ class _Ellipse:
         return np.asarray(np.sqrt((self.axes**2) @ (self.semi_axes_px + grown_px) ** 2))
 
 
-def detect(
-    image_e: NDArray[np.float32], raw_e: NDArray[np.float32], clipped: NDArray[np.bool_], reach_px: int
-) -> tuple[Spot, ...]:
-    """Find the lamps in an image of electrons, (height, width).
+def detect(readouts: Sequence[Readout], sensor_px: int, reach_px: int) -> tuple[Spot, ...]:
+    """Find the lamps in what was read out of a sensor of `sensor_px` pixels: all of it, or windows around lamps.
 
-    `raw_e` is the image before the denoiser, `clipped` where it was full, and `reach_px` the half width of the box that
-    the denoiser averaged over, 0 where `image_e` is the raw image. A spot whose light may go over the image's border is
-    reported and flagged: its centroid is biased. Raises EstimationFailure where there is no spot at all.
+    `reach_px` is the half width of the box that the denoiser averaged over, 0 where the images are the raw ones. A spot
+    whose light may go over the border of its window is reported and flagged: its centroid is biased. Raises
+    EstimationFailure where there is no spot at all.
     """
-    smooth = cv2.blur(image_e, (SMOOTHING_PX, SMOOTHING_PX), borderType=cv2.BORDER_REPLICATE)
-    background_e, threshold_e = _levels(smooth)
-    ellipses = _ellipses(smooth, background_e, threshold_e)
+    size = (SMOOTHING_PX, SMOOTHING_PX)
+    smooth = [cv2.blur(readout.image_e, size, borderType=cv2.BORDER_REPLICATE) for readout in readouts]
+    whole = sum(image.size for image in smooth) == sensor_px and len(smooth) == 1
+    background_e, threshold_e = _levels(smooth, whole)
+    spots: list[Spot] = []
+    for readout, image in zip(readouts, smooth, strict=True):
+        ellipses = _ellipses(image, background_e, threshold_e, LARGEST_BLOB_OF_FRAME * sensor_px)
+        spots += _spots(readout, ellipses, reach_px)
+    if not spots:
+        raise EstimationFailure("detect", "no spot found")
+    return tuple(spots)
+
+
+def _spots(readout: Readout, ellipses: Sequence[_Ellipse], reach_px: int) -> list[Spot]:
+    """Measure each ellipse of a window, beside those near it."""
     margin_px = MARGIN_PX + reach_px
     centres = np.array([ellipse.centre_px for ellipse in ellipses]).reshape(-1, 2)
     extents = np.array([ellipse.half_extent(margin_px + RING_PX) for ellipse in ellipses]).reshape(-1, 2)
@@ -90,26 +115,36 @@ def detect(
     for index, ellipse in enumerate(ellipses):
         overlaps = (np.abs(centres - centres[index]) < extents + extents[index]).all(axis=1)
         overlaps[index] = False
-        others = [ellipses[other] for other in np.flatnonzero(overlaps)]
-        spot = _measure(image_e, raw_e, clipped, ellipse, others, reach_px)
+        others = [ellipses[other] for other in np.flatnonzero(overlaps).tolist()]
+        spot = _measure(readout, ellipse, others, reach_px)
         if spot is not None:
             spots.append(spot)
-    if not spots:
-        raise EstimationFailure("detect", "no spot found")
-    return tuple(spots)
+    return spots
 
 
-def _levels(smooth: NDArray[np.float32]) -> tuple[float, float]:
-    """Median background and the threshold for blobs, electrons; every few pixels are enough for either."""
-    step = max(1, smooth.shape[1] // 500)
-    sample = smooth[::step, ::step]
-    background = float(np.median(sample))
-    sigma = 1.4826 * float(np.median(np.abs(sample - background)))
-    above_walls = THRESHOLD_OF_BRIGHTEST * (float(smooth.max()) - background)
+def _levels(smooth: Sequence[NDArray[np.float32]], whole: bool) -> tuple[float, float]:
+    """Background and the threshold for blobs, electrons.
+
+    In the whole image most pixels are background, and every few of them are enough. A lamp may fill most of a window
+    around it, but not of the window's outermost pixels: the darkest quarter of these is background, blurred or not.
+    """
+    if whole:
+        (image,) = smooth
+        step = max(1, image.shape[1] // 500)
+        sample = image[::step, ::step]
+        background = float(np.median(sample))
+        sigma = 1.4826 * float(np.median(np.abs(sample - background)))
+    else:
+        outermost = np.concatenate([np.concatenate([s[0], s[-1], s[:, 0], s[:, -1]]) for s in smooth])
+        low, background = map(float, np.percentile(outermost, [5, 25]))
+        sigma = (background - low) / 0.9704  # between these percentiles of a normal distribution
+    above_walls = THRESHOLD_OF_BRIGHTEST * (max(float(image.max()) for image in smooth) - background)
     return background, background + max(THRESHOLD_SIGMA * sigma, above_walls)
 
 
-def _ellipses(smooth: NDArray[np.float32], background_e: float, threshold_e: float) -> list[_Ellipse]:
+def _ellipses(
+    smooth: NDArray[np.float32], background_e: float, threshold_e: float, largest_px: float
+) -> list[_Ellipse]:
     """The blobs above the threshold, cut at half of their own level, as ellipses."""
     mask = (smooth > threshold_e).view(np.uint8)
     _, labels, boxes, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
@@ -117,7 +152,7 @@ def _ellipses(smooth: NDArray[np.float32], background_e: float, threshold_e: flo
     by_area = np.argsort(-boxes[1:, cv2.CC_STAT_AREA], kind="stable") + 1
     for label in by_area[:MOST_BLOBS]:
         left, top, width, height, area = (int(value) for value in boxes[label])
-        if not SMALLEST_BLOB_PX <= area <= LARGEST_BLOB_OF_FRAME * smooth.size:
+        if not SMALLEST_BLOB_PX <= area <= largest_px:
             continue
         window = np.s_[top : top + height, left : left + width]
         own = labels[window] == label
@@ -143,23 +178,16 @@ def _ellipse(core: NDArray[np.bool_], left: int, top: int) -> _Ellipse:
     return _Ellipse(centre, axes, 2 * np.sqrt(np.maximum(variances, 0)) + 0.5, len(rows))
 
 
-def _measure(
-    image_e: NDArray[np.float32],
-    raw_e: NDArray[np.float32],
-    clipped: NDArray[np.bool_],
-    ellipse: _Ellipse,
-    others: list[_Ellipse],
-    reach_px: int,
-) -> Spot | None:
+def _measure(readout: Readout, ellipse: _Ellipse, others: list[_Ellipse], reach_px: int) -> Spot | None:
     """Centroid and covariance of one spot, or None where it does not stand out of its own noise."""
     margin_px = MARGIN_PX + reach_px
-    height_px, width_px = image_e.shape
+    height_px, width_px = readout.image_e.shape
     reach = ellipse.half_extent(margin_px + RING_PX)
     left, top = np.maximum(np.floor(ellipse.centre_px - reach), 0).astype(int)
     right, bottom = np.minimum(np.ceil(ellipse.centre_px + reach), (width_px, height_px)).astype(int)
     window = np.s_[top:bottom, left:right]
     u_px, v_px = np.arange(left, right)[None, :] + 0.5, np.arange(top, bottom)[:, None] + 0.5
-    electrons = image_e[window].astype(np.float64)
+    electrons = readout.image_e[window].astype(np.float64)
 
     distance = ellipse.radius(u_px, v_px, margin_px)
     support = distance <= 1
@@ -173,7 +201,7 @@ def _measure(
 
     signal = np.where(support, electrons - background_e, 0.0)
     # Shot noise: a raw pixel's variance is its electrons.
-    variance = np.maximum(raw_e[window].astype(np.float64), 0.0)
+    variance = np.maximum(readout.raw_e[window].astype(np.float64), 0.0)
     flux = signal.sum()
     if flux <= LEAST_SIGNAL_TO_NOISE * np.sqrt(variance[support].sum()):
         return None
@@ -191,13 +219,13 @@ def _measure(
     light = ellipse.half_extent(margin_px)
     low, high = ellipse.centre_px - light, ellipse.centre_px + light
     return Spot(
-        u_px=u,
-        v_px=v,
+        u_px=u + readout.column,
+        v_px=v + readout.row,
         covariance_px2=covariance,
-        brightest_u_px=float(u_px[0, brightest[1]]),
-        brightest_v_px=float(v_px[brightest[0], 0]),
+        brightest_u_px=float(u_px[0, brightest[1]]) + readout.column,
+        brightest_v_px=float(v_px[brightest[0], 0]) + readout.row,
         area_px=ellipse.area_px,
         peak_e=float(electrons[brightest]),
         touches_border=bool((low < 0).any() or high[0] > width_px or high[1] > height_px),
-        saturated=bool(clipped[window][inside].any()),
+        saturated=bool(readout.clipped[window][inside].any()),
     )

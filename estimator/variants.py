@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from estimator.dataset import DeviceFrame
 from estimator.denoise import REACH_PX, neighbourhood_mean
-from estimator.detect import detect
+from estimator.detect import Readout, detect
 from estimator.errors import EstimationFailure
 from estimator.identify import Sighting, identify
 from estimator.position import position_from_pixels, position_from_ranges
@@ -16,6 +16,7 @@ from estimator.ranging import PairLaw, law_of_sines, led_ranges, printed_eq3
 from estimator.rectify import level, rotation, tilt_from_gravity
 
 Floats = NDArray[np.float64]
+Image = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +38,7 @@ class Variant:
 
 def huynh2016(frame: DeviceFrame) -> Estimate:
     """Huynh & Yoo 2016 with its slips corrected, and centroids in place of brightest pixels."""
-    sightings = _denoised_sightings(frame)
+    sightings = _sightings(frame, neighbourhood_mean, REACH_PX)
     return _two_step(frame, sightings, _centroids(sightings), law_of_sines)
 
 
@@ -48,22 +49,24 @@ def huynh2016_as_printed(frame: DeviceFrame) -> Estimate:
     Algorithm 1 (the adjusted intensity is not said; it takes c - mu_S). Eq. 4 has no z with LEDs at one height: z is
     taken from the spheres, as in `huynh2016`, and not by moving LEDs in z.
     """
-    sightings = _denoised_sightings(frame)
+    sightings = _sightings(frame, neighbourhood_mean, REACH_PX)
     pixels = np.array([(sighting.spot.brightest_u_px, sighting.spot.brightest_v_px) for sighting in sightings])
     return _two_step(frame, sightings, pixels, printed_eq3)
 
 
 def pnp(frame: DeviceFrame) -> Estimate:
     """Perspective-n-point on centroids of the raw image; gravity is not used."""
-    raw = frame.electrons()
-    spots = detect(raw, raw, frame.clipped(), reach_px=0)
-    sightings = identify(spots, frame.spots, frame.leds)
+    sightings = _sightings(frame, lambda image: image, reach_px=0)
     return Estimate(position_from_pixels(_positions(sightings), _centroids(sightings), frame.camera.matrix()))
 
 
-def _denoised_sightings(frame: DeviceFrame) -> tuple[Sighting, ...]:
-    raw = frame.electrons()
-    spots = detect(neighbourhood_mean(raw), raw, frame.clipped(), REACH_PX)
+def _sightings(frame: DeviceFrame, denoise: Callable[[Image], Image], reach_px: int) -> tuple[Sighting, ...]:
+    """The LEDs in a frame; `denoise` averages over `reach_px` pixels on each side."""
+    readouts = []
+    for part in frame.parts:
+        raw = frame.electrons(part)
+        readouts.append(Readout(part.row, part.column, denoise(raw), raw, frame.clipped(part)))
+    spots = detect(readouts, frame.camera.width_px * frame.camera.height_px, reach_px)
     return identify(spots, frame.spots, frame.leds)
 
 

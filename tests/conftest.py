@@ -1,5 +1,7 @@
 """Shared fixtures: the two scenes, a camera of a hundredth of the pixels, and small datasets made once."""
 
+import os
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +9,9 @@ import pytest
 
 from vlcrender.camera import Camera
 from vlcrender.scene import Scene, load_scene
+
+os.environ.setdefault("VLCRENDER_CACHE", tempfile.mkdtemp(prefix="vlcrender-tests-"))
+# No bake of an earlier run is taken, and processes that tests start share this one's.
 
 ROOT = Path(__file__).parent.parent
 SMALL = (

@@ -133,10 +133,12 @@ TRUTH_LED = pa.struct([*SPOT, pa.field("visible_fraction", pa.float64())])
 FRAMES_SCHEMA = pa.schema(
     [
         ("frame", pa.int64()),
+        ("shot", pa.int64()),
         ("file", pa.string()),
         ("sha256", pa.string()),
         ("camera", pa.string()),
         ("exposure_s", pa.float64()),
+        ("capturable", pa.bool_()),
         ("accelerometer_m_s2", pa.list_(pa.float64(), 3)),
         ("spots", pa.list_(SPOT)),
     ]
@@ -144,6 +146,7 @@ FRAMES_SCHEMA = pa.schema(
 TRUTH_SCHEMA = pa.schema(
     [
         ("frame", pa.int64()),
+        ("shot", pa.int64()),
         ("position_m", pa.list_(pa.float64(), 3)),
         ("R_cam_world", pa.list_(pa.float64(), 9)),
         ("tilt_x_deg", pa.float64()),
@@ -179,10 +182,12 @@ def write_dataset(
         frames.append(
             {
                 "frame": index,
+                "shot": index,
                 "file": file,
                 "sha256": write_exr(folder / file, image),
                 "camera": "main",
                 "exposure_s": 1e-3,
+                "capturable": True,
                 "accelerometer_m_s2": view.gravity_m_s2.tolist(),
                 "spots": [{"led": 10 + k, "u_px": rough[k, 0], "v_px": rough[k, 1]} for k in seen],
             }
@@ -190,6 +195,7 @@ def write_dataset(
         truth.append(
             {
                 "frame": index,
+                "shot": index,
                 "position_m": list(view.position_m),
                 "R_cam_world": view.R_cam_world.ravel().tolist(),
                 "tilt_x_deg": view.tilt_x_deg,
@@ -211,7 +217,7 @@ def description(view: View, frame_count: int, leds_m: Array, radius_m: float) ->
     pitch_um = 18000 / view.focal_px
     return {
         "format": "vlcrender-dataset",
-        "version": 1,
+        "version": 2,
         "name": "synthetic <&>",
         "frame_count": frame_count,
         "cameras": {
@@ -222,6 +228,8 @@ def description(view: View, frame_count: int, leds_m: Array, radius_m: float) ->
                 "pixel_pitch_um": pitch_um,
                 "focal_length_mm": 18.0,
                 "f_number": 2.0,
+                "R_cam_rig": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+                "offset_m": [0.0, 0.0, 0.0],
             }
         },
         "sensor": {"bits": 16, "gain_e_per_dn": 1.0, "full_well_e": 60000, "black_level_dn": 0, "noise": "shot"},

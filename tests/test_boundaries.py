@@ -16,7 +16,7 @@ LIBRARY_ROOMS = {
     "cv2": {"estimator"},
     "colour": {"vlcrender/photometry.py"},
 }
-BACKEND_ROOMS = {"backend", "irradiance", "render", "reference"}
+BACKEND_ROOMS = {"backend", "background", "furniture", "irradiance", "poisson", "raycast", "reference", "render"}
 """Modules of vlcrender that may use Mitsuba, through `backend`."""
 
 

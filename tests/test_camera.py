@@ -1,9 +1,24 @@
 """Axes and signs: each one written down here, so that no two can cancel."""
 
+import cv2
 import numpy as np
 import pytest
 
-from vlcrender.camera import Camera, Pose, mitsuba_to_world, project, rays_world, rotation_cam_world
+from vlcrender.backend import dr, mi
+from vlcrender.camera import (
+    Camera,
+    Pose,
+    image_of_points,
+    mitsuba_to_world,
+    pixel_of_point,
+    project,
+    ray_of_pixel,
+    rays_world,
+    rotation_cam_world,
+)
+from vlcrender.distortion import Distortion, distort_with_slope
+from vlcrender.errors import InputError
+from vlcrender.settings import check
 
 LAMP = np.array([3.0, 4.0, 3.5])
 
@@ -94,3 +109,139 @@ def test_mitsubas_camera_is_a_proper_rotation_with_x_left_and_y_up() -> None:
     assert np.allclose(matrix[:3, 0], -pose.rotation[0])  # Mitsuba's +x is our image's left
     assert np.allclose(matrix[:3, 1], -pose.rotation[1])  # its +y our image's up
     assert np.allclose(matrix[:3, 2], pose.rotation[2])  # both look along +z
+
+
+WIDE = {"width_px": 4000, "height_px": 3000, "pixel_pitch_um": 1.2, "focal_length_mm": 4.0}
+"""62 x 48 deg: distorted positions reach a radius of 0.75."""
+BARREL = Camera(**WIDE, skew_px=5.0, distortion=Distortion(k1=-0.2, k2=0.05, k3=-0.01, p1=0.002, p2=-0.003))
+PINCUSHION = Camera(**WIDE, distortion=Distortion(k1=0.2, k2=0.1, p1=-0.01, p2=0.01))
+FISHEYE = Camera(**(WIDE | {"focal_length_mm": 1.4}), projection="equidistant", principal_point_px=(1950.0, 1540.0))
+"""Sees 102 deg off the axis in the corners."""
+LENSES = {"barrel": BARREL, "pincushion": PINCUSHION, "fish-eye": FISHEYE}
+
+
+@pytest.mark.parametrize("camera", LENSES.values(), ids=LENSES)
+def test_rays_and_pixels_undo_each_other(camera: Camera, rng: np.random.Generator) -> None:
+    u, v = rng.uniform([[0], [0]], [[4000], [3000]], (2, 10_000))
+    again = pixel_of_point(camera, *ray_of_pixel(camera, u, v))
+    # 4000 px * 2^-52 = 1e-12 px, times the dozen operations there and back
+    assert np.abs(again[0] - u).max() < 1e-10
+    assert np.abs(again[1] - v).max() < 1e-10
+
+
+@pytest.mark.parametrize("camera", LENSES.values(), ids=LENSES)
+def test_rays_are_the_same_in_a_kernel(camera: Camera, rng: np.random.Generator) -> None:
+    u, v = rng.uniform([[0], [0]], [[4000], [3000]], (2, 1000)).astype(np.float32)
+    rays = np.stack(ray_of_pixel(camera, u.astype(float), v.astype(float)))
+    kernel = np.stack([x.numpy() for x in ray_of_pixel(camera, mi.Float(u), mi.Float(v), dr)])
+    # float32: 2^-24 = 6e-8 an operation, a few dozen operations on numbers up to 1
+    assert np.abs(kernel - rays).max() < 2e-6
+    pixels = np.stack([x.numpy() for x in pixel_of_point(camera, *(mi.Float(x.astype(np.float32)) for x in rays), dr)])
+    assert np.abs(pixels - [u, v]).max() < 4000 * 2e-6
+
+
+@pytest.mark.parametrize("camera", [BARREL, PINCUSHION], ids=["barrel", "pincushion"])
+def test_distortion_is_opencvs(camera: Camera, rng: np.random.Generator) -> None:
+    points = rng.uniform([-1, -0.7, 1.8], [1, 0.7, 2.2], (500, 3))
+    d = camera.distortion
+    assert d is not None
+    # cv2 has no skew: put it in by hand
+    straight = camera.model_copy(update={"skew_px": 0.0})
+    coefficients = np.array([d.k1, d.k2, d.p1, d.p2, d.k3])
+    expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), straight.matrix, coefficients)
+    expected = expected.reshape(-1, 2)
+    expected[:, 0] += camera.skew_px * (expected[:, 1] - camera.center_px[1]) / camera.focal_px
+    assert np.allclose(image_of_points(camera, points), expected, atol=1e-9)
+
+
+def test_negative_k1_is_a_barrel_and_p1_and_p2_pull_along_v_and_u() -> None:
+    at = np.array([0.3, 0.2, 1.0])
+    plain, barrel, p1, p2 = (
+        image_of_points(Camera(**WIDE, distortion=Distortion(**d)), at) - [2000, 1500]
+        for d in ({}, {"k1": -0.1}, {"p1": 0.01}, {"p2": 0.01})
+    )
+    # r^2 = 0.13; f = 10 000 / 3 px
+    assert np.allclose(barrel, plain * (1 - 0.1 * 0.13))
+    assert np.allclose(p1 - plain, 1e4 / 3 * 0.01 * np.array([2 * 0.06, 0.13 + 2 * 0.04]))
+    assert np.allclose(p2 - plain, 1e4 / 3 * 0.01 * np.array([0.13 + 2 * 0.09, 2 * 0.06]))
+
+
+def test_the_slope_of_the_distortion_is_its_slope(rng: np.random.Generator) -> None:
+    d = Distortion(k1=-0.2, k2=0.05, k3=-0.3, p1=0.02, p2=-0.03)
+    x, y = rng.uniform(-0.7, 0.7, (2, 100))
+    h = 1e-6
+    right, left = distort_with_slope(d, x + h, y), distort_with_slope(d, x - h, y)
+    below, above = distort_with_slope(d, x, y + h), distort_with_slope(d, x, y - h)
+    _, _, xx, xy, yy = distort_with_slope(d, x, y)
+    # central differences: h^2 = 1e-12 and 2^-52 / h = 2e-10
+    assert np.allclose((right[0] - left[0]) / (2 * h), xx, atol=2e-9)
+    assert np.allclose((below[0] - above[0]) / (2 * h), xy, atol=2e-9)
+    assert np.allclose((right[1] - left[1]) / (2 * h), xy, atol=2e-9)
+    assert np.allclose((below[1] - above[1]) / (2 * h), yy, atol=2e-9)
+
+
+def test_what_lies_beyond_the_fold_of_a_barrel_has_no_pixel() -> None:
+    # r (1 - 0.3 r^2) turns at r = 1.054; r = 1.6 would come back to 0.37, in the middle of the image
+    camera = Camera(**(WIDE | {"focal_length_mm": 6.0}), distortion=Distortion(k1=-0.3))
+    assert np.isnan(image_of_points(camera, np.array([1.6, 0.0, 1.0]))).all()
+    assert np.isfinite(image_of_points(camera, np.array([0.4, 0.0, 1.0]))).all()
+
+
+@pytest.mark.parametrize("theta_deg", [0.0, 1e-7, 60.0, 90.0, 100.0])
+def test_a_fisheye_puts_light_as_far_out_as_its_angle(theta_deg: float) -> None:
+    theta = np.radians(theta_deg)
+    direction = np.array([np.sin(theta) * 0.6, -np.sin(theta) * 0.8, np.cos(theta)])
+    f = FISHEYE.focal_px
+    pixel = image_of_points(FISHEYE, 3.0 * direction)
+    assert pixel == pytest.approx([1950 + 0.6 * f * theta, 1540 - 0.8 * f * theta], abs=1e-9)
+    assert np.allclose(ray_of_pixel(FISHEYE, *pixel), direction, atol=1e-12)
+
+
+def test_focusing_near_moves_the_sensor_back() -> None:
+    # 1/f = 1/s + 1/f_i: f = 18 mm and s = 198 mm give f_i = 19.8 mm
+    camera = Camera(focus_distance_m=0.198)
+    assert camera.image_distance_mm == pytest.approx(19.8)
+    assert camera.matrix[0, 0] == pytest.approx(16500)
+    assert camera.working_f_number == pytest.approx(2.2 * 1.1)
+    assert Camera(focus_distance_m="infinity").matrix[0, 0] == Camera().matrix[0, 0] == 15000
+
+
+def test_view_angles_follow_the_lens() -> None:
+    assert Camera(focus_distance_m=0.198).view_angles_deg()[0] == pytest.approx(2 * np.degrees(np.arctan(2000 / 16500)))
+    assert FISHEYE.view_angles_deg()[0] == pytest.approx(np.degrees(4000 / FISHEYE.focal_px))
+    barrel = Camera(**WIDE, distortion=Distortion(k1=-0.1)).view_angles_deg()[0]
+    x = np.tan(np.radians(barrel / 2))
+    assert x * (1 - 0.1 * x * x) == pytest.approx(0.6)
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"projection": "fisheye"}, "projection"),
+        (
+            {"projection": "equidistant", "distortion": {"k1": 0.1}},
+            'distortion: is for projection = "perspective" only',
+        ),
+        ({"projection": "equidistant", "focal_length_mm": 0.9}, "180"),
+        ({"focal_length_mm": 4.0, "distortion": {"k1": -0.5}}, "distortion: k1 = -0.5 folds the image"),
+        ({"focal_length_mm": 4.0, "distortion": {"p2": 0.9}}, "distortion: p2 = 0.9 folds the image"),
+        ({"distortion": {"k4": 0.1}}, "unknown key distortion.k4"),
+        ({"focus_distance_m": 0.018}, "focus_distance_m = 0.018: has to exceed the focal length of 0.018 m"),
+        ({"focus_distance_m": -1.0}, 'focus_distance_m = -1.0: has to be a distance in m above 0, or "infinity"'),
+        ({"focus_distance_m": "near"}, "focus_distance_m"),
+        ({"focus_distance_m": True}, "focus_distance_m"),
+        ({"psf": "gauss"}, "psf"),
+        ({"psf": "measured"}, "psf_kernel has to be given"),
+        ({"psf_kernel": [[1.0]]}, "psf_kernel has to be given"),
+        ({"psf": "measured", "psf_kernel": [[0.5, 0.5]]}, "psf_kernel: has to be square, with an odd number"),
+        ({"psf": "measured", "psf_kernel": [[0.9]]}, "psf_kernel: adds up to 0.9"),
+        ({"psf": "measured", "psf_kernel": [[-0.1]]}, "psf_kernel[0][0] = -0.1"),
+        ({"vignetting_deg": 90.0}, "vignetting_deg"),
+        ({"vignetting_deg": 0.0}, "vignetting_deg"),
+    ],
+)
+def test_a_lens_that_cannot_be_is_refused_in_one_line(settings: dict[str, object], said: str) -> None:
+    with pytest.raises(InputError) as refusal:
+        check(settings, Camera, "recipe.toml")
+    assert said in str(refusal.value)
+    assert "\n" not in str(refusal.value)

@@ -67,7 +67,8 @@ def test_a_good_dataset_is_read_as_written(good: Path) -> None:
     assert (len(dataset.frames), len(dataset.leds), min(dataset.leds)) == (3, 20, 10)
     frame = read_frame(dataset, dataset.frames[1])
     with OpenEXR.File(str(good / "frames/000001.exr")) as file:
-        np.testing.assert_array_equal(frame.image_dn, file.channels()["Y"].pixels)
+        (part,) = frame.parts
+        np.testing.assert_array_equal(part.image_dn, file.channels()["Y"].pixels)
     np.testing.assert_array_equal(frame.camera.matrix(), [[1500, 0, 200], [0, 1500, 150], [0, 0, 1]])
     assert frame.accelerometer_m_s2 == pytest.approx((9.80665 * np.sin(np.radians(20)), 4.6076, 7.9806), abs=1e-4)
 
@@ -76,7 +77,8 @@ def test_electrons_undo_the_black_level_and_the_gain(folder: Path) -> None:
     change_json(folder, lambda c: c["sensor"].update(gain_e_per_dn=2.5, black_level_dn=16))
     dataset = read_dataset(folder)
     frame = read_frame(dataset, dataset.frames[0])
-    np.testing.assert_allclose(frame.electrons(), (frame.image_dn.astype(float) - 16) * 2.5)
+    (part,) = frame.parts
+    np.testing.assert_allclose(frame.electrons(part), (part.image_dn.astype(float) - 16) * 2.5)
 
 
 def test_a_full_pixel_is_clipped_at_the_full_well_or_at_the_last_number(folder: Path) -> None:
@@ -84,7 +86,8 @@ def test_a_full_pixel_is_clipped_at_the_full_well_or_at_the_last_number(folder: 
     dataset = read_dataset(folder)
     assert dataset.sensor.largest_dn() == 2010
     frame = read_frame(dataset, dataset.frames[0])
-    np.testing.assert_array_equal(frame.clipped(), frame.image_dn >= 2010)
+    (part,) = frame.parts
+    np.testing.assert_array_equal(frame.clipped(part), part.image_dn >= 2010)
     change_json(folder, lambda c: c["sensor"].update(bits=10))
     assert read_dataset(folder).sensor.largest_dn() == 1023
 
@@ -111,7 +114,7 @@ def test_a_missing_key_is_named(folder: Path, key: str) -> None:
 
 
 WRONG_VALUES: list[tuple[str, Callable[[dict[str, Any]], object]]] = [
-    ("version", lambda c: c.update(version=2)),
+    ("version", lambda c: c.update(version=1)),
     ("format", lambda c: c.update(format="other")),
     ("frame_count", lambda c: c.update(frame_count="3")),
     ("frame_count", lambda c: c.update(frame_count=4)),
@@ -170,6 +173,7 @@ def test_all_wrong_types_everywhere_in_the_json_are_input_errors(folder: Path) -
 WRONG_ROWS: list[tuple[str, Callable[[Rows], object]]] = [
     ("row 1", lambda rows: rows[1].update(frame=2)),
     ("3 rows", lambda rows: rows.append({**rows[0], "frame": 3})),
+    ("shot 2", lambda rows: rows[1].update(shot=2)),
     ("camera 'other'", lambda rows: rows[0].update(camera="other")),
     ("2.sha256", lambda rows: rows[2].update(sha256="0123")),
     ("0.exposure_s", lambda rows: rows[0].update(exposure_s=0.0)),
@@ -284,6 +288,43 @@ def test_an_image_of_another_size_kind_or_range_is_refused(folder: Path) -> None
     with OpenEXR.File({**header, "displayWindow": window}, {"Y": np.zeros((300, 400), np.uint32)}) as file:
         file.write(str(path))
     assert "displayWindow" in refused_frame(folder, **rehash(folder))
+
+
+def write_parts(path: Path, boxes: list[tuple[int, int, int, int]]) -> None:
+    """Parts of (row, column, rows, columns) on a display of 400 x 300."""
+    display = (np.array([0, 0], np.int32), np.array([399, 299], np.int32))
+    parts = []
+    for number, (row, column, rows, columns) in enumerate(boxes):
+        data = (np.array([column, row], np.int32), np.array([column + columns - 1, row + rows - 1], np.int32))
+        header = {"type": OpenEXR.scanlineimage, "displayWindow": display, "dataWindow": data}
+        image = np.full((rows, columns), number + 1, np.uint32)
+        parts.append(OpenEXR.Part(header, {"Y": image}, name=f"window {number}"))
+    OpenEXR.File(parts).write(str(path))
+
+
+def test_windows_are_read_with_their_places(folder: Path) -> None:
+    write_parts(folder / "frames/000000.exr", [(10, 20, 30, 40), (100, 0, 5, 6), (200, 380, 100, 20)])
+    dataset = read_dataset(folder)
+    frame = read_frame(dataset, dataset.frames[0].model_copy(update=rehash(folder)))
+    assert [(part.row, part.column, *part.image_dn.shape) for part in frame.parts] == [
+        (10, 20, 30, 40),
+        (100, 0, 5, 6),
+        (200, 380, 100, 20),
+    ]
+    assert [part.image_dn.max() for part in frame.parts] == [1, 2, 3]
+
+
+def test_windows_that_overlap_or_lie_beyond_the_sensor_are_refused(folder: Path) -> None:
+    path = folder / "frames/000000.exr"
+    write_parts(path, [(10, 20, 30, 40), (39, 59, 5, 5)])
+    assert "overlaps another" in refused_frame(folder, **rehash(folder))
+    write_parts(path, [(-1, 20, 30, 40)])
+    assert "beyond the sensor" in refused_frame(folder, **rehash(folder))
+    dataset = read_dataset(folder)
+    beyond = dataset.frames[0].model_copy(update={**rehash(folder), "capturable": False})
+    assert read_frame(dataset, beyond).parts[0].row == -1
+    write_parts(path, [(0, -1000, 1, 17), (5, 0, 1400, 1400)])
+    assert "16 times the sensor" in refused_frame(folder, **rehash(folder), capturable=False)
 
 
 def test_records_are_unchangeable(good: Path) -> None:

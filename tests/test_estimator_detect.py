@@ -5,7 +5,7 @@ import pytest
 from estimator_synthetic import Array, View, grid, poisson, render, view_of
 
 from estimator.denoise import REACH_PX, neighbourhood_mean
-from estimator.detect import Spot, detect
+from estimator.detect import Readout, Spot, detect
 from estimator.errors import EstimationFailure
 
 SMALL = (400, 300, 1500.0)
@@ -17,8 +17,8 @@ def spots_of(expected_e: Array, denoised: bool = False) -> list[Spot]:
     image = expected_e.astype(np.float32)
     none_full = np.zeros(image.shape, bool)
     if denoised:
-        return list(detect(neighbourhood_mean(image), image, none_full, REACH_PX))
-    return list(detect(image, image, none_full, 0))
+        return list(detect([Readout(0, 0, neighbourhood_mean(image), image, none_full)], image.size, REACH_PX))
+    return list(detect([Readout(0, 0, image, image, none_full)], image.size, 0))
 
 
 def centroids(spots: list[Spot]) -> Array:
@@ -142,7 +142,7 @@ def test_spots_at_the_border_are_flagged_and_others_are_not() -> None:
 def test_saturation_is_told_from_the_raw_image() -> None:
     view = view_of((3, 3, 3), 3.0, size=SMALL)
     image = render(view, np.array([[2.9, 3, 3], [3.1, 3, 3]]), led_e=[900, 1000]).astype(np.float32)
-    spots = detect(neighbourhood_mean(image), image, image >= 1000, REACH_PX)
+    spots = detect([Readout(0, 0, neighbourhood_mean(image), image, image >= 1000)], image.size, REACH_PX)
     assert {spot.u_px > 200: spot.saturated for spot in spots} == {False: False, True: True}
 
 
@@ -150,3 +150,48 @@ def test_saturation_is_told_from_the_raw_image() -> None:
 def test_an_image_without_lamps_is_a_named_failure(background_e: float) -> None:
     with pytest.raises(EstimationFailure, match="detect: no spot"):
         spots_of(poisson(np.full((300, 400), background_e), 1))
+
+
+def windows_around(image: Array, pixels: Array, half_px: int, denoised: bool) -> list[Readout]:
+    """Square windows of an image around pixels (n, 2), as if nothing else had been read out."""
+    readouts = []
+    for u, v in pixels.astype(int):
+        row, column = max(v - half_px, 0), max(u - half_px, 0)
+        raw = image[row : v + half_px, column : u + half_px].astype(np.float32)
+        shown = neighbourhood_mean(raw) if denoised else raw
+        readouts.append(Readout(row, column, shown, raw, np.zeros(raw.shape, bool)))
+    return readouts
+
+
+@pytest.mark.parametrize("denoised", [False, True])
+def test_windows_give_the_spots_of_the_whole_image(denoised: bool) -> None:
+    """Discs of 12 px radius fill a third of windows of 36 px: not what most pixels are, but what the outermost are, is
+    background. Both medians are off by noise, which moves the half level by a thousandth of itself and with it at most
+    a few of the pixels at the support's rim, which hold noise alone: a fraction of the centroid's own sigma.
+    """
+    view = view_of((3, 3, 3), 3.0, 20.0, -10.0, size=(900, 700, 4000.0))
+    leds = grid(3, 2, 0.15, (3, 3, 3))
+    image = poisson(render(view, leds, led_e=[1000, 2000, 3000, 4000, 2000, 1000]), 3)
+    whole = spots_of(image, denoised)
+    reach_px = REACH_PX if denoised else 0
+    windows = windows_around(image, view.project(leds), 36, denoised)
+    parts = detect(windows, image.size, reach_px)
+    assert len(parts) == len(whole) == 6
+    for spot in parts:
+        same = min(whole, key=lambda other: np.hypot(other.u_px - spot.u_px, other.v_px - spot.v_px))
+        sigma_px = np.sqrt(np.trace(same.covariance_px2))
+        assert np.hypot(same.u_px - spot.u_px, same.v_px - spot.v_px) < 0.5 * sigma_px
+        assert (same.brightest_u_px, same.brightest_v_px) == (spot.brightest_u_px, spot.brightest_v_px)
+        assert not spot.touches_border
+
+
+def test_a_lamp_that_fills_its_window_is_found_and_flagged() -> None:
+    """The denoiser's neighbourhood goes over the window's border, and so does the light for all one can tell."""
+    view = view_of((3, 3, 3), 3.0, size=(900, 700, 4000.0))
+    leds = np.array([[3.0, 3.0, 3.0]])
+    image = render(view, leds)
+    tight = windows_around(image, view.project(leds), 17, True)  # radius 13.3 px: less than 5 + 2 px of margin
+    (spot,) = detect(tight, image.size, REACH_PX)
+    assert spot.touches_border
+    (raw,) = detect(windows_around(image, view.project(leds), 17, False), image.size, 0)
+    assert not raw.touches_border

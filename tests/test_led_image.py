@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
-from vlcrender.camera import Camera, Pose, project
-from vlcrender.led_image import circle_polygon_area, image_of_disc
+from vlcrender.camera import Camera, Pose, project, rays_world
+from vlcrender.distortion import Distortion
+from vlcrender.led_image import image_of_disc, image_of_led, image_of_square, leds_that_may_be_seen
+from vlcrender.led_shape import Disc, Rectangle, circle_polygon_area, rectangle_polygon_area
 
 SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 
@@ -39,6 +41,8 @@ def test_area_shared_by_disc_and_polygon(polygon: np.ndarray, radius: float, exp
     st.floats(0, np.pi),
     st.floats(0.2, 3),
 )
+@example(x=0.0, y=1.0, radius=1.0, angle=3.8e-16, stretch=1.0)  # a corner within rounding of the centre
+@example(x=2.9e-9, y=2.9e-9, radius=1.0, angle=0.0, stretch=1.0)  # and near it
 def test_the_areas_of_the_parts_add_up(x: float, y: float, radius: float, angle: float, stretch: float) -> None:
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     quad = (SQUARE * [stretch, 1]) @ turn.T + [x, y]
@@ -139,3 +143,146 @@ def test_a_disc_cut_by_the_border_says_what_share_is_seen() -> None:
 )
 def test_a_disc_that_cannot_be_seen_has_no_image(center: list[float], why: str) -> None:
     assert image_of_disc(Camera(), Pose((3.0, 3.0, 0.5)), np.array(center), 0.01) is None, why
+
+
+def rectangle_area(polygon: np.ndarray, half_x: float, half_y: float) -> float:
+    return float(rectangle_polygon_area(polygon[None], half_x, half_y)[0])
+
+
+DIAMOND = np.array([[0.0, -1.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
+
+
+@pytest.mark.parametrize(
+    ("polygon", "half", "expected"),
+    [
+        (SQUARE, (0.5, 0.25), 0.5),  # the rectangle is inside
+        (SQUARE, (2.0, 3.0), 4.0),  # the square is inside
+        (SQUARE, (1.0, 1.0), 4.0),  # the same
+        (SQUARE + [1.5, 1.5], (1.0, 1.0), 0.25),  # corners overlap
+        (SQUARE + [2.0, 0.0], (1.0, 1.0), 0.0),  # they touch
+        (SQUARE + [3.0, 3.0], (1.0, 1.0), 0.0),  # apart, beyond a corner
+        (SQUARE + [0.0, 1.0], (1.0, 1.0), 2.0),  # sides run along each other
+        (DIAMOND, (0.5, 0.5), 1.0),  # its sides pass through the corners
+        (DIAMOND, (0.75, 0.75), 2 - 4 * 0.25**2),  # four corners cut off
+        (DIAMOND[::-1] + [1.0, 0.0], (1.0, 1.0), 1.0),  # clockwise; half of it
+    ],
+)
+def test_area_shared_by_rectangle_and_polygon(polygon: np.ndarray, half: tuple[float, float], expected: float) -> None:
+    assert rectangle_area(polygon, *half) == pytest.approx(expected, abs=1e-12)
+
+
+@given(st.floats(-2, 2), st.floats(-2, 2), st.floats(0.1, 2), st.floats(0.1, 2), st.floats(0, np.pi))
+def test_the_areas_in_a_rectangles_parts_add_up(x: float, y: float, w: float, h: float, angle: float) -> None:
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    quad = SQUARE @ turn.T + [x, y]
+    quarters = [quad - [i * w / 2, j * h / 2] for i in (-1, 1) for j in (-1, 1)]
+    # sums of a few numbers below 10 in double precision
+    total = sum(rectangle_area(quarter, w / 2, h / 2) for quarter in quarters)
+    assert total == pytest.approx(rectangle_area(quad, w, h), abs=1e-9)
+
+
+SMALL = {"width_px": 400, "height_px": 300, "pixel_pitch_um": 12.0}
+LENSES = {
+    "pinhole": Camera(**SMALL),
+    "barrel": Camera(
+        **SMALL,
+        focal_length_mm=5.0,
+        distortion=Distortion(k1=-0.3, k2=0.1, p1=0.005, p2=-0.004),
+    ),
+    "fish-eye": Camera(focal_length_mm=2.0, projection="equidistant"),
+}
+
+
+@pytest.mark.parametrize("camera", LENSES.values(), ids=LENSES)
+@pytest.mark.parametrize("shape", [Disc(1.0), Rectangle((1.5, 1.5)), Rectangle((2.0, 1.0), 30.0)], ids=str)
+@pytest.mark.parametrize("where", [(0.5, 0.5), (0.9, 0.85), (0.98, 0.1)])
+def test_every_shape_through_every_lens_covers_the_share_of_each_pixel(
+    camera: Camera, shape: Disc | Rectangle, where: tuple[float, float]
+) -> None:
+    pose = Pose((3.0, 2.0, 0.5), 12.0, -8.0, 25.0)
+    on_sensor = np.array(where) * [camera.width_px, camera.height_px] + [0.3, 0.7]
+    ray = rays_world(camera, pose, on_sensor)
+    center = np.array(pose.position_m) + ray * (3.45 - 0.5) / ray[2]
+    size = 15 * float(np.linalg.norm(center - pose.position_m)) / camera.focal_px  # about 30 px
+    if isinstance(shape, Disc):
+        shape = Disc(size * shape.radius_m)
+    else:
+        shape = Rectangle((size * shape.size_m[0], size * shape.size_m[1]), shape.yaw_deg)
+    image = image_of_led(camera, pose, center, shape)
+    assert image is not None
+    n = 64
+    rows, columns = image.coverage.shape
+    u = image.column + (np.arange(columns * n) + 0.5) / n
+    v = image.row + (np.arange(rows * n) + 0.5) / n
+    rays = rays_world(camera, pose, np.stack(np.meshgrid(u, v), axis=-1))
+    xy = rays[..., :2] / rays[..., 2:] * (3.45 - 0.5) + np.array(pose.position_m[:2]) - center[:2]
+    if isinstance(shape, Disc):
+        inside = np.hypot(xy[..., 0], xy[..., 1]) < shape.radius_m
+    else:
+        c, s = np.cos(np.radians(shape.yaw_deg)), np.sin(np.radians(shape.yaw_deg))
+        inside = abs(c * xy[..., 0] + s * xy[..., 1]) < shape.size_m[0] / 2
+        inside &= abs(c * xy[..., 1] - s * xy[..., 0]) < shape.size_m[1] / 2
+    share = inside.reshape(rows, n, columns, n).mean(axis=(1, 3))
+    error = image.coverage - share
+    mixed = (share > 0) & (share < 1)
+    # The grid's own error, 0.3 / n^1.5 = 6e-4 rms at edges of any direction (of a straight one not: three times that)
+    # and half a line of it at worst, and the change of scale within a pixel: less than 1e-3 here.
+    assert np.sqrt((error[mixed] ** 2).mean()) < 3 * 0.3 / n**1.5
+    assert np.abs(error).max() < 0.5 / n + 1e-3
+    assert abs(error.mean()) < 1e-4  # the grid errs either way, the coverage may not
+    assert mixed.sum() > 10
+
+
+@pytest.mark.parametrize("camera", LENSES.values(), ids=LENSES)
+def test_an_image_goes_on_beyond_the_sensor_where_asked(camera: Camera) -> None:
+    pose = Pose((3.0, 2.0, 0.5), yaw_deg=10.0)
+    ray = rays_world(camera, pose, np.array([0.0, camera.height_px / 2]))  # half of it is off the left border
+    center = np.array(pose.position_m) + ray * 3.0 / ray[2]
+    radius = 8 * float(np.linalg.norm(center - pose.position_m)) / camera.focal_px
+    cut = image_of_disc(camera, pose, center, radius)
+    whole = image_of_disc(camera, pose, center, radius, margin_px=20)
+    assert cut is not None
+    assert whole is not None
+    assert cut.column == 0
+    assert -20 <= whole.column < 0
+    assert np.array_equal(whole.coverage[:, -whole.column :], cut.coverage)
+    assert whole.visible_fraction == cut.visible_fraction
+    assert cut.coverage.sum() / whole.coverage.sum() == pytest.approx(cut.visible_fraction, abs=1e-4)
+
+
+def test_a_level_square_of_whole_pixels_covers_them_and_nothing_else() -> None:
+    # 0.1 m at 3 m is 500 px; sides run along pixel borders
+    image = image_of_square(Camera(), Pose((3.0, 3.0, 0.5)), np.array([3.0, 3.0, 3.5]), 0.1)
+    assert image is not None
+    assert image.coverage.sum() == pytest.approx(250_000, rel=1e-9)
+    assert image.coverage[1:-1, 1:-1].min() > 1 - 1e-9
+
+
+def test_a_turned_square_turns_from_x_towards_y() -> None:
+    # a long thin one turned by 45 deg runs from the upper left to the lower right: +x is +u, +y is +v
+    image = image_of_led(Camera(), Pose((3.0, 3.0, 0.5)), np.array([3.0, 3.0, 3.5]), Rectangle((0.02, 0.002), 45.0))
+    assert image is not None
+    rows, columns = np.indices(image.coverage.shape)
+    u, v = columns - columns.mean(), rows - rows.mean()
+    assert (image.coverage * u * v).sum() > 0
+
+
+COARSE_LENSES = LENSES | {
+    "fish-eye": Camera(**SMALL, focal_length_mm=2.0, projection="equidistant"),
+    "skewed": Camera(**SMALL, focal_length_mm=6.0, skew_px=100.0),
+}
+
+
+@pytest.mark.parametrize("camera", COARSE_LENSES.values(), ids=COARSE_LENSES)
+def test_no_led_that_lights_a_pixel_is_left_out(camera: Camera, rng: np.random.Generator) -> None:
+    centers = np.column_stack([rng.uniform(0, 7, (250, 2)), rng.uniform(2.5, 3.5, 250)])
+    radii = rng.uniform(0.05, 0.5, 250)
+    candidates_in_vain = 0
+    for _ in range(8):
+        pose = Pose((3.0, 3.0, 1.0), *rng.uniform(-40, 40, 2), rng.uniform(-180, 180))
+        candidates = leds_that_may_be_seen(camera, pose, centers, radii, margin_px=5.0)
+        images = [image_of_disc(camera, pose, c, float(r), 5) for c, r in zip(centers, radii, strict=True)]
+        seen = [i for i, image in enumerate(images) if image is not None]
+        assert set(seen) <= set(candidates.tolist())
+        candidates_in_vain += len(candidates) - len(seen)
+    assert candidates_in_vain < 8 * 250 / 4

@@ -76,7 +76,7 @@ BAD_TABLE1 = [
     ("radius_m = 0.01", 'radius_m = "1 cm"', r"led\[0\]\.radius_m = \"1 cm\": .*valid number"),
     ("radius_m = 0.01", "radius_m = nan", r"led\[0\]\.radius_m"),
     ("radius_m = 0.01", "radius_m = true", r"led\[0\]\.radius_m = true"),
-    ("radius_m = 0.01", "radius_m = 0.01\ncolour = 3", r"unknown key led\[0\]\.colour; allowed: id, luminance_cd_m2"),
+    ("radius_m = 0.01", "radius_m = 0.01\ncolour = 3", r"unknown key led\[0\]\.colour; allowed: half_power_deg, id"),
     ("position_m = [0.5, 1.5, 3.5]", "position_m = [5, 15, 35]", r"led\[0\]: LED 1 .*not inside the room"),
     ("position_m = [0.5, 1.5, 3.5]", "position_m = [0.005, 1.5, 3.5]", r"LED 1 .*not inside the room"),
     ("position_m = [0.5, 1.5, 3.5]", "position_m = [0.5, 1.5]", r"led\[0\]\.position_m"),

@@ -4,17 +4,18 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from vlcrender.sensor import Sensor, clip_full_well, shot_noise
+from vlcrender.exposure import expose
+from vlcrender.sensor import Sensor, clip_full_well
 from vlcrender.streams import stream
 
 N = 400_000
 MEANS = [0.2, 3.0, 40.0, 3000.0]
-WIDE = Sensor(full_well_e=1e9)
+WIDE = Sensor(full_well_e=1e9, gain_e_per_dn=1.0)
 
 
 def draw(mean: float, name: str) -> np.ndarray:
     """N digital numbers of a wide-open sensor at 1 e/DN: electrons."""
-    return WIDE.expose(np.full(N, mean, dtype=np.float32), stream(1, 0, name)).astype(np.int64)
+    return expose(WIDE, np.full((400, N // 400), mean, dtype=np.float32), name).ravel().astype(np.int64)
 
 
 def chi_square_p(sample: np.ndarray, distribution: stats.rv_discrete) -> float:
@@ -66,8 +67,8 @@ def test_neighbouring_pixels_are_independent() -> None:
 
 def test_without_noise_the_expected_image_is_rounded() -> None:
     sensor = Sensor(noise="none")
-    image = sensor.expose(np.array([0.0, 0.49, 0.51, 1.5, 2.5, 99.7], dtype=np.float32), stream(0, 0, "x"))
-    assert image.tolist() == [0, 0, 1, 2, 2, 100]  # halves go to the even number, as IEEE 754 rounds
+    image = expose(sensor, np.array([[0.0, 0.49, 0.51, 1.5, 2.5, 99.7]], dtype=np.float32), "x")
+    assert image.tolist() == [[0, 0, 1, 2, 2, 100]]  # halves go to the even number, as IEEE 754 rounds
     assert image.dtype == np.uint32
 
 
@@ -81,13 +82,9 @@ def test_the_converter_saturates_at_its_largest_number(bits: int) -> None:
 
 def test_full_well_clips_electrons_before_gain() -> None:
     assert clip_full_well(np.array([0.0, 5999.0, 6000.0, 1e6]), 6000.0).tolist() == [0, 5999, 6000, 6000]
-    assert Sensor(full_well_e=100.0, gain_e_per_dn=0.5, noise="none").expose(
-        np.array([1000.0], dtype=np.float32), stream(0, 0, "x")
-    ).tolist() == [200]
-
-
-def test_shot_noise_of_nothing_is_nothing(rng: np.random.Generator) -> None:
-    assert not shot_noise(np.zeros(1000, dtype=np.float32), rng).any()
+    assert expose(
+        Sensor(full_well_e=100.0, gain_e_per_dn=0.5, noise="none"), np.array([[1000.0]], dtype=np.float32), "x"
+    ).tolist() == [[200]]
 
 
 def test_streams_share_nothing_between_neighbouring_seeds_frames_and_names() -> None:

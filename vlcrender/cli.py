@@ -13,7 +13,7 @@ from vlcrender import __version__
 from vlcrender.camera import Camera
 from vlcrender.dataset import problems_of, read_dataset_file
 from vlcrender.errors import InputError
-from vlcrender.recipe import load_plan
+from vlcrender.recipe import ScaleMode, load_plan
 from vlcrender.scene import load_scene
 from vlcrender.visibility import ENOUGH_LEDS, level_coverage, tilted_coverage
 
@@ -34,6 +34,8 @@ def generate(
     *,
     out: Path,
     set_: Annotated[list[str] | None, Parameter(name="--set", negative=())] = None,
+    scale: int = 1,
+    scale_mode: ScaleMode = "binned",
     workers: int = 1,
     scheduler: str | None = None,
 ) -> None:
@@ -47,6 +49,11 @@ def generate(
         Folder of the dataset; new, empty, or an unfinished run of the same recipe.
     set_
         key=value that replaces a value of the recipe, e.g. camera.f_number=2.8. May be repeated.
+    scale
+        Make this many by this many pixels one, for quick looks; has to divide the camera's width and height.
+    scale_mode
+        Whether larger pixels keep all photons (full well and gain grow with them), or as many as the small ones had
+        (the exposure is shorter).
     workers
         Processes that make frames.
     scheduler
@@ -54,7 +61,7 @@ def generate(
     """
     if workers < 1:
         raise InputError(f"--workers {workers}: is not 1 or more")
-    plan = load_plan(recipe, set_ or [])
+    plan = load_plan(recipe, set_ or [], scale, scale_mode)
     from vlcrender.generate import generate as make  # starts Mitsuba: not before the recipe is known to be good
 
     columns = (
@@ -66,7 +73,7 @@ def generate(
         TimeRemainingColumn(),
     )
     bar = Progress(*columns, console=Console(stderr=True))
-    task = bar.add_task(plan.recipe.name, total=plan.recipe.poses.count)
+    task = bar.add_task(plan.recipe.name, total=plan.recipe.frame_count)
 
     def progress(done: int, total: int) -> None:
         bar.start()  # not before the first report: a refusal is one line
@@ -76,7 +83,7 @@ def generate(
         made = make(plan, out, workers, scheduler, progress)
     finally:
         bar.stop()
-    print(f"{out}: {plan.recipe.poses.count} frames{'' if made else ' (was already complete and intact)'}")
+    print(f"{out}: {plan.recipe.frame_count} frames{'' if made else ' (was already complete and intact)'}")
 
 
 @app.command

@@ -16,18 +16,24 @@ from numpy.typing import NDArray
 
 from vlcrender.camera import Camera
 from vlcrender.errors import InputError
+from vlcrender.rig import Mounted
 from vlcrender.scene import Leds
 from vlcrender.settings import Settings, check
+from vlcrender.windows import Window
 
-PREVIEW_WIDTH_PX = 800
+PREVIEW_PX = 800
+Shown = tuple[Window, NDArray[np.uint32] | NDArray[np.float32]]
+"""A window and its pixels (rows, columns)."""
 SPOT = pa.struct([("led", pa.int64()), ("u_px", pa.float64()), ("v_px", pa.float64())])
 FRAMES_SCHEMA = pa.schema(
     [
         ("frame", pa.int64()),
+        ("shot", pa.int64()),
         ("file", pa.string()),
         ("sha256", pa.string()),
         ("camera", pa.string()),
         ("exposure_s", pa.float64()),
+        ("capturable", pa.bool_()),
         ("accelerometer_m_s2", pa.list_(pa.float64(), 3)),
         ("spots", pa.list_(SPOT)),
     ]
@@ -35,6 +41,7 @@ FRAMES_SCHEMA = pa.schema(
 TRUTH_SCHEMA = pa.schema(
     [
         ("frame", pa.int64()),
+        ("shot", pa.int64()),
         ("position_m", pa.list_(pa.float64(), 3)),
         ("R_cam_world", pa.list_(pa.float64(), 9)),
         ("tilt_x_deg", pa.float64()),
@@ -45,15 +52,21 @@ TRUTH_SCHEMA = pa.schema(
 )
 
 
+Row3 = tuple[float, float, float]
+Matrix = tuple[Row3, Row3, Row3]
+
+
 class CameraEntry(Settings):
     """A camera in dataset.json."""
 
     width_px: int
     height_px: int
-    K: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+    K: Matrix
     pixel_pitch_um: float
     focal_length_mm: float
     f_number: float
+    R_cam_rig: Matrix
+    offset_m: tuple[float, float, float]
 
 
 class SensorEntry(Settings):
@@ -84,7 +97,7 @@ class DatasetFile(Settings):
     """dataset.json."""
 
     format: Literal["vlcrender-dataset"]
-    version: Literal[1]
+    version: Literal[2]
     name: str
     frame_count: int
     cameras: dict[str, CameraEntry]
@@ -95,10 +108,11 @@ class DatasetFile(Settings):
     provenance: dict[str, Any]
 
 
-def camera_entry(camera: Camera) -> CameraEntry:
+def camera_entry(mounted: Mounted) -> CameraEntry:
     """A camera as dataset.json tells of it."""
-    rows = [tuple(map(float, row)) for row in camera.matrix]
-    return CameraEntry.model_validate({"K": rows, **camera.model_dump(include=set(CameraEntry.model_fields) - {"K"})})
+    own = {"K": mounted.camera.matrix, "R_cam_rig": mounted.rotation, "offset_m": mounted.offset_m}
+    shared = mounted.camera.model_dump(include=set(CameraEntry.model_fields) - set(own))
+    return CameraEntry.model_validate({**shared, **{key: array.tolist() for key, array in own.items()}})
 
 
 def led_map(leds: Leds) -> tuple[LedMapEntry, ...]:
@@ -109,21 +123,37 @@ def led_map(leds: Leds) -> tuple[LedMapEntry, ...]:
     )
 
 
-def write_exr(path: Path, image: NDArray[np.uint32] | NDArray[np.float32], attributes: Mapping[str, Any]) -> str:
-    """Write a one-channel (Y) image losslessly and return the file's SHA-256.
+def write_exr(path: Path, images: Sequence[Shown], sensor: Window, attributes: Mapping[str, Any]) -> str:
+    """Write windows of a sensor, one channel (Y), losslessly and return the file's SHA-256.
 
     The file appears whole or not at all. Raises InputError where it cannot be written.
     """
-    header = {"compression": OpenEXR.PIZ_COMPRESSION, "type": OpenEXR.scanlineimage, **attributes}
+    header = {
+        "compression": OpenEXR.PIZ_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
+        "displayWindow": _box(sensor),
+        **attributes,
+    }
+    names = [f"window {number}" for number in range(len(images))] if len(images) > 1 else [""]
+    parts = [
+        OpenEXR.Part({**header, "dataWindow": _box(window)}, {"Y": np.ascontiguousarray(image)}, name)
+        for name, (window, image) in zip(names, images, strict=True)
+    ]
     partial = path.with_suffix(".partial")
     try:
-        OpenEXR.File(header, {"Y": np.ascontiguousarray(image)}).write(str(partial))
+        OpenEXR.File(parts).write(str(partial))
     except RuntimeError as error:  # OpenEXR's word for a full disk as well
         partial.unlink(missing_ok=True)
         raise InputError(f"{path}: cannot be written: {' '.join(str(error).split())}") from None
     digest = sha256_of(partial)
     os.replace(partial, path)
     return digest
+
+
+def _box(window: Window) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """First and last pixel, (column, row) each, as EXR has it."""
+    first = np.array([window.column, window.row], dtype=np.int32)
+    return first, first + np.array([window.columns - 1, window.rows - 1], dtype=np.int32)
 
 
 def exr_attributes(camera: Camera, camera_name: str, exposure_s: float, frame: int) -> dict[str, Any]:
@@ -140,11 +170,27 @@ def exr_attributes(camera: Camera, camera_name: str, exposure_s: float, frame: i
     }
 
 
-def write_preview(path: Path, image: NDArray[np.uint32], largest_dn: int) -> None:
-    """Write a small grey picture: block means, gamma 2.2, white at the converter's largest number."""
-    block = max(1, -(-image.shape[1] // PREVIEW_WIDTH_PX))
-    rows, columns = (size // block * block for size in image.shape)
-    small = image[:rows, :columns].reshape(rows // block, block, columns // block, block).mean(axis=(1, 3))
+def write_preview(path: Path, images: Sequence[Shown], sensor: Window, largest_dn: int) -> None:
+    """Write a small grey picture: block means, gamma 2.2, white at the converter's largest number.
+
+    It shows the sensor and all windows; what was not read out is black.
+    """
+    whole = sensor
+    for window, _ in images:
+        whole = whole.around(window)
+    block = max(1, -(-max(whole.columns, whole.rows) // PREVIEW_PX))
+    sums = np.zeros((-(-whole.rows // block), -(-whole.columns // block)))
+    for window, image in images:
+        row, column = window.row - whole.row, window.column - whole.column
+        before, after = (
+            (row % block, column % block),
+            (-(row + window.rows) % block, -(column + window.columns) % block),
+        )
+        padded = np.pad(image, tuple(zip(before, after, strict=True)))
+        rows, columns = padded.shape[0] // block, padded.shape[1] // block
+        here = np.s_[row // block : row // block + rows, column // block : column // block + columns]
+        sums[here] += padded.reshape(rows, block, columns, block).sum(axis=(1, 3))
+    small = sums[: max(1, whole.rows // block), : max(1, whole.columns // block)] / block**2
     imsave(path, (np.clip(small / largest_dn, 0, 1)) ** (1 / 2.2), cmap="gray", vmin=0, vmax=1)
 
 
@@ -236,14 +282,26 @@ def _problems_of_frame(directory: Path, row: Mapping[str, Any], dataset: Dataset
     if sha256_of(path) != row["sha256"]:
         return [f"{path}: its SHA-256 is not the one in frames.parquet: the file was changed or cut short"]
     camera = dataset.cameras[row["camera"]]
+    sensor = Window(0, 0, camera.height_px, camera.width_px)
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
-            pixels = file.channels()["Y"].pixels
+            windows = [_window(part.header["dataWindow"]) for part in file.parts]
+            shown = [_window(part.header["displayWindow"]) for part in file.parts]
+            types = {part.channels["Y"].pixels.dtype for part in file.parts}
     except (RuntimeError, KeyError, ValueError, TypeError) as error:
         return [f"{path}: cannot be read as an EXR with a channel Y: {error}"]
-    if pixels.shape != (camera.height_px, camera.width_px) or pixels.dtype != np.uint32:
-        return [f"{path}: is {pixels.dtype} {pixels.shape}; uint32 {camera.height_px, camera.width_px} is expected"]
+    if types != {np.dtype(np.uint32)} or set(shown) != {sensor}:
+        return [f"{path}: is not uint32 of a sensor of {camera.height_px, camera.width_px} pixels in every part"]
+    if any(a.overlaps(b) for i, a in enumerate(windows) for b in windows[:i]):
+        return [f"{path}: has windows that overlap"]
+    if row["capturable"] != all(sensor.holds(window) for window in windows):
+        return [f"{path}: capturable is {row['capturable']}, but its windows say otherwise"]
     return []
+
+
+def _window(box: tuple[NDArray[np.int32], NDArray[np.int32]]) -> Window:
+    (column, row), (last_column, last_row) = (corner.tolist() for corner in box)
+    return Window(row, column, last_row - row + 1, last_column - column + 1)
 
 
 def _problems_of_truth(row: Mapping[str, Any], frame: Mapping[str, Any] | None, dataset: DatasetFile) -> list[str]:

@@ -7,8 +7,6 @@ import platform
 import signal
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from dataclasses import dataclass
-from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -21,37 +19,16 @@ from vlcrender.dataset import (
     DatasetFile,
     SensorEntry,
     camera_entry,
-    exr_attributes,
     led_map,
     problems_of,
     sha256_of,
-    write_exr,
     write_json,
-    write_preview,
     write_table,
 )
-from vlcrender.downlink import decoded_spots
 from vlcrender.errors import InputError
-from vlcrender.poses import pose_of_frame
-from vlcrender.recipe import Plan, Recipe
-from vlcrender.render import Renderer, check_inside
-from vlcrender.scene import Scene, SceneSettings, build_scene
-from vlcrender.streams import stream
-
-CAMERA_NAME = "main"
-FRAMES, EXPECTED, PREVIEWS = "frames", "expected", "previews"
-
-Record = dict[str, Any]
-"""One frame's rows: {"frame": n, "device": row of frames.parquet, "truth": row of truth.parquet}."""
-
-
-@dataclass(frozen=True)
-class Job:
-    """What a worker needs to make any frame; small, so that it travels."""
-
-    recipe_json: str
-    scene_json: str
-    directory: str
+from vlcrender.frame import EXPECTED, FRAMES, PREVIEWS, Job, Record, make_frame, poses_of_frame
+from vlcrender.recipe import Plan
+from vlcrender.render import check_inside
 
 
 def generate(
@@ -72,73 +49,26 @@ def generate(
         if damage:
             raise InputError(f"{directory}: is complete but damaged: {damage[0]}; delete it or choose another --out")
         return False
-    for frame in range(plan.recipe.poses.count):  # impossible poses are found before the first image
-        check_inside(plan.scene, _pose(plan.recipe, plan.scene, frame))
+    for frame in range(plan.recipe.frame_count):  # impossible poses are found before the first image
+        _, during = poses_of_frame(plan.recipe, plan.scene, frame)
+        check_inside(plan.scene, during[0])
+        check_inside(plan.scene, during[-1])
     _prepare(directory, provenance, plan.recipe.expected)
-    job = Job(plan.recipe.model_dump_json(), plan.scene.settings.model_dump_json(), str(directory))
+    job = Job(
+        plan.recipe.model_dump_json(), plan.scene.settings.model_dump_json(), str(plan.scene.folder), str(directory)
+    )
     done = _journal(directory)
-    missing = [frame for frame in range(plan.recipe.poses.count) if frame not in done]
+    missing = [frame for frame in range(plan.recipe.frame_count) if frame not in done]
     if done:
-        progress(len(done), plan.recipe.poses.count)
+        progress(len(done), plan.recipe.frame_count)
     with (directory / "journal.jsonl").open("a", encoding="utf-8") as journal:
         for record in _records(job, missing, workers, scheduler):
             done[record["frame"]] = record
             journal.write(json.dumps(record) + "\n")
             journal.flush()
-            progress(len(done), plan.recipe.poses.count)
+            progress(len(done), plan.recipe.frame_count)
     _finish(plan, directory, provenance, [done[frame] for frame in sorted(done)])
     return True
-
-
-def make_frame(job: Job, frame: int) -> Record:
-    """Render, expose and write one frame; depends on nothing but its arguments."""
-    recipe, renderer = _renderer(job.recipe_json, job.scene_json)
-    directory = Path(job.directory)
-    pose = _pose(recipe, renderer.scene, frame)
-    view = renderer.view(recipe.camera, pose)
-    expected = view.expected_electrons(recipe.exposure_s)
-    dn = recipe.sensor.expose(expected, stream(recipe.seed, frame, "shot-noise"))
-    attributes = exr_attributes(recipe.camera, CAMERA_NAME, recipe.exposure_s, frame)
-    file = f"{FRAMES}/{frame:06d}.exr"
-    digest = write_exr(directory / file, dn, attributes)
-    if recipe.expected:
-        write_exr(directory / EXPECTED / f"{frame:06d}.exr", expected, attributes)
-    write_preview(directory / PREVIEWS / f"{frame:06d}.png", dn, recipe.sensor.largest_dn)
-    size = recipe.camera.width_px, recipe.camera.height_px
-    reading = recipe.accelerometer.reading_m_s2(pose, stream(recipe.seed, frame, "accelerometer"))
-    device = {
-        "frame": frame,
-        "file": file,
-        "sha256": digest,
-        "camera": CAMERA_NAME,
-        "exposure_s": recipe.exposure_s,
-        "accelerometer_m_s2": reading.tolist(),
-        "spots": decoded_spots(view.patches, *size, stream(recipe.seed, frame, "demodulator")),
-    }
-    truth = {
-        "frame": frame,
-        "position_m": list(pose.position_m),
-        "R_cam_world": pose.rotation.ravel().tolist(),
-        "tilt_x_deg": pose.tilt_x_deg,
-        "tilt_y_deg": pose.tilt_y_deg,
-        "yaw_deg": pose.yaw_deg,
-        "leds": [
-            {"led": p.led_id, "u_px": p.center_px[0], "v_px": p.center_px[1], "visible_fraction": p.visible_fraction}
-            for p in sorted(view.patches, key=lambda p: p.led_id)
-        ],
-    }
-    return {"frame": frame, "device": device, "truth": truth}
-
-
-def _pose(recipe: Recipe, scene: Scene, frame: int) -> Any:
-    return pose_of_frame(recipe.poses, frame, recipe.seed, recipe.camera, scene)
-
-
-@cache
-def _renderer(recipe_json: str, scene_json: str) -> tuple[Recipe, Renderer]:
-    """One renderer a process and plan."""
-    scene = build_scene(SceneSettings.model_validate_json(scene_json), "scene")
-    return Recipe.model_validate_json(recipe_json), Renderer(scene)
 
 
 def _records(job: Job, frames: list[int], workers: int, scheduler: str | None) -> Iterator[Record]:
@@ -254,10 +184,10 @@ def _finish(plan: Plan, directory: Path, provenance: dict[str, Any], records: li
     write_table(directory / "truth.parquet", [record["truth"] for record in records], TRUTH_SCHEMA)
     dataset = DatasetFile(
         format="vlcrender-dataset",
-        version=1,
+        version=2,
         name=recipe.name,
         frame_count=len(records),
-        cameras={CAMERA_NAME: camera_entry(recipe.camera)},
+        cameras={mounted.name: camera_entry(mounted) for mounted in recipe.cameras},
         sensor=SensorEntry(**recipe.sensor.model_dump()),
         accelerometer=AccelerometerEntry(**recipe.accelerometer.model_dump()),
         led_map=led_map(scene.leds),

@@ -1,18 +1,36 @@
-"""The image of one LED: how much of each pixel its disc covers, exactly.
+"""The image of one LED: how much of each pixel its face covers, exactly.
 
-A pixel's corners are mapped through the camera onto the LED's plane. There the LED is a circle and the pixel a
-quadrilateral; the area they share over the area of the quadrilateral is the pixel's coverage. For a pinhole this is
-the pixel-area average but for the change of scale within one pixel, a relative 1e-4 of a mixed pixel's value.
+A pixel's corners are mapped through the camera onto the LED's plane. There the LED is a disc or a rectangle and the
+pixel a quadrilateral; the area they share over the area of the quadrilateral is the pixel's coverage. This is the
+pixel-area average but for the change of scale within one pixel: 1e-4 for a camera of 15 000 px of focal length, less
+than 1e-3 for one of 400; more only where a pixel of a fish-eye lens looks along the LED's plane.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vlcrender.camera import Camera, Pose, project, rays_world
+from vlcrender.camera import (
+    BEYOND_SENSOR,
+    Camera,
+    Pose,
+    image_of_points,
+    pixel_on_sensor,
+    ray_of_pixel,
+    ray_of_sensor,
+    transform,
+)
+from vlcrender.distortion import fold_radius2
+from vlcrender.led_shape import BEYOND_HORIZON_M, Disc, Rectangle, quadrilateral_area
 
 Array = NDArray[np.float64]
+
+RIM_POINTS = 720
+"""Of a face's outline: the window around them misses a disc's edge by at most 1e-5 of its radius."""
+CELLS_AT_ONCE = 500_000
+"""Pixels of a window handled together: bounds the memory that an LED as large as the image takes."""
 
 
 @dataclass(frozen=True)
@@ -26,109 +44,160 @@ class LedImage:
     """Share of the LED's whole image, by area, that falls on the sensor."""
 
 
-def circle_polygon_area(polygons: Array, radius: float) -> Array:
-    """Area common to the disc of this radius about the origin and each polygon.
+def image_of_disc(camera: Camera, pose: Pose, center_m: Array, radius_m: float, margin_px: int = 0) -> LedImage | None:
+    """`image_of_led` of a disc."""
+    return image_of_led(camera, pose, center_m, Disc(radius_m), margin_px)
 
-    polygons: (n, corners, 2), any orientation. Returns (n,), >= 0. Sum over the edges of the signed area that the disc
-    shares with the triangle of the origin and that edge: straight where the edge is inside, a sector where outside.
+
+def image_of_square(
+    camera: Camera, pose: Pose, center_m: Array, side_m: float, yaw_deg: float = 0.0, margin_px: int = 0
+) -> LedImage | None:
+    """`image_of_led` of a square."""
+    return image_of_led(camera, pose, center_m, Rectangle((side_m, side_m), yaw_deg), margin_px)
+
+
+def image_of_led(
+    camera: Camera, pose: Pose, center_m: Array, shape: Disc | Rectangle, margin_px: int = 0
+) -> LedImage | None:
+    """Image of a horizontal face that faces down, or None where no pixel sees it.
+
+    center_m: (3,), world. The window may reach `margin_px` pixels beyond the sensor (row and column may be negative),
+    since blur brings that light onto it; with distortion no farther than BEYOND_SENSOR. A face that a perspective lens
+    has beside or behind it, in part, or that the camera looks down on, is not seen.
     """
-    p = polygons
-    q = np.roll(polygons, -1, axis=1)
-    edge = q - p
-    length2 = np.maximum((edge**2).sum(-1), np.finfo(float).tiny)
-    # The edge meets the circle at p + t * edge with t = t_mid -+ half.
-    t_mid = -(p * edge).sum(-1) / length2
-    closest2 = np.maximum((p**2).sum(-1) - t_mid**2 * length2, 0.0)
-    half = np.sqrt(np.maximum(radius**2 - closest2, 0.0) / length2)
-    meets = radius**2 > closest2
-    enter = np.where(meets, np.clip(t_mid - half, 0.0, 1.0), 0.0)
-    leave = np.where(meets, np.clip(t_mid + half, 0.0, 1.0), 0.0)
-    a = p + enter[..., None] * edge
-    b = p + leave[..., None] * edge
-    inside = _cross(a, b) / 2
-    outside = radius**2 / 2 * (_angle(p, a) + _angle(b, q))
-    area: Array = np.abs((inside + outside).sum(axis=1))
-    return area
-
-
-def _cross(a: Array, b: Array) -> Array:
-    product: Array = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-    return product
-
-
-def _angle(a: Array, b: Array) -> Array:
-    angle: Array = np.arctan2(_cross(a, b), (a * b).sum(-1))
-    return angle
-
-
-def image_of_disc(camera: Camera, pose: Pose, center_m: Array, radius_m: float) -> LedImage | None:
-    """Image of a horizontal disc that faces down, or None where no pixel sees it.
-
-    center_m: (3,), world. A disc that reaches behind the camera, or that the camera looks down on, is not seen.
-    """
-    outline = _outline_px(camera, pose, center_m, radius_m)
-    if outline is None:
-        return None
-    low = np.floor(outline.min(axis=0)).astype(int)
-    high = np.ceil(outline.max(axis=0)).astype(int)
-    size = np.array([camera.width_px, camera.height_px])
-    first, last = np.maximum(low, 0), np.minimum(high, size)
-    if (last <= first).any():
-        return None
-    coverage = _coverage(camera, pose, center_m, radius_m, first, last)
-    if not coverage.any():
-        return None
-    on_sensor = coverage.sum()
-    cut = (low < 0).any() or (high > size).any()
-    fraction = float(min(on_sensor / _ellipse_area_px(outline), 1.0)) if cut else 1.0
-    return LedImage(int(first[1]), int(first[0]), coverage, fraction)
-
-
-def _outline_px(camera: Camera, pose: Pose, center_m: Array, radius_m: float) -> Array | None:
     if pose.position_m[2] >= center_m[2]:
         return None
-    angles = np.linspace(0.0, 2 * np.pi, 720, endpoint=False)
-    rim = center_m + radius_m * np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=1)
-    pixels, depth = project(camera, pose, rim)
-    # A rim point at less than a radius' depth is beside or behind the lens, never on a sensor of less than 180 deg.
-    return pixels if (depth > 1e-3 * radius_m).all() else None
+    outline = _outline_px(camera, pose, center_m, shape.rim(RIM_POINTS))
+    if outline is None:
+        return None
+    size = np.array([camera.width_px, camera.height_px])
+    low = np.floor(outline.min(axis=0)).astype(int)
+    high = np.ceil(outline.max(axis=0)).astype(int)
+    margin = np.full(2, margin_px)
+    if camera.distortion is not None:
+        margin = np.minimum(margin, (BEYOND_SENSOR * size).astype(int))
+    first, last = np.maximum(low, -margin), np.minimum(high, size + margin)
+    if (last <= first).any():
+        return None
+    coverage = _coverage(camera, pose, center_m, shape, first, last)
+    if not coverage.any():
+        return None
+    column, row = (int(edge) for edge in first)
+    fraction = 1.0
+    if (low < 0).any() or (high > size).any():
+        on_sensor = coverage[
+            max(0, -row) : max(0, camera.height_px - row), max(0, -column) : max(0, camera.width_px - column)
+        ]
+        fraction = float(min(on_sensor.sum() / shape.image_area_px(outline), 1.0))
+    return LedImage(row, column, coverage, fraction)
 
 
-def _ellipse_area_px(outline: Array) -> float:
-    """Area of the polygon through the outline, corrected for the arcs it cuts off."""
-    u, v = outline.T
-    polygon = abs(float(np.dot(u, np.roll(v, -1)) - np.dot(v, np.roll(u, -1)))) / 2
-    step = 2 * np.pi / len(outline)
-    return polygon * step / float(np.sin(step))
+def leds_that_may_be_seen(
+    camera: Camera, pose: Pose, centers_m: Array, reaches_m: Array, margin_px: float = 0.0
+) -> NDArray[np.int64]:
+    """Indices of LEDs that may light a pixel of the sensor or up to `margin_px` beside it: never too few.
+
+    centers_m: (n, 3), world; reaches_m: (n,), from a centre to its face's farthest point. Held against the sphere of
+    that radius: perspective, the four planes through the projection centre that hold all the sensor sees; equidistant,
+    the cone.
+    """
+    p_cam = transform(pose.rotation, centers_m - np.array(pose.position_m))
+    x, y, z = p_cam[:, 0], p_cam[:, 1], p_cam[:, 2]
+    above = centers_m[:, 2] > pose.position_m[2]
+    if camera.projection == "equidistant":
+        distance = np.sqrt(x * x + y * y + z * z)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            half_angle = np.arcsin(np.minimum(reaches_m / distance, 1.0))
+        theta = np.arctan2(np.hypot(x, y), z)
+        found: NDArray[np.int64] = np.flatnonzero(above & (theta - half_angle <= _widest_angle(camera, margin_px)))
+        return found
+    left, right, top, bottom = _widest_slopes(camera, margin_px)
+    seen = above & (z > -reaches_m)
+    for across, low, high in ((x, left, right), (y, top, bottom)):
+        seen &= across - low * z >= -reaches_m * np.sqrt(1 + low * low)
+        seen &= across - high * z <= reaches_m * np.sqrt(1 + high * high)
+    found = np.flatnonzero(seen)
+    return found
 
 
-def _coverage(camera: Camera, pose: Pose, center_m: Array, radius_m: float, first: Array, last: Array) -> Array:
-    u = np.arange(first[0], last[0] + 1, dtype=float)
-    v = np.arange(first[1], last[1] + 1, dtype=float)
-    corners = np.stack(np.meshgrid(u, v), axis=-1)
-    rays = rays_world(camera, pose, corners)
-    above = rays[..., 2] > 1e-9
-    reach = np.where(above, (center_m[2] - pose.position_m[2]) / np.where(above, rays[..., 2], 1.0), np.inf)
-    with np.errstate(invalid="ignore"):
-        on_plane = rays[..., :2] * reach[..., None] + (np.array(pose.position_m[:2]) - center_m[:2])
-    on_plane = np.where(above[..., None], on_plane, 1e9)  # beyond the horizon: far from every LED
-    distance = np.hypot(on_plane[..., 0], on_plane[..., 1])
-    quads = np.stack([on_plane[:-1, :-1], on_plane[:-1, 1:], on_plane[1:, 1:], on_plane[1:, :-1]], axis=2)
-    farthest = _corner_extreme(distance, np.maximum)
-    nearest = _corner_extreme(distance, np.minimum)
-    span = np.hypot(*(quads.max(axis=2) - quads.min(axis=2)).transpose(2, 0, 1))
-    coverage = (farthest <= radius_m).astype(float)
-    mixed = (farthest > radius_m) & (nearest < radius_m + span) & (farthest < 1e8)
-    shared = circle_polygon_area(quads[mixed], radius_m)
-    coverage[mixed] = np.clip(shared / _area(quads[mixed]), 0.0, 1.0)
+@lru_cache(maxsize=64)
+def _widest_angle(camera: Camera, margin_px: float) -> float:
+    """The field angle of the pixel position farthest from the axis, radians."""
+    return float(np.hypot(*pixel_on_sensor(camera, *_border_px(camera, margin_px))).max())
+
+
+@lru_cache(maxsize=64)
+def _widest_slopes(camera: Camera, margin_px: float) -> tuple[float, float, float, float]:
+    """Least and greatest x / z, least and greatest y / z of what a perspective lens sees."""
+    x, y, _ = ray_of_sensor(camera, *pixel_on_sensor(camera, *_border_px(camera, margin_px)))
+    # Where the border bends, its extreme lies between two of 64 points a side: off by a 1 / (8 * 64^2) of its bend.
+    slack = 0.0 if camera.distortion is None else 1e-3 * float(np.hypot(np.ptp(x), np.ptp(y)))
+    return float(x.min()) - slack, float(x.max()) + slack, float(y.min()) - slack, float(y.max()) + slack
+
+
+def _border_px(camera: Camera, margin_px: float) -> tuple[Array, Array]:
+    """Pixel positions (u, v) all along the border of the sensor and its margin."""
+    t = np.linspace(0.0, 1.0, 65)
+    u = -margin_px + t * (camera.width_px + 2 * margin_px)
+    v = -margin_px + t * (camera.height_px + 2 * margin_px)
+    u_border = np.concatenate([u, u, np.full(65, u[0]), np.full(65, u[-1])])
+    return u_border, np.concatenate([np.full(65, v[0]), np.full(65, v[-1]), v, v])
+
+
+def _outline_px(camera: Camera, pose: Pose, center_m: Array, offsets: Array) -> Array | None:
+    """Pixels of points of the LED's plane, given relative to its centre; None where the lens does not image them."""
+    reach = float(np.hypot(offsets[:, 0], offsets[:, 1]).max())
+    points = np.column_stack([offsets, np.zeros(len(offsets))]) + center_m
+    p_cam = transform(pose.rotation, points - np.array(pose.position_m))
+    if camera.projection == "perspective":
+        # A point at less than a thousandth of that depth is beside or behind the lens, never on a sensor.
+        if not (p_cam[:, 2] > 1e-3 * reach).all():
+            return None
+        if camera.distortion is not None:
+            # Points beyond the fold are drawn in to it, which is beyond the sensor still.
+            limit = 0.999 * np.sqrt(fold_radius2(camera.distortion)) * p_cam[:, 2]
+            radius = np.hypot(p_cam[:, 0], p_cam[:, 1])
+            p_cam[:, :2] *= np.minimum(1.0, limit / np.maximum(radius, np.finfo(float).tiny))[:, None]
+    pixels = image_of_points(camera, p_cam)
+    return pixels if np.isfinite(pixels).all() else None
+
+
+def _coverage(camera: Camera, pose: Pose, center_m: Array, shape: Disc | Rectangle, first: Array, last: Array) -> Array:
+    """Coverage of the pixels from `first` to before `last`, both (column, row), in bands of rows."""
+    columns, rows = last - first
+    band = max(1, CELLS_AT_ONCE // int(columns))
+    parts = []
+    for start in range(0, int(rows), band):
+        v = np.arange(first[1] + start, first[1] + min(start + band, int(rows)) + 1, dtype=float)
+        u = np.arange(first[0], last[0] + 1, dtype=float)
+        parts.append(_coverage_of_band(camera, pose, center_m, shape, u, v))
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+
+def _coverage_of_band(
+    camera: Camera, pose: Pose, center_m: Array, shape: Disc | Rectangle, u: Array, v: Array
+) -> Array:
+    x, y = _on_plane(camera, pose, center_m, u, v)
+    whole, mixed = shape.whole_and_mixed(x, y)
+    coverage = whole.astype(float)
+    row, column = np.nonzero(mixed)
+    rows = np.stack([row, row, row + 1, row + 1], axis=1)
+    columns = np.stack([column, column + 1, column + 1, column], axis=1)
+    quads = np.stack([x[rows, columns], y[rows, columns]], axis=-1)
+    coverage[row, column] = np.clip(shape.shared_area(quads) / quadrilateral_area(quads), 0.0, 1.0)
     return coverage
 
 
-def _corner_extreme(values: Array, of: np.ufunc) -> Array:
-    extreme: Array = of(of(values[:-1, :-1], values[:-1, 1:]), of(values[1:, :-1], values[1:, 1:]))
-    return extreme
-
-
-def _area(quads: Array) -> Array:
-    area: Array = np.abs(_cross(quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1])) / 2
-    return area
+def _on_plane(camera: Camera, pose: Pose, center_m: Array, u: Array, v: Array) -> tuple[Array, Array]:
+    """Where the rays of the pixel positions u (columns,) by v (rows,) meet the LED's plane, from its centre."""
+    ray = ray_of_pixel(camera, u[None, :], v[:, None])
+    x, y, z = (ray[0] * r[0] + ray[1] * r[1] + ray[2] * r[2] for r in pose.rotation.T)
+    above = z > 1e-9
+    everywhere = bool(above.all())
+    height = center_m[2] - pose.position_m[2]
+    reach = height / (z if everywhere else np.where(above, z, 1.0))
+    on_x = x * reach + (pose.position_m[0] - center_m[0])
+    on_y = y * reach + (pose.position_m[1] - center_m[1])
+    if everywhere:
+        return on_x, on_y
+    return np.where(above, on_x, 10 * BEYOND_HORIZON_M), np.where(above, on_y, 10 * BEYOND_HORIZON_M)

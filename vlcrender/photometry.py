@@ -1,7 +1,7 @@
 """From photometric units to photoelectrons: cd/m2 at the lens to electrons a second in a pixel.
 
 Electrons in a pixel = (pi/4) (D/f_i)^2 cos^4(theta) A_pix t tau * integral of L_lambda QE(lambda) lambda/(h c) dlambda
-with D = f/N and f_i the image distance, f here: the lens is focused at infinity.
+with D = f/N and f_i the image distance: D/f_i is one over the working f-number.
 
 Sources: spectra of white LEDs, CIE 15:2018 illuminants LED-B1 to LED-V2; luminous efficiency V(lambda), CIE 1924
 photopic observer; both as tabulated by the package colour-science. Silicon: `silicon_absorption_per_m`.
@@ -89,6 +89,6 @@ def electron_rate_per_cd_m2(camera: Camera, spectrum_name: str, silicon: Silicon
     watt_per_nm = spectral_radiance(1.0, relative_spectrum(spectrum_name))
     photon_j = constants.h * constants.c / (WAVELENGTHS_NM * 1e-9)
     electrons = np.trapezoid(watt_per_nm * silicon.quantum_efficiency(WAVELENGTHS_NM) / photon_j, WAVELENGTHS_NM)
-    solid_angle_sr = np.pi / 4 / camera.f_number**2
+    solid_angle_sr = np.pi / 4 / camera.working_f_number**2
     area_m2 = (camera.pixel_pitch_um * 1e-6) ** 2
     return float(solid_angle_sr * area_m2 * camera.transmittance * electrons)

@@ -65,11 +65,35 @@ class ListedPoses(Settings):
         return len(self.pose)
 
 
-Poses = Annotated[AimedPoses | ListedPoses, Field(discriminator="kind")]
+class GridPoses(Settings):
+    """Level poses at one height, in the middles of columns (along x) times rows (along y) equal cells of the floor.
+
+    Table 1 of Huynh & Yoo 2016 has 350 x 350 at 0 m. A camera has to be inside the room: take a small height.
+    """
+
+    kind: Literal["grid"]
+    columns: Annotated[int, Field(ge=1, le=10_000)]
+    rows: Annotated[int, Field(ge=1, le=10_000)]
+    height_m: Annotated[float, Field(gt=0)]
+    yaw_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
+
+    @property
+    def count(self) -> int:
+        """Number of poses."""
+        return self.columns * self.rows
 
 
-def pose_of_frame(poses: AimedPoses | ListedPoses, frame: int, seed: int, camera: Camera, scene: Scene) -> Pose:
+AnyPoses = AimedPoses | ListedPoses | GridPoses
+Poses = Annotated[AnyPoses, Field(discriminator="kind")]
+
+
+def pose_of_frame(poses: AnyPoses, frame: int, seed: int, camera: Camera, scene: Scene) -> Pose:
     """The pose of one frame; depends on nothing but its arguments. Raises InputError where none can be found."""
+    if isinstance(poses, GridPoses):
+        row, column = divmod(frame, poses.columns)  # x goes up fastest
+        x_m, y_m, _ = scene.room_m
+        place = (float((column + 0.5) * x_m / poses.columns), float((row + 0.5) * y_m / poses.rows), poses.height_m)
+        return Pose(place, yaw_deg=poses.yaw_deg)
     if isinstance(poses, ListedPoses):
         entry = poses.pose[frame]
         return Pose(entry.position_m, entry.tilt_x_deg, entry.tilt_y_deg, entry.yaw_deg)

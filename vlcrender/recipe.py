@@ -3,17 +3,22 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from vlcrender.camera import Camera
 from vlcrender.errors import InputError
 from vlcrender.inertial import Accelerometer
-from vlcrender.poses import Poses
+from vlcrender.motion import Motion
+from vlcrender.poses import AimedPoses, Poses
+from vlcrender.rig import MAIN, Mounted, RigCamera, mounted_cameras
 from vlcrender.scene import Scene, load_scene
 from vlcrender.sensor import Sensor
 from vlcrender.settings import Settings, check, override, read_toml
+from vlcrender.windows import LedWindows
+
+ScaleMode = Literal["binned", "same-photons"]
 
 
 class Recipe(Settings):
@@ -33,6 +38,31 @@ class Recipe(Settings):
     sensor: Sensor = Sensor()
     accelerometer: Accelerometer = Accelerometer()
     poses: Poses
+    windows: LedWindows | None = None
+    """What is read out of the sensor; all of it where not given."""
+    motion: Motion | None = None
+    rig: tuple[RigCamera, ...] = ()
+    """Cameras beside `main`, which is the one under `camera` and the one that `poses` are for."""
+
+    @model_validator(mode="after")
+    def _camera_names_differ(self) -> Self:
+        names = [MAIN, *(entry.name for entry in self.rig)]
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(
+                    f"rig: {name!r} is the name of more than one camera (the one under camera is {MAIN!r})"
+                )
+        return self
+
+    @property
+    def cameras(self) -> tuple[Mounted, ...]:
+        """All cameras, `main` first."""
+        return mounted_cameras(self.camera, self.rig)
+
+    @property
+    def frame_count(self) -> int:
+        """One frame for each camera at each pose."""
+        return self.poses.count * len(self.cameras)
 
 
 @dataclass(frozen=True)
@@ -43,12 +73,63 @@ class Plan:
     scene: Scene
 
 
-def load_plan(path: Path, assignments: Iterable[str] = ()) -> Plan:
-    """Read a recipe, apply `key=value` assignments, read its scene. Raises InputError naming file, key and value."""
+def load_plan(path: Path, assignments: Iterable[str] = (), scale: int = 1, scale_mode: ScaleMode = "binned") -> Plan:
+    """Read a recipe, apply `key=value` assignments, then `scaled`, and read its scene.
+
+    Raises InputError naming file, key and value.
+    """
     assignments = list(assignments)
     source = f"{path} with --set" if assignments else str(path)
     recipe = check(override(read_toml(path), assignments), Recipe, source)
     scene_path = Path(path.parent / recipe.scene)
     if not scene_path.is_file():
         raise InputError(f"{source}: scene = {recipe.scene!r}: no such file from the recipe's folder")
-    return Plan(recipe, load_scene(scene_path))
+    return Plan(scaled(recipe, scale, scale_mode), load_scene(scene_path))
+
+
+def scaled(recipe: Recipe, by: int, mode: ScaleMode) -> Recipe:
+    """The same recipe with `by` x `by` pixels made one, and all that is given in pixels divided by `by`.
+
+    "binned" keeps all photons: full well and gain grow with the pixels' area, so that digital numbers keep their range.
+    "same-photons" shortens the exposure by the pixels' area instead: as many photons in a pixel as before.
+    Raises InputError where `by` does not divide a sensor or the result is no recipe.
+    """
+    if by == 1:
+        return recipe
+    if by < 1:
+        raise InputError(f"--scale {by}: is not 1 or more")
+    changes: dict[str, object] = {
+        "camera": _scaled_camera(recipe.camera, by),
+        "rig": tuple(
+            entry.model_copy(update={"camera": entry.camera and _scaled_camera(entry.camera, by)})
+            for entry in recipe.rig
+        ),
+    }
+    if isinstance(recipe.poses, AimedPoses):
+        changes["poses"] = recipe.poses.model_copy(update={"border_px": recipe.poses.border_px / by})
+    if recipe.windows is not None:
+        changes["windows"] = recipe.windows.model_copy(update={"margin_px": recipe.windows.margin_px / by})
+    if mode == "same-photons":
+        changes["exposure_s"] = recipe.exposure_s / by**2
+    else:
+        larger = {key: getattr(recipe.sensor, key) * by**2 for key in ("full_well_e", "gain_e_per_dn")}
+        changes["sensor"] = recipe.sensor.model_copy(update=larger)
+    return check(recipe.model_copy(update=changes).model_dump(mode="json"), Recipe, f"--scale {by}")
+
+
+def _scaled_camera(camera: Camera, by: int) -> Camera:
+    """u' = u / by and v' = v / by: focal length, principal point and skew in pixels shrink alike."""
+    if camera.width_px % by or camera.height_px % by:
+        raise InputError(f"--scale {by}: does not divide the camera's {camera.width_px} x {camera.height_px} pixels")
+    if camera.psf_kernel is not None:
+        raise InputError(f"--scale {by}: camera.psf_kernel is measured in pixels of the full camera; leave out one")
+    point = camera.principal_point_px
+    return camera.model_copy(
+        update={
+            "width_px": camera.width_px // by,
+            "height_px": camera.height_px // by,
+            "pixel_pitch_um": camera.pixel_pitch_um * by,
+            "principal_point_px": point and (point[0] / by, point[1] / by),
+            "skew_px": camera.skew_px / by,
+        }
+    )

@@ -1,39 +1,86 @@
-"""The same view by Mitsuba's own sensor and path integrator: slow, independent of `render`, for checking it."""
+"""The same view by Mitsuba's own path integrator: slow, independent of `render` and of the bake, for checking them.
+
+The room is built from Mitsuba's rectangles and discs, every LED is an area emitter, and light is followed from the
+camera by `path`. Two images add up: the LEDs' and windows' light with all its reflections, and the surrounding light,
+which is defined to hold its own reflections and so is looked at and not followed.
+"""
+
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vlcrender.backend import mi
-from vlcrender.camera import Camera, Pose, mitsuba_to_world
+from vlcrender.backend import dr, mi
+from vlcrender.camera import Camera, Pose, mitsuba_to_world, ray_of_pixel
 from vlcrender.errors import InputError
-from vlcrender.irradiance import led_face_luminance_cd_m2, surface_luminance_cd_m2
-from vlcrender.scene import Scene
+from vlcrender.irradiance import BEHIND_M, pane_bsdf
+from vlcrender.scene import Scene, Surface
+
+Array = NDArray[np.float64]
 
 BATCHES = 8
 LED_STANDOFF_M = 1e-5
-"""LED discs are put this far below what they are mounted on, so that a ray meets the disc first."""
+"""LEDs are put this far below what they are mounted on, so that a ray meets the LED first."""
+MAX_DEPTH = 24
 
 
 def reference_cd_m2(
     scene: Scene, camera: Camera, pose: Pose, samples_per_pixel: int, seed: int = 0
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Luminance averaged over each pixel, and the variance of that estimate, both (height, width).
+) -> tuple[Array, Array]:
+    """Luminance averaged over each pixel (and the pupil), and the variance of that estimate, both (height, width).
 
-    No lens: no cos^4, no aperture. `samples_per_pixel` is rounded up to a multiple of BATCHES, from whose scatter the
-    variance comes. Raises InputError for a camera with skew, which Mitsuba's sensors do not have.
+    No photometry: no cos^4, no aperture. A pinhole is Mitsuba's own perspective sensor; of other lenses rays are drawn
+    here, evenly over the pixel and the pupil, and followed by Mitsuba. The variance comes from the scatter of BATCHES
+    images. Raises InputError for what it cannot do: a psf, LEDs that are not Lambertian, furniture.
     """
-    if camera.skew_px != 0:
-        raise InputError(f"camera.skew_px = {camera.skew_px}: the reference renderer has no skew; it has to be 0")
-    loaded = mi.load_dict(scene_dict(scene, camera, pose), optimize=False)
+    if camera.psf != "none":
+        raise InputError(f"camera.psf = {camera.psf!r}: the reference renderer has no diffraction; it has to be 'none'")
+    if not np.allclose(scene.leds.orders, 1.0):
+        raise InputError("half_power_deg: the reference renderer's LEDs are Lambertian; it has to be 60")
+    if scene.settings.furniture:
+        raise InputError("furniture: the reference renderer has none")
+    followed = mi.load_dict({"type": "path", "max_depth": MAX_DEPTH, "rr_depth": 8})
+    looked_at = mi.load_dict({"type": "path", "max_depth": 3})
+    lit, flat = (mi.load_dict(scene_dict(scene, camera, pose, glow), optimize=False) for glow in (False, True))
+    pinhole = camera.projection == "perspective" and camera.distortion is None and camera.focus_distance_m is None
+    render = _by_sensor if pinhole and camera.skew_px == 0 else _by_rays
     each = -(-samples_per_pixel // BATCHES)
     images = []
     for batch in range(BATCHES):
-        film = mi.render(loaded, spp=each, seed=seed * BATCHES + batch)
-        images.append(np.asarray(film, dtype=np.float64).reshape(camera.height_px, camera.width_px))
+        number = 2 * (seed * BATCHES + batch)
+        image = render(lit, followed, camera, pose, each, number) + render(
+            flat, looked_at, camera, pose, each, number + 1
+        )
+        images.append(image.reshape(camera.height_px, camera.width_px))
     stack = np.stack(images)
-    mean: NDArray[np.float64] = stack.mean(axis=0)
-    variance: NDArray[np.float64] = stack.var(axis=0, ddof=1) / BATCHES
-    return mean, variance
+    return stack.mean(axis=0), stack.var(axis=0, ddof=1) / BATCHES
+
+
+def _by_sensor(scene: Any, integrator: Any, camera: Camera, pose: Pose, samples: int, seed: int) -> Array:
+    return np.asarray(mi.render(scene, integrator=integrator, spp=samples, seed=seed), dtype=np.float64)
+
+
+def _by_rays(scene: Any, integrator: Any, camera: Camera, pose: Pose, samples: int, seed: int) -> Array:
+    """Thin lens: from a point of the pupil to where the ray through its centre meets the plane of focus."""
+    count = camera.width_px * camera.height_px
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(seed, count * samples)
+    pixel = dr.arange(mi.UInt32, count * samples) // samples
+    row = pixel // camera.width_px
+    within = sampler.next_2d()
+    u, v = mi.Float(pixel - row * camera.width_px) + within.x, mi.Float(row) + within.y
+    x, y, z = ray_of_pixel(camera, u, v, dr)
+    pupil_m = 0.0 if camera.focus_distance_m is None else camera.aperture_mm / 2000
+    off = mi.warp.square_to_uniform_disk_concentric(sampler.next_2d()) * pupil_m
+    if isinstance(camera.focus_distance_m, float):
+        x, y, z = x - off.x / camera.focus_distance_m, y - off.y / camera.focus_distance_m, z
+    to_world = pose.rotation.T.tolist()
+    direction = mi.Vector3f(*(r[0] * x + r[1] * y + r[2] * z for r in to_world))
+    origin = mi.Point3f(*(p + r[0] * off.x + r[1] * off.y for p, r in zip(pose.position_m, to_world, strict=True)))
+    luminance, _, _ = integrator.sample(scene, sampler, mi.RayDifferential3f(origin, dr.normalize(direction)))
+    mean: Array = np.array(luminance, dtype=np.float64).reshape(count, samples).mean(axis=1)
+    return mean
 
 
 def sensor_dict(camera: Camera, pose: Pose) -> dict[str, object]:
@@ -61,35 +108,73 @@ def sensor_dict(camera: Camera, pose: Pose) -> dict[str, object]:
     }
 
 
-def scene_dict(scene: Scene, camera: Camera, pose: Pose) -> dict[str, object]:
-    """The scene for Mitsuba with flat surrounding light: every surface and LED shines with its own luminance."""
-    tree: dict[str, object] = {
-        "type": "scene",
-        "integrator": {"type": "path", "max_depth": 1},
-        "sensor": sensor_dict(camera, pose),
-    }
-    for number, (surface, luminance) in enumerate(zip(scene.surfaces, surface_luminance_cd_m2(scene), strict=True)):
-        # Mitsuba's rectangle spans [-1, 1]^2.
-        frame = np.eye(4)
-        frame[:3, 0] = surface.edge_u_m / 2
-        frame[:3, 1] = surface.edge_v_m / 2
-        normal = np.cross(surface.edge_u_m, surface.edge_v_m)
-        frame[:3, 2] = normal / np.linalg.norm(normal)
-        frame[:3, 3] = surface.corner_m + (surface.edge_u_m + surface.edge_v_m) / 2
-        tree[f"surface{number}"] = _glowing("rectangle", frame, float(luminance))
-    leds = scene.leds
-    faces = leds.luminances_cd_m2 + led_face_luminance_cd_m2(scene)
+def scene_dict(scene: Scene, camera: Camera, pose: Pose, glow: bool) -> dict[str, object]:
+    """The scene for Mitsuba. With `glow` every surface shines with what the surrounding light makes of it, no LED does.
+
+    A pane mirrors and lets through; what is outside shines in the image without `glow`.
+    """
+    tree: dict[str, object] = {"type": "scene", "sensor": sensor_dict(camera, pose)}
+    flat = scene.settings.ambient.illuminance_lux / np.pi
+    number = 0
+    for surface in scene.surfaces:
+        luminance = surface.reflectance * flat if glow else 0.0
+        for corner, edge_u, edge_v in _without_holes(surface):
+            diffuse = _diffuse(0.0 if glow else surface.reflectance)
+            tree[f"surface{number}"] = _shape("rectangle", _frame(corner, edge_u, edge_v), diffuse, luminance)
+            number += 1
+    for i, pane in enumerate(scene.panes):
+        frame = _frame(pane.corner_m, pane.edge_u_m, pane.edge_v_m)
+        tree[f"pane{i}"] = _shape("rectangle", frame, pane_bsdf(pane), 0.0)
+        if not glow:
+            behind = frame.copy()
+            behind[:3, 3] -= BEHIND_M * frame[:3, 2]
+            behind[:3, :2] *= 1 + BEHIND_M
+            tree[f"outside{i}"] = _shape("rectangle", behind, _diffuse(0.0), pane.luminance_cd_m2)
+    leds, face = scene.leds, scene.settings.led_reflectance
     for i in range(len(leds)):
-        frame = np.diag([leds.radii_m[i], -leds.radii_m[i], -1.0, 1.0])  # faces down
+        radius = leds.radii_m[i]
+        frame = np.diag([radius, -radius, -1.0, 1.0])  # faces down
         frame[:3, 3] = leds.centers_m[i] - [0, 0, LED_STANDOFF_M]
-        tree[f"led{i}"] = _glowing("disk", frame, float(faces[i]))
+        luminance = face * flat if glow else leds.luminances_cd_m2[i]
+        shape = "rectangle" if leds.squares[i] else "disk"
+        tree[f"led{i}"] = _shape(shape, frame, _diffuse(0.0 if glow else face), luminance)
     return tree
 
 
-def _glowing(shape: str, frame: NDArray[np.float64], luminance_cd_m2: float) -> dict[str, object]:
-    return {
-        "type": shape,
-        "to_world": mi.ScalarTransform4f(frame.tolist()),
-        "emitter": {"type": "area", "radiance": luminance_cd_m2},
-        "bsdf": {"type": "diffuse", "reflectance": 0.0},
-    }
+def _without_holes(surface: Surface) -> list[tuple[Array, Array, Array]]:
+    """Corner and edges of rectangles that make up a surface: strips along v, cut where a hole is."""
+    corner, edge_u, edge_v, holes = surface.corner_m, surface.edge_u_m, surface.edge_v_m, surface.holes
+    cuts = np.unique([0.0, 1.0, *(cut for a0, _, a1, _ in holes for cut in (a0, a1))])
+    parts = []
+    for low, high in pairwise(cuts):
+        if high - low < 1e-12:
+            continue
+        across = sorted((b0, b1) for a0, b0, a1, b1 in holes if a0 < (low + high) / 2 < a1)
+        start = 0.0
+        for b0, b1 in [*across, (1.0, 1.0)]:
+            if b0 - start > 1e-12:
+                parts.append((corner + low * edge_u + start * edge_v, (high - low) * edge_u, (b0 - start) * edge_v))
+            start = b1
+    return parts
+
+
+def _frame(corner: Array, edge_u: Array, edge_v: Array) -> Array:
+    """`to_world` of Mitsuba's rectangle, which spans [-1, 1]^2."""
+    frame = np.eye(4)
+    frame[:3, 0] = edge_u / 2
+    frame[:3, 1] = edge_v / 2
+    normal = np.cross(edge_u, edge_v)
+    frame[:3, 2] = normal / np.linalg.norm(normal)
+    frame[:3, 3] = corner + (edge_u + edge_v) / 2
+    return frame
+
+
+def _diffuse(reflectance: float) -> dict[str, object]:
+    return {"type": "diffuse", "reflectance": reflectance}
+
+
+def _shape(shape: str, frame: Array, bsdf: dict[str, object], luminance_cd_m2: float) -> dict[str, Any]:
+    tree = {"type": shape, "to_world": mi.ScalarTransform4f(frame.tolist()), "bsdf": bsdf}
+    if luminance_cd_m2 > 0:
+        tree["emitter"] = {"type": "area", "radiance": float(luminance_cd_m2)}
+    return tree

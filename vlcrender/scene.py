@@ -5,127 +5,72 @@ World: metres, right-handed, z up, origin at a floor corner.
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from vlcrender.errors import InputError
-from vlcrender.settings import Settings, check, read_toml
+from vlcrender.scene_settings import PanelGrid, PanelLeds, Room, SceneSettings
+from vlcrender.settings import check, read_toml
 from vlcrender.streams import stream
-
-Length = Annotated[float, Field(gt=0, le=1000)]
-Reflectance = Annotated[float, Field(ge=0, le=1)]
-Luminance = Annotated[float, Field(gt=0, le=1e9)]
-Illuminance = Annotated[float, Field(ge=0, le=1e6)]
-Count = Annotated[int, Field(ge=1, le=1000)]
-Identity = Annotated[int, Field(ge=0, lt=2**31)]
-Point = tuple[float, float, float]
-Spectrum = Literal["LED-B1", "LED-B2", "LED-B3", "LED-B4", "LED-B5", "LED-BH1", "LED-V1", "LED-V2"]
 
 TOUCH_M = 1e-9
 """Rounding allowance where an LED or panel touches a wall or another LED."""
 
 
-class RoomReflectances(Settings):
-    """Diffuse reflectance (albedo) of the room's surfaces, 0 to 1."""
-
-    floor: Reflectance
-    ceiling: Reflectance
-    walls: Reflectance
-
-
-class Room(Settings):
-    """A box with one corner at the origin."""
-
-    size_m: tuple[Length, Length, Length]
-    reflectance: RoomReflectances
-
-
-class Ambient(Settings):
-    """Surrounding light: all that reaches a surface and does not come straight from an LED."""
-
-    illuminance_lux: Illuminance
-    spectrum: Spectrum
-
-
-class LedEntry(Settings):
-    """One LED: a disc that faces down."""
-
-    id: Identity
-    position_m: Point
-    radius_m: Length
-    luminance_cd_m2: Luminance
-
-
-class PanelLeds(Settings):
-    """The two-dimensional array of LEDs on the underside of a panel, centred on it."""
-
-    columns: Count
-    rows: Count
-    pitch_m: tuple[Length, Length]
-    radius_m: Length
-    luminance_cd_m2: tuple[Luminance, Luminance]
-    """Each LED's luminance is drawn evenly between the two, once and for all, by `luminance_seed`."""
-    luminance_seed: Identity = 0
-    first_id: Identity
-    """LED (row, column) of panel (row, column): ids go up along columns first, then rows, then panels likewise."""
-
-
-class PanelGrid(Settings):
-    """Equal panels on a rectangular grid; each is a box whose underside carries LEDs."""
-
-    columns: Count
-    rows: Count
-    first_center_m: Point
-    """Centre of the underside of the panel nearest the origin."""
-    pitch_m: tuple[Length, Length]
-    size_m: tuple[Length, Length, Length]
-    """Along x, along y, and upwards from the underside."""
-    reflectance: Reflectance
-    leds: PanelLeds
-
-
-class SceneSettings(Settings):
-    """A scene file."""
-
-    format: Literal["vlcrender-scene"]
-    version: Literal[1]
-    name: Annotated[str, Field(min_length=1, max_length=100)]
-    description: str = ""
-    led_spectrum: Spectrum
-    led_reflectance: Reflectance
-    """Of an LED's own face, under the surrounding light."""
-    room: Room
-    ambient: Ambient
-    led: tuple[LedEntry, ...] = ()
-    panels: tuple[PanelGrid, ...] = ()
-
-
 @dataclass(frozen=True)
 class Surface:
-    """A diffuse parallelogram: corner + a * edge_u + b * edge_v with a, b in [0, 1]; seen from edge_u x edge_v."""
+    """A diffuse rectangle: corner + a * edge_u + b * edge_v with a, b in [0, 1]; seen from edge_u x edge_v."""
 
     name: str
     corner_m: NDArray[np.float64]
     edge_u_m: NDArray[np.float64]
     edge_v_m: NDArray[np.float64]
     reflectance: float
+    holes: tuple[tuple[float, float, float, float], ...] = ()
+    """(a0, b0, a1, b1) of what is cut out: panels on a ceiling, windows in a wall."""
+
+
+@dataclass(frozen=True)
+class Pane:
+    """A window pane: the rectangle corner + a * edge_u + b * edge_v, seen from edge_u x edge_v."""
+
+    name: str
+    corner_m: NDArray[np.float64]
+    edge_u_m: NDArray[np.float64]
+    edge_v_m: NDArray[np.float64]
+    luminance_cd_m2: float
+    refractive_index: float
+
+    @property
+    def corners_m(self) -> NDArray[np.float64]:
+        """The four corners in order around, shape (4, 3)."""
+        shares = ((0, 0), (1, 0), (1, 1), (0, 1))
+        return np.stack([self.corner_m + a * self.edge_u_m + b * self.edge_v_m for a, b in shares])
 
 
 @dataclass(frozen=True)
 class Leds:
-    """All LEDs of a scene, sorted by id: discs that face down (normal 0, 0, -1)."""
+    """All LEDs of a scene, sorted by id: discs or squares that face down (normal 0, 0, -1)."""
 
     ids: NDArray[np.int64]
     centers_m: NDArray[np.float64]
     radii_m: NDArray[np.float64]
     luminances_cd_m2: NDArray[np.float64]
+    orders: NDArray[np.float64]
+    """Lambertian order m: luminance at an angle theta from the normal is luminance * cos^(m-1)(theta)."""
+
+    squares: NDArray[np.bool_]
+    """Where True the LED is a square of half side `radii_m`, sides along x and y."""
 
     def __len__(self) -> int:
         """Count the LEDs."""
         return len(self.ids)
+
+    @property
+    def areas_m2(self) -> NDArray[np.float64]:
+        """Area of each face."""
+        return np.where(self.squares, 4.0, np.pi) * self.radii_m**2
 
 
 @dataclass(frozen=True)
@@ -134,7 +79,10 @@ class Scene:
 
     settings: SceneSettings
     surfaces: tuple[Surface, ...]
+    panes: tuple[Pane, ...]
     leds: Leds
+    folder: Path
+    """Where furniture files are looked up."""
 
     @property
     def name(self) -> str:
@@ -149,16 +97,25 @@ class Scene:
 
 def load_scene(path: Path) -> Scene:
     """Read and check a scene file. Raises InputError naming file, key and value."""
-    return build_scene(check(read_toml(path), SceneSettings, str(path)), str(path))
+    return build_scene(check(read_toml(path), SceneSettings, str(path)), str(path), path.parent)
 
 
-def build_scene(settings: SceneSettings, source: str) -> Scene:
-    """Lay out surfaces and LEDs. Raises InputError where something is outside the room or overlaps."""
+def build_scene(settings: SceneSettings, source: str, folder: Path = Path()) -> Scene:
+    """Lay out surfaces and LEDs; furniture files are below `folder`.
+
+    Raises InputError, which starts with `source`, where something is outside the room, overlaps or is missing.
+    """
     leds = _leds(settings, source)
-    surfaces = _room_surfaces(settings.room)
+    panes = _panes(settings, source)
+    surfaces = _room_surfaces(settings.room, settings.panels, panes)
     for index, grid in enumerate(settings.panels):
         surfaces += _panel_surfaces(grid, np.array(settings.room.size_m), f"{source}: panels[{index}]")
-    return Scene(settings, tuple(surfaces), leds)
+    for index, piece in enumerate(settings.furniture):
+        if not (folder / piece.file).is_file():
+            raise InputError(
+                f"{source}: furniture[{index}].file = {piece.file!r}: no such file from the scene's folder"
+            )
+    return Scene(settings, tuple(surfaces), panes, leds, folder)
 
 
 def panel_centers_m(grid: PanelGrid) -> NDArray[np.float64]:
@@ -174,12 +131,16 @@ def _leds(settings: SceneSettings, source: str) -> Leds:
     centers: list[NDArray[np.float64]] = []
     radii: list[float] = []
     luminances: list[float] = []
+    half_powers: list[float] = []
+    shapes: list[str] = []
     origins: list[str] = []
     for index, entry in enumerate(settings.led):
         ids.append(entry.id)
         centers.append(np.array(entry.position_m))
         radii.append(entry.radius_m)
         luminances.append(entry.luminance_cd_m2)
+        half_powers.append(entry.half_power_deg)
+        shapes.append(entry.shape)
         origins.append(f"led[{index}]")
     for index, grid in enumerate(settings.panels):
         array = grid.leds
@@ -194,6 +155,8 @@ def _leds(settings: SceneSettings, source: str) -> Leds:
         centers += list(positions)
         radii += [array.radius_m] * len(positions)
         luminances += list(stream(array.luminance_seed, 0, "led-luminance").uniform(low, high, len(positions)))
+        half_powers += [array.half_power_deg] * len(positions)
+        shapes += [array.shape] * len(positions)
         origins += [f"panels[{index}].leds"] * len(positions)
     if not ids:
         raise InputError(f"{source}: has no LED; add [[led]] or [[panels]]")
@@ -203,6 +166,8 @@ def _leds(settings: SceneSettings, source: str) -> Leds:
         np.array(centers)[order],
         np.array(radii)[order],
         np.array(luminances)[order],
+        -np.log(2) / np.log(np.cos(np.radians(half_powers)))[order],
+        np.array([shape == "square" for shape in shapes])[order],
     )
     _check_leds(leds, [origins[i] for i in order], np.array(settings.room.size_m), source)
     return leds
@@ -234,7 +199,9 @@ def _check_leds(leds: Leds, origins: list[str], room_m: NDArray[np.float64], sou
             f"is not inside the room of {room_m.tolist()} m"
         )
     for i in range(len(leds) - 1):
-        apart = np.linalg.norm(leds.centers_m[i + 1 :] - leds.centers_m[i], axis=1)
+        between = leds.centers_m[i + 1 :] - leds.centers_m[i]
+        both_square = leds.squares[i + 1 :] & leds.squares[i]
+        apart = np.where(both_square, np.abs(between).max(axis=1), np.linalg.norm(between, axis=1))
         close = np.flatnonzero(apart < leds.radii_m[i + 1 :] + leds.radii_m[i] - TOUCH_M)
         if len(close):
             other = i + 1 + close[0]
@@ -244,18 +211,94 @@ def _check_leds(leds: Leds, origins: list[str], room_m: NDArray[np.float64], sou
             )
 
 
-def _room_surfaces(room: Room) -> list[Surface]:
-    x, y, z = (np.diag(room.size_m)[i] for i in range(3))
+def _room_surfaces(room: Room, panels: tuple[PanelGrid, ...], panes: tuple[Pane, ...]) -> list[Surface]:
     o = np.zeros(3)
+    x, y, z = (np.diag(room.size_m)[i] for i in range(3))
     r = room.reflectance
-    return [
+    surfaces = [
         Surface("floor", o, x, y, r.floor),
-        Surface("ceiling", z, y, x, r.ceiling),
-        Surface("wall x=0", o, y, z, r.walls),
-        Surface("wall x=max", x, z, y, r.walls),
-        Surface("wall y=0", o, z, x, r.walls),
-        Surface("wall y=max", y, x, z, r.walls),
+        Surface("ceiling", z, y, x, r.ceiling, _panels_on_ceiling(room, panels)),
     ]
+    for name, (corner, edge_u, edge_v) in _walls(room).items():
+        holes = tuple(_hole(pane, corner, edge_u, edge_v) for pane in panes if pane.name.startswith(f"window {name} "))
+        surfaces.append(Surface(f"wall {name}", corner, edge_u, edge_v, r.walls, holes))
+    return surfaces
+
+
+def _walls(room: Room) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]]:
+    """Corner and edges of each wall; edge_u x edge_v points into the room."""
+    o = np.zeros(3)
+    x, y, z = (np.diag(room.size_m)[i] for i in range(3))
+    return {"x=0": (o, y, z), "x=max": (x, z, y), "y=0": (o, z, x), "y=max": (y, x, z)}
+
+
+def _panels_on_ceiling(room: Room, panels: tuple[PanelGrid, ...]) -> tuple[tuple[float, float, float, float], ...]:
+    """Parts of the ceiling that panels touch, in its (a, b) = (y, x) shares."""
+    width, depth, height = room.size_m
+    holes = []
+    for grid in panels:
+        if abs(grid.first_center_m[2] + grid.size_m[2] - height) > TOUCH_M:
+            continue
+        half_x, half_y = grid.size_m[0] / 2, grid.size_m[1] / 2
+        for x, y, _ in panel_centers_m(grid).tolist():
+            holes.append(((y - half_y) / depth, (x - half_x) / width, (y + half_y) / depth, (x + half_x) / width))
+    return tuple(holes)
+
+
+def _hole(
+    pane: Pane, corner: NDArray[np.float64], edge_u: NDArray[np.float64], edge_v: NDArray[np.float64]
+) -> tuple[float, float, float, float]:
+    low = pane.corner_m - corner
+    high = low + pane.edge_u_m + pane.edge_v_m
+    along = [(float(p @ edge_u / (edge_u @ edge_u)), float(p @ edge_v / (edge_v @ edge_v))) for p in (low, high)]
+    (a0, b0), (a1, b1) = along
+    return a0, b0, a1, b1
+
+
+def _panes(settings: SceneSettings, source: str) -> tuple[Pane, ...]:
+    panes: list[Pane] = []
+    taken: list[tuple[str, tuple[NDArray[np.float64], NDArray[np.float64]]]] = []
+    for index, window in enumerate(settings.window):
+        where = f"{source}: window[{index}]"
+        corner, edge_u, edge_v = _walls(settings.room)[window.wall]
+        along = 1 if window.wall.startswith("x") else 0
+        low = corner.copy()
+        low[along] = window.corner_m[0]
+        low[2] = window.corner_m[1]
+        high = low.copy()
+        high[along] += window.size_m[0]
+        high[2] += window.size_m[1]
+        if (high > np.array(settings.room.size_m) + TOUCH_M).any():
+            raise InputError(
+                f"{where}: from {low.round(4).tolist()} to {high.round(4).tolist()} m does not fit "
+                f"into the room of {list(settings.room.size_m)} m"
+            )
+        if any(wall == window.wall and _overlap(low, high, *extent, along) for wall, extent in taken):
+            raise InputError(f"{where}: overlaps another window in wall {window.wall}")
+        taken.append((window.wall, (low, high)))
+        span = high - low
+        panes.append(
+            Pane(
+                name=f"window {window.wall} {index}",
+                corner_m=low,
+                edge_u_m=np.where(edge_u != 0, span, 0.0),
+                edge_v_m=np.where(edge_v != 0, span, 0.0),
+                luminance_cd_m2=window.luminance_cd_m2,
+                refractive_index=window.refractive_index,
+            )
+        )
+    return tuple(panes)
+
+
+def _overlap(
+    low: NDArray[np.float64],
+    high: NDArray[np.float64],
+    other_low: NDArray[np.float64],
+    other_high: NDArray[np.float64],
+    along: int,
+) -> bool:
+    axes = [along, 2]
+    return bool((low[axes] < other_high[axes] - TOUCH_M).all() and (high[axes] > other_low[axes] + TOUCH_M).all())
 
 
 def _panel_surfaces(grid: PanelGrid, room_m: NDArray[np.float64], where: str) -> list[Surface]:

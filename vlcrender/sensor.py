@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 
 from vlcrender.settings import Settings
 
-Electrons = NDArray[np.float32] | NDArray[np.float64] | NDArray[np.int64]
+Electrons = NDArray[np.float32] | NDArray[np.float64] | NDArray[np.uint32]
 
 
 class Sensor(Settings):
@@ -38,23 +38,18 @@ class Sensor(Settings):
         """The digital number at which the converter saturates."""
         return int(2**self.bits - 1)
 
-    def expose(self, expected_e: Electrons, generator: np.random.Generator) -> NDArray[np.uint32]:
-        """Turn expected electrons (any shape, finite, >= 0) into digital numbers of the same shape."""
-        electrons = shot_noise(expected_e, generator) if self.noise == "shot" else expected_e
-        return self.quantise(clip_full_well(electrons, self.full_well_e))
-
     def quantise(self, electrons: Electrons) -> NDArray[np.uint32]:
         """Convert electrons: round(e / gain) + black level, within 0 and the converter's largest number."""
-        dn = np.rint(electrons / np.float64(self.gain_e_per_dn)) + self.black_level_dn
+        if self.gain_e_per_dn == 1.0 and electrons.dtype == np.uint32:  # counts are numbers already
+            dn = electrons + np.uint32(self.black_level_dn)
+        else:
+            dn = np.rint(electrons / np.float64(self.gain_e_per_dn)) + self.black_level_dn
         clipped: NDArray[np.uint32] = np.clip(dn, 0, self.largest_dn).astype(np.uint32)
         return clipped
 
 
-def shot_noise(expected_e: Electrons, generator: np.random.Generator) -> NDArray[np.int64]:
-    """Draw Poisson counts of these means."""
-    return generator.poisson(expected_e)
-
-
 def clip_full_well(electrons: Electrons, full_well_e: float) -> Electrons:
     """Clip at the full well: what a photodiode cannot hold is lost."""
+    if electrons.dtype == np.uint32:
+        return np.minimum(electrons, np.uint32(min(full_well_e, 2**32 - 1)))
     return np.minimum(electrons, full_well_e)

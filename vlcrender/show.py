@@ -9,8 +9,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from vlcrender.camera import Camera, Pose, rays_world
-from vlcrender.render import Renderer, View
+from vlcrender.render import Renderer
 from vlcrender.scene import Scene
+from vlcrender.view import View
 from vlcrender.visibility import leds_in_view
 
 EXPOSURE_S = 160e-6

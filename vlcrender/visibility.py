@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from vlcrender.camera import Camera, Pose, project, rays_world, transform
+from vlcrender.camera import Camera, Pose, image_of_points, project, rays_world, transform
 from vlcrender.scene import Scene
 from vlcrender.streams import stream
 
@@ -41,9 +41,9 @@ def leds_in_view(camera: Camera, pose: Pose, scene: Scene, margin_px: float = 0.
     rim = np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=1)
     # The circumscribed 24-gon: what holds it holds the disc.
     points = leds.centers_m[candidates, None, :] + rim * (leds.radii_m[candidates, None, None] / np.cos(np.pi / 24))
-    pixels, depth = project(camera, pose, points)
+    pixels, _ = project(camera, pose, points)
     inside = (pixels >= margin_px) & (pixels <= np.array([camera.width_px, camera.height_px]) - margin_px)
-    seen = (inside.all(axis=-1) & (depth > 0)).all(axis=1) & (pose.position_m[2] < leds.centers_m[candidates, 2])
+    seen = inside.all(axis=(-1, -2)) & (pose.position_m[2] < leds.centers_m[candidates, 2])
     visible: NDArray[np.int64] = candidates[seen]
     return visible
 
@@ -58,10 +58,12 @@ def level_coverage(camera: Camera, scene: Scene, height_m: float, yaw_deg: float
     pose = Pose((0.0, 0.0, 0.0), yaw_deg=yaw_deg)
     size = np.array([camera.width_px, camera.height_px])
     corners = rays_world(camera, pose, size * np.array([[0, 0], [1, 0], [0, 1], [1, 1]]))
+    with np.errstate(divide="ignore"):
+        slopes = np.where(corners[:, 2:] > 0, corners[:, :2] / corners[:, 2:], np.inf)
     tree = cKDTree(positions[:, :2])
     counts = np.zeros(len(positions), dtype=np.int64)
     for center in scene.leds.centers_m[scene.leds.centers_m[:, 2] > height_m]:
-        reach = np.hypot(corners[:, 0], corners[:, 1]).max() * (center[2] - height_m)
+        reach = np.hypot(slopes[:, 0], slopes[:, 1]).max() * (center[2] - height_m)
         near = np.array(tree.query_ball_point(center[:2], reach), dtype=np.int64)
         counts[near] += _on_sensor(camera, transform(pose.rotation, center - positions[near]))
     side = "x" if yaw_deg == 0 else "y"
@@ -91,10 +93,8 @@ def tilted_coverage(camera: Camera, scene: Scene, height_m: float) -> Coverage:
 
 def _on_sensor(camera: Camera, p_cam: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Whether points in camera axes (n, 3) are imaged on the sensor, shape (n,)."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        pixels = transform(camera.matrix[:2], p_cam / p_cam[:, 2:])
+    pixels = image_of_points(camera, p_cam)  # NaN, which is on no side of a border, where the lens does not image
     tolerance = 1e-6  # a point on the border counts, whichever way its last digit rounds
-    seen: NDArray[np.bool_] = (p_cam[:, 2] > 0) & (
-        (pixels >= -tolerance) & (pixels <= np.array([camera.width_px, camera.height_px]) + tolerance)
-    ).all(axis=1)
-    return seen
+    size = np.array([camera.width_px, camera.height_px])
+    seen = ((pixels >= -tolerance) & (pixels <= size + tolerance)).all(axis=1)
+    return np.asarray(seen, dtype=np.bool_)

@@ -1,0 +1,81 @@
+"""Speed of LED windows alone: poses a second, and a full frame's time over that of its windows.
+
+    python benchmarks/windows.py [POSES]
+
+Table 1's four LEDs on a 4000 x 3000 sensor, windows reaching beyond it so that every pose has all four, noise
+included, files not. Machines differ and are shared: compare rates within one run only.
+"""
+
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor
+from functools import cache
+from multiprocessing import get_context
+from pathlib import Path
+
+from vlcrender.backend import dr
+from vlcrender.camera import Camera, Pose
+from vlcrender.exposure import expose
+from vlcrender.render import Renderer
+from vlcrender.scene import load_scene
+from vlcrender.sensor import Sensor
+from vlcrender.windows import LedWindows
+
+EXPOSURE_S = 160e-6
+WORKERS = 2
+
+
+@cache
+def renderer() -> Renderer:
+    """One a process."""
+    return Renderer(load_scene(Path(__file__).parent.parent / "scenes/table1.toml"))
+
+
+def shoot(number: int, windows: LedWindows | None) -> int:
+    """Render and expose the pose of this number, along a diagonal of the floor; returns the pixels made."""
+    share = number * 0.618034 % 1.0
+    pose = Pose((0.2 + 6.6 * share, 0.2 + 6.6 * (1 - share), 0.05))
+    view = renderer().view(Camera(), pose, windows)
+    sensor, key = Sensor(), f"bench {number}"
+    return sum(
+        expose(sensor, part.expected_electrons(EXPOSURE_S), key, part.window.row, part.window.column).size
+        for part in view.parts
+    )
+
+
+def leds_alone(numbers: range) -> int:
+    """Make the windows of these poses; returns the pixels made."""
+    return sum(shoot(number, LedWindows(kind="leds", overscan=True)) for number in numbers)
+
+
+def one_thread() -> None:
+    """Have Dr.Jit keep to one: idle ones wait busily, and take from the other process what they do not use."""
+    dr.set_thread_count(1)
+
+
+def main() -> None:
+    """Measure and print."""
+    poses = int(sys.argv[1]) if len(sys.argv) > 1 else 200
+    leds_alone(range(5))
+    start = time.perf_counter()
+    pixels = leds_alone(range(poses)) / poses
+    window_s = (time.perf_counter() - start) / poses
+    shoot(0, None)
+    start = time.perf_counter()
+    for number in range(3):
+        shoot(number, None)
+    full_s = (time.perf_counter() - start) / 3
+    chunks = [range(first, poses, 4 * WORKERS) for first in range(4 * WORKERS)]
+    with ProcessPoolExecutor(WORKERS, get_context("spawn"), one_thread) as pool:
+        list(pool.map(leds_alone, [range(5)] * 2 * WORKERS))
+        start = time.perf_counter()
+        list(pool.map(leds_alone, chunks))
+        pooled_s = (time.perf_counter() - start) / poses
+    print(f"table1, 4000 x 3000, four LED windows of {pixels:.0f} pixels together, {poses} poses")
+    print(f"one process        {1 / window_s:6.0f} poses/s")
+    print(f"{WORKERS} processes        {1 / pooled_s:6.0f} poses/s")
+    print(f"full frame / windows of the same process   {full_s / window_s:6.0f}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,206 @@
+"""The room's light against closed forms: single sources, white furnace, energy balance, form factors, shadows."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import ROOT
+
+from vlcrender.geometry import Mesh, join, mesh_of_surfaces
+from vlcrender.irradiance import bake, led_illuminance_lux, mitsuba_scene, path_traced_lux, room_mesh
+from vlcrender.scene import Leds, Scene, build_scene, load_scene
+from vlcrender.scene_settings import SceneSettings
+from vlcrender.settings import check, read_toml
+
+TABLE1 = read_toml(ROOT / "scenes/table1.toml")
+
+
+def scene_of(folder: Path | None = None, **changes: object) -> Scene:
+    """Table 1's room with other tables."""
+    return build_scene(check({**TABLE1, **changes}, SceneSettings, "test"), "test", folder or ROOT / "scenes")
+
+
+def lamp(**values: object) -> dict[str, object]:
+    return {"id": 1, "position_m": [3.5, 3.5, 3.5], "radius_m": 0.01, "luminance_cd_m2": 10000.0, **values}
+
+
+def empty_room(mesh: Mesh) -> object:
+    return mitsuba_scene(mesh, np.zeros(len(mesh.vertices_m)), (), panes_glow=False)
+
+
+def lux_on_floor(leds: Leds, x: float, y: float, scene: Scene) -> float:
+    mesh = room_mesh(scene)
+    return float(led_illuminance_lux(empty_room(mesh), np.array([[x, y, 0.0]]), np.array([[0.0, 0.0, 1.0]]), leds)[0])
+
+
+def test_below_a_disc() -> None:
+    """E = pi L r^2 / (r^2 + h^2), exact for a Lambertian disc on its axis."""
+    scene = scene_of(led=[lamp(radius_m=0.1)])
+    expected = np.pi * 10000 * 0.1**2 / (0.1**2 + 3.5**2)
+    # the small-source form leaves out r^2 beside h^2: 8e-4
+    assert lux_on_floor(scene.leds, 3.5, 3.5, scene) == pytest.approx(expected, rel=1e-3)
+
+
+def test_below_a_square() -> None:
+    """On the axis of a square: four corner rectangles with the textbook's form factor, X = half side / height."""
+    scene = scene_of(led=[lamp(radius_m=0.1, shape="square")])
+    x = 0.1 / 3.5
+    factor = 4 / (2 * np.pi) * 2 * x / np.sqrt(1 + x**2) * np.arctan(x / np.sqrt(1 + x**2))
+    # the small-source form leaves out 4/3 X^2 = 1.1e-3
+    assert lux_on_floor(scene.leds, 3.5, 3.5, scene) == pytest.approx(np.pi * 10000 * factor, rel=1.5e-3)
+
+
+def test_beside_the_axis_illuminance_falls_with_cos4() -> None:
+    scene = scene_of(led=[lamp()])
+    straight = lux_on_floor(scene.leds, 3.5, 3.5, scene)
+    beside = lux_on_floor(scene.leds, 3.5 + 3.5 * np.tan(np.radians(30)), 3.5, scene)
+    assert beside / straight == pytest.approx(np.cos(np.radians(30)) ** 4, rel=1e-4)
+
+
+@pytest.mark.parametrize("half_power_deg", [20.0, 45.0, 60.0, 75.0])
+def test_intensity_falls_to_half_at_the_half_power_angle(half_power_deg: float) -> None:
+    # a point at that angle on a surface that faces the LED: E d^2 is the intensity
+    scene = scene_of(led=[lamp(half_power_deg=half_power_deg)])
+    angle = np.radians(half_power_deg)
+    direction = np.array([np.sin(angle), 0.0, -np.cos(angle)])
+    points = np.array([[3.5, 3.5, 3.5 - 1.0], [3.5, 3.5, 3.5] + direction])
+    normals = np.array([[0.0, 0.0, 1.0], -direction])
+    straight, aside = led_illuminance_lux(empty_room(room_mesh(scene)), points, normals, scene.leds)
+    assert aside / straight == pytest.approx(0.5, rel=1e-6)
+
+
+@pytest.mark.parametrize("half_power_deg", [30.0, 60.0])
+def test_all_light_of_the_leds_falls_on_the_room(half_power_deg: float) -> None:
+    """Flux of an LED of order m: 2 pi I_0 / (m + 1). The corners' trapezoidal sum misses little at 0.1 m."""
+    scene = scene_of(led=[lamp(half_power_deg=half_power_deg)])
+    mesh = mesh_of_surfaces(scene.surfaces, 0.1)
+    lux = led_illuminance_lux(empty_room(mesh), mesh.probes_m, mesh.normals, scene.leds)
+    order = scene.leds.orders[0]
+    flux = 2 * np.pi * 10000 * np.pi * 0.01**2 / (order + 1)
+    # second-order rule on 0.1 m texels of a pattern some 3.5 m wide: (0.1 / 3.5)^2 = 8e-4, and the corners' inset
+    assert (lux * mesh.areas_m2()).sum() == pytest.approx(flux, rel=5e-3)
+
+
+@pytest.mark.parametrize("albedo", [0.0, 0.5, 0.8])
+def test_white_furnace(albedo: float) -> None:
+    """Where all surfaces glow alike and reflect alike, luminance is glow / (1 - albedo) everywhere."""
+    scene = scene_of(led=[lamp()])
+    mesh = mesh_of_surfaces(scene.surfaces, 1.0)
+    mesh = dataclasses.replace(mesh, albedo=np.full(len(mesh.vertices_m), albedo))
+    glowing = mitsuba_scene(mesh, np.ones(len(mesh.vertices_m)), (), panes_glow=False)
+    lux, sigma = path_traced_lux(glowing, mesh.probes_m, mesh.normals, 2048, lambda share: None)
+    expected = np.pi / (1 - albedo)
+    n = len(lux)
+    # The standard errors come from 8 batches: z follows Student's t with 7 degrees of freedom, variance 7/5.
+    z = (lux - expected) / np.maximum(sigma, 1e-5 * expected)
+    assert abs(z.mean()) < 5 * np.sqrt(7 / 5 / n)
+    assert lux.mean() == pytest.approx(expected, rel=5e-3)
+
+
+def test_energy_balance(tmp_path: Path) -> None:
+    """What the LEDs send is what the surfaces absorb."""
+    scene = scene_of(led=[lamp(position_m=[3.5, 3.5, 3.0])], bake={"texel_m": 0.2, "paths": 512})
+    light = bake(scene, tmp_path)
+    corners = len(light.mesh.vertices_m)
+    absorbed = ((1 - light.mesh.albedo) * light.led_lux[:corners] * light.mesh.areas_m2()).sum()
+    flux = np.pi * 10000 * np.pi * 0.01**2
+    # the quadrature's half per cent, as for direct light; Monte Carlo adds 512 * 2000 paths: 0.1 %
+    assert absorbed == pytest.approx(flux, rel=0.01)
+
+
+def test_light_reflected_by_the_floor_onto_the_ceiling_agrees_with_a_form_factor(tmp_path: Path) -> None:
+    """One bounce by hand: only the floor reflects; the ceiling gets rho E / pi * cos cos / d^2 of each part of it."""
+    reflectance = {"floor": 0.5, "ceiling": 0.0, "walls": 0.0}
+    scene = scene_of(led=[lamp()], room={"size_m": [7.0, 7.0, 3.5], "reflectance": reflectance}, bake={"paths": 4096})
+    light = bake(scene, tmp_path)
+    step = 7.0 / 200
+    x, y = np.meshgrid(*[(np.arange(200) + 0.5) * step] * 2)
+    intensity = 10000 * np.pi * 0.01**2
+    d2 = (x - 3.5) ** 2 + (y - 3.5) ** 2 + 3.5**2
+    floor = intensity * (3.5 / np.sqrt(d2)) ** 2 / d2
+    ceiling = np.flatnonzero(np.isclose(light.mesh.vertices_m[:, 2], 3.5) & (light.mesh.normals[:, 2] == -1))
+    for corner in ceiling[:: len(ceiling) // 7]:
+        px, py, _ = light.mesh.probes_m[corner]
+        back2 = (x - px) ** 2 + (y - py) ** 2 + 3.5**2
+        expected = (0.5 * floor / np.pi * (3.5**2 / back2) / back2).sum() * step**2
+        # 5 sigma of the bake, and 1 % for the floor's linear interpolation between corners 0.25 m apart
+        assert abs(light.led_lux[corner] - expected) < 5 * light.sigma_lux[corner] + 0.01 * expected
+
+
+def test_furniture_casts_a_shadow_and_reflects(tmp_path: Path) -> None:
+    """A table between LED and floor: dark below, light around as before, and its top is lit."""
+    corners = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]])
+    text = "".join(f"v {x} {y} {z}\n" for x, y, z in corners) + "f 1 2 3\nf 1 3 4\n"
+    (tmp_path / "table.obj").write_text(text)
+    piece = {"file": "table.obj", "position_m": [3.5, 3.5, 0.75], "reflectance": 0.3}
+    scene = scene_of(tmp_path, led=[lamp()], furniture=[piece])
+    mesh = room_mesh(scene)
+    blockers = empty_room(mesh)
+    # the shadow on the floor ends at 0.5 * 3.5 / 2.75 = 0.636 m from the middle
+    points = np.array([[3.5, 3.5, 0.0], [3.5 + 0.62, 3.5, 0.0], [3.5 + 0.66, 3.5, 0.0], [3.5, 3.6, 0.75]])
+    lux = led_illuminance_lux(blockers, points, np.tile([0.0, 0.0, 1.0], (4, 1)), scene.leds)
+    assert lux[:2].tolist() == [0.0, 0.0]
+    alone = scene_of(led=[lamp()])
+    assert lux[2] == pytest.approx(lux_on_floor(alone.leds, 4.16, 3.5, alone))
+    assert lux[3] > 0
+    assert mesh.owners.max() == len(scene.surfaces)
+    top = mesh.owners == len(scene.surfaces)
+    assert set(mesh.albedo[mesh.faces[top]].ravel().round(6)) == {0.3}
+
+
+def test_a_window_lights_the_room_as_its_form_factor_says(tmp_path: Path) -> None:
+    """E at a point opposite the middle of a rectangle, 4 corner form factors; the room is black."""
+    black = {"floor": 0.0, "ceiling": 0.0, "walls": 0.0}
+    window = {"wall": "x=0", "corner_m": [2.5, 1.0], "size_m": [2.0, 1.5], "luminance_cd_m2": 2000.0}
+    scene = scene_of(
+        led=[lamp()], window=[window], room={"size_m": [7.0, 7.0, 3.5], "reflectance": black}, bake={"texel_m": 0.35}
+    )
+    light = bake(scene, tmp_path)
+    point = np.argmin(np.linalg.norm(light.mesh.vertices_m - [7.0, 3.5, 1.75], axis=1))
+    _, y, z = light.mesh.probes_m[point]
+    expected = 0.0
+    for dy in (y - 2.5, 4.5 - y):
+        for dz in (z - 1.0, 2.5 - z):
+            a, b = dy / 7.0, dz / 7.0
+            expected += (
+                a / np.sqrt(1 + a * a) * np.arctan(b / np.sqrt(1 + a * a))
+                + b / np.sqrt(1 + b * b) * np.arctan(a / np.sqrt(1 + b * b))
+            ) / (2 * np.pi)
+    # a thin pane of index 1.52 reflects F = (0.52 / 2.52)^2 at each face, 2 F / (1 + F) = 8.2 %, to 1e-3 up to 20 deg
+    face = (0.52 / 2.52) ** 2
+    through = np.pi * 2000 * expected * (1 - 2 * face / (1 + face))
+    ambient = scene.settings.ambient.illuminance_lux
+    assert abs(light.surround_lux[point] - ambient - through) < 5 * light.sigma_lux[point] + 2e-3 * through
+
+
+def test_the_bake_is_kept_and_taken_again(tmp_path: Path) -> None:
+    scene = scene_of(led=[lamp()], bake={"texel_m": 1.0, "paths": 64})
+    stages: list[str] = []
+    first = bake(scene, tmp_path, lambda stage, share: stages.append(stage))
+    assert "reflected light" in stages
+    stages.clear()
+    again = bake(scene, tmp_path, lambda stage, share: stages.append(stage))
+    assert not stages
+    assert again.led_lux.tobytes() == first.led_lux.tobytes()
+    # cut short by a crash: made again, the same
+    (kept,) = tmp_path.glob("*.npz")
+    kept.write_bytes(kept.read_bytes()[:100])
+    assert bake(scene, tmp_path).led_lux.tobytes() == first.led_lux.tobytes()
+    # another scene has its own
+    bake(scene_of(led=[lamp(luminance_cd_m2=5000.0)], bake={"texel_m": 1.0, "paths": 64}), tmp_path)
+    assert len(list(tmp_path.glob("*.npz"))) == 2
+
+
+def test_the_mesh_leaves_out_what_panels_cover(office: Scene) -> None:
+    mesh = mesh_of_surfaces(office.surfaces, 0.25)
+    area = mesh.areas_m2().sum()
+    # floor, walls, ceiling, and the panels' sides; their undersides fill the holes they cut into the ceiling
+    assert area == pytest.approx(2 * 49 + 4 * 24.5 + 49 * 4 * 0.6 * 0.05)
+
+
+def test_joined_meshes_keep_their_faces() -> None:
+    scene = load_scene(ROOT / "scenes/table1.toml")
+    one = mesh_of_surfaces(scene.surfaces[:1], 1.0)
+    two = join([one, one])
+    assert np.array_equal(two.faces[len(one.faces) :], one.faces + len(one.vertices_m))

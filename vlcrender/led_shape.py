@@ -1,0 +1,172 @@
+"""Shapes of LED faces in their own plane, and the exact area each shares with a polygon."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+BEYOND_HORIZON_M = 1e8
+"""Farther away than any LED: where a ray meets the LEDs' plane nowhere."""
+
+
+@dataclass(frozen=True)
+class Disc:
+    """A round LED face."""
+
+    radius_m: float
+
+    @property
+    def reach_m(self) -> float:
+        """From its centre to the farthest point."""
+        return self.radius_m
+
+    def rim(self, points: int) -> Array:
+        """Points of the rim (points, 2), relative to the centre, evenly spaced."""
+        angles = np.linspace(0.0, 2 * np.pi, points, endpoint=False)
+        return self.radius_m * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+
+    def image_area_px(self, outline: Array) -> float:
+        """Area of the image, of which `outline` (points, 2) is the rim: the polygon and the arcs it cuts off."""
+        step = 2 * np.pi / len(outline)
+        return _polygon_area(outline) * step / float(np.sin(step))
+
+    def whole_and_mixed(self, x: Array, y: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Which cells of a grid of corners (rows + 1, columns + 1) are inside whole, which others may be in part."""
+        distance = np.hypot(x, y)
+        farthest = _corner_extreme(distance, np.maximum)
+        whole = farthest <= self.radius_m
+        span = np.hypot(
+            _corner_extreme(x, np.maximum) - _corner_extreme(x, np.minimum),
+            _corner_extreme(y, np.maximum) - _corner_extreme(y, np.minimum),
+        )
+        near = _corner_extreme(distance, np.minimum) < self.radius_m + span
+        return whole, near & ~whole & (farthest < BEYOND_HORIZON_M)
+
+    def shared_area(self, quads: Array) -> Array:
+        """Area common to the face and each polygon (n, corners, 2) in its plane, (n,)."""
+        return circle_polygon_area(quads, self.radius_m)
+
+
+@dataclass(frozen=True)
+class Rectangle:
+    """A rectangular LED face, `size_m` along x and y of the room, turned by `yaw_deg` from x towards y."""
+
+    size_m: tuple[float, float]
+    yaw_deg: float = 0.0
+
+    @property
+    def reach_m(self) -> float:
+        """From its centre to the farthest point."""
+        return float(np.hypot(*self.size_m)) / 2
+
+    def rim(self, points: int) -> Array:
+        """Points of the rim (points, 2), relative to the centre, a quarter of them on each side, corners included."""
+        along = np.linspace(-1, 1, points // 4, endpoint=False)
+        side = np.stack([along, -np.ones_like(along)], axis=1)
+        quarter_turn = np.array([[0, 1], [-1, 0]])
+        sides = [side]
+        for _ in range(3):
+            sides.append(sides[-1] @ quarter_turn)
+        return self._turned(np.concatenate(sides) * np.array(self.size_m) / 2, 1)
+
+    def image_area_px(self, outline: Array) -> float:
+        """Area of the image, of which `outline` (points, 2) is the rim."""
+        return _polygon_area(outline)
+
+    def whole_and_mixed(self, x: Array, y: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Which cells of a grid of corners (rows + 1, columns + 1) are inside whole, which others may be in part."""
+        own = self._turned(np.stack([x, y], axis=-1), -1)
+        whole = np.ones((x.shape[0] - 1, x.shape[1] - 1), dtype=bool)
+        mixed = whole.copy()
+        for axis, half in enumerate(self.size_m):
+            low, high = (_corner_extreme(own[..., axis], of) for of in (np.minimum, np.maximum))
+            whole &= (low >= -half / 2) & (high <= half / 2)
+            mixed &= (high > -half / 2) & (low < half / 2) & (high - low < BEYOND_HORIZON_M / 2)
+        return whole, mixed & ~whole
+
+    def shared_area(self, quads: Array) -> Array:
+        """Area common to the face and each polygon (n, corners, 2) in its plane, (n,)."""
+        width, depth = self.size_m
+        return rectangle_polygon_area(self._turned(quads, -1), width / 2, depth / 2)
+
+    def _turned(self, points: Array, sense: int) -> Array:
+        if self.yaw_deg == 0:
+            return points
+        c, s = np.cos(np.radians(self.yaw_deg)), sense * np.sin(np.radians(self.yaw_deg))
+        x, y = points[..., 0], points[..., 1]
+        return np.stack([c * x - s * y, s * x + c * y], axis=-1)
+
+
+def circle_polygon_area(polygons: Array, radius: float) -> Array:
+    """Area common to the disc of this radius about the origin and each polygon.
+
+    polygons: (n, corners, 2), any orientation. Returns (n,), >= 0. Sum over the edges of the signed area that the disc
+    shares with the triangle of the origin and that edge: straight where the edge is inside, a sector where outside.
+    """
+    p = polygons
+    q = np.roll(polygons, -1, axis=1)
+    edge = q - p
+    length2 = np.maximum((edge**2).sum(-1), np.finfo(float).tiny)
+    # The edge meets the circle at p + t * edge with t = t_mid -+ half.
+    t_mid = -(p * edge).sum(-1) / length2
+    closest2 = np.maximum((p**2).sum(-1) - t_mid**2 * length2, 0.0)
+    half = np.sqrt(np.maximum(radius**2 - closest2, 0.0) / length2)
+    meets = radius**2 > closest2
+    enter = np.where(meets, np.clip(t_mid - half, 0.0, 1.0), 0.0)
+    leave = np.where(meets, np.clip(t_mid + half, 0.0, 1.0), 0.0)
+    a = p + enter[..., None] * edge
+    b = p + leave[..., None] * edge
+    inside = _cross(a, b) / 2
+    # b is q where q is inside, but for rounding, which near the centre turns a direction as far as it likes.
+    at_center = (q**2).sum(-1) < (1e-3 * radius) ** 2
+    outside = radius**2 / 2 * (_angle(p, a) + np.where(at_center, 0.0, _angle(b, q)))
+    area: Array = np.abs((inside + outside).sum(axis=1))
+    return area
+
+
+def rectangle_polygon_area(polygons: Array, half_x: float, half_y: float) -> Array:
+    """Area common to the rectangle |x| <= half_x, |y| <= half_y and each polygon.
+
+    polygons: (n, corners, 2), any orientation. Returns (n,), >= 0. Every point is moved to the rectangle's nearest one:
+    what is inside stays, what is outside collapses onto the rectangle's sides and encloses nothing. The polygon that
+    this makes of each has new corners where an edge crosses a side's line. Continuous also where edges coincide.
+    """
+    limits = np.array([half_x, half_y])
+    p = polygons
+    edge = np.roll(polygons, -1, axis=1) - p
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+        crossings = np.concatenate([(-limits - p) / edge, (limits - p) / edge], axis=-1)
+    # an edge along a side crosses it nowhere
+    crossings = np.clip(np.nan_to_num(crossings, nan=0.0, posinf=0.0, neginf=0.0), 0.0, 1.0)
+    t = np.concatenate([np.zeros((*p.shape[:-1], 1)), np.sort(crossings, axis=-1)], axis=-1)
+    moved = np.clip(p[:, :, None] + t[..., None] * edge[:, :, None], -limits, limits).reshape(len(p), 5 * p.shape[1], 2)
+    area: Array = np.abs(_cross(moved, np.roll(moved, -1, axis=1)).sum(axis=1)) / 2
+    return area
+
+
+def _cross(a: Array, b: Array) -> Array:
+    product: Array = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    return product
+
+
+def _angle(a: Array, b: Array) -> Array:
+    angle: Array = np.arctan2(_cross(a, b), (a * b).sum(-1))
+    return angle
+
+
+def quadrilateral_area(quads: Array) -> Array:
+    """Area of convex quadrilaterals (n, 4, 2), (n,)."""
+    area: Array = np.abs(_cross(quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1])) / 2
+    return area
+
+
+def _polygon_area(corners: Array) -> float:
+    u, v = corners.T
+    return abs(float(np.dot(u, np.roll(v, -1)) - np.dot(v, np.roll(u, -1)))) / 2
+
+
+def _corner_extreme(values: Array, of: np.ufunc) -> Array:
+    extreme: Array = of(of(values[:-1, :-1], values[:-1, 1:]), of(values[1:, :-1], values[1:, 1:]))
+    return extreme
