@@ -22,6 +22,8 @@ lint: $(READY)
 bench: $(READY)
 	$(BIN)/python benchmarks/full_frame.py
 	$(BIN)/python benchmarks/windows.py
+	$(BIN)/python benchmarks/errors.py
+	$(BIN)/python benchmarks/memory.py
 
 $(READY): requirements.txt pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \

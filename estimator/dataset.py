@@ -4,13 +4,13 @@ import hashlib
 import io
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import numpy as np
 import OpenEXR
 import pyarrow as pa
 from numpy.typing import NDArray
-from pydantic import Field, Strict, ValidationError, field_validator
+from pydantic import Field, Strict, ValidationError, field_validator, model_validator
 
 from estimator.errors import InputError
 from estimator.tables import Number, Positive, Row, Triple, first_line, first_problem, read_rows
@@ -36,15 +36,28 @@ FRAME_COLUMNS = {
 }
 
 
+class Distortion(Row):
+    """Brown-Conrady coefficients, as OpenCV has them, for a position on the sensor in units of the image distance."""
+
+    k1: Number
+    k2: Number
+    k3: Number
+    p1: Number
+    p2: Number
+
+
 class Camera(Row):
-    """Pinhole intrinsics; `K` maps camera axes to continuous pixels with pixel centres at +0.5."""
+    """Intrinsics; `K` maps what the lens makes of a direction to continuous pixels with pixel centres at +0.5."""
 
     width_px: int = Field(ge=1, le=65536)
     height_px: int = Field(ge=1, le=65536)
     K: tuple[Triple, Triple, Triple]
     pixel_pitch_um: Positive
     focal_length_mm: Positive
+    image_distance_mm: Positive
     f_number: Positive
+    projection: Literal["perspective", "equidistant"]
+    distortion: Distortion | None
     R_cam_rig: tuple[Triple, Triple, Triple]
     offset_m: Triple
 
@@ -54,6 +67,12 @@ class Camera(Row):
         if k[0][0] <= 0 or k[1][1] <= 0 or k[1][0] != 0 or k[2] != (0.0, 0.0, 1.0):
             raise ValueError("K has to be [[fx, skew, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0")
         return k
+
+    @model_validator(mode="after")
+    def _fish_eyes_have_no_distortion(self) -> Self:
+        if self.projection == "equidistant" and self.distortion is not None:
+            raise ValueError('distortion has to be null with projection "equidistant"')
+        return self
 
     def matrix(self) -> NDArray[np.float64]:
         """`K` as a (3, 3) array, pixels."""

@@ -14,6 +14,7 @@ from estimator.identify import Sighting, identify
 from estimator.position import position_from_pixels, position_from_ranges
 from estimator.ranging import PairLaw, law_of_sines, led_ranges, printed_eq3
 from estimator.rectify import level, rotation, tilt_from_gravity
+from estimator.undistort import pinhole_pixels
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -57,7 +58,8 @@ def huynh2016_as_printed(frame: DeviceFrame) -> Estimate:
 def pnp(frame: DeviceFrame) -> Estimate:
     """Perspective-n-point on centroids of the raw image; gravity is not used."""
     sightings = _sightings(frame, lambda image: image, reach_px=0)
-    return Estimate(position_from_pixels(_positions(sightings), _centroids(sightings), frame.camera.matrix()))
+    pixels = pinhole_pixels(_centroids(sightings), frame.camera)
+    return Estimate(position_from_pixels(_positions(sightings), pixels, frame.camera.matrix()))
 
 
 def _sightings(frame: DeviceFrame, denoise: Callable[[Image], Image], reach_px: int) -> tuple[Sighting, ...]:
@@ -71,10 +73,10 @@ def _sightings(frame: DeviceFrame, denoise: Callable[[Image], Image], reach_px: 
 
 
 def _two_step(frame: DeviceFrame, sightings: Sequence[Sighting], pixels: Floats, pair_law: PairLaw) -> Estimate:
-    """The paper's way from pixels (n, 2): level them by gravity, ranges from pairs, position from ranges."""
+    """The paper's way from pixels (n, 2), once the lens is taken out: level them by gravity, ranges, position."""
     K = frame.camera.matrix()
     leds_m = _positions(sightings)
-    level_px = level(pixels, K, rotation(*tilt_from_gravity(frame.accelerometer_m_s2)))
+    level_px = level(pinhole_pixels(pixels, frame.camera), K, rotation(*tilt_from_gravity(frame.accelerometer_m_s2)))
     distances_m = led_ranges(level_px, K, leds_m, pair_law)
     ranges_m = {sighting.led.id: float(d) for sighting, d in zip(sightings, distances_m, strict=True)}
     try:

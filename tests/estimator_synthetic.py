@@ -227,7 +227,10 @@ def description(view: View, frame_count: int, leds_m: Array, radius_m: float) ->
                 "K": view.K.tolist(),
                 "pixel_pitch_um": pitch_um,
                 "focal_length_mm": 18.0,
+                "image_distance_mm": 18.0,
                 "f_number": 2.0,
+                "projection": "perspective",
+                "distortion": None,
                 "R_cam_rig": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
                 "offset_m": [0.0, 0.0, 0.0],
             }

@@ -113,6 +113,7 @@ def test_a_missing_key_is_named(folder: Path, key: str) -> None:
     assert f"dataset.json: {key}" in refused(folder)
 
 
+LENS = {"k1": -0.05, "k2": 0.0, "k3": 0.0, "p1": 0.0, "p2": 0.0}
 WRONG_VALUES: list[tuple[str, Callable[[dict[str, Any]], object]]] = [
     ("version", lambda c: c.update(version=1)),
     ("format", lambda c: c.update(format="other")),
@@ -124,6 +125,16 @@ WRONG_VALUES: list[tuple[str, Callable[[dict[str, Any]], object]]] = [
     ("cameras.main.K", lambda c: c["cameras"]["main"].update(K=[[1, 0, 0], [0, 0, 0], [0, 0, 1]])),
     ("cameras.main.K", lambda c: c["cameras"]["main"]["K"][1].__setitem__(0, 1)),
     ("cameras.main.K.0.2", lambda c: c["cameras"]["main"]["K"][0].__setitem__(2, float("nan"))),
+    ("cameras.main.projection", lambda c: c["cameras"]["main"].update(projection="stereographic")),
+    ("cameras.main.projection", lambda c: c["cameras"]["main"].pop("projection")),
+    ("cameras.main.distortion", lambda c: c["cameras"]["main"].pop("distortion")),
+    ("cameras.main.distortion.k3", lambda c: c["cameras"]["main"].update(distortion={**LENS, "k3": None})),
+    (
+        "cameras.main.distortion.p2",
+        lambda c: c["cameras"]["main"].update(distortion={"k1": 0, "k2": 0, "k3": 0, "p1": 0}),
+    ),
+    ("distortion", lambda c: c["cameras"]["main"].update(projection="equidistant", distortion=LENS)),
+    ("cameras.main.image_distance_mm", lambda c: c["cameras"]["main"].update(image_distance_mm=0)),
     ("sensor.noise", lambda c: c["sensor"].update(noise="loud")),
     ("sensor.gain_e_per_dn", lambda c: c["sensor"].update(gain_e_per_dn=0)),
     ("sensor.bits", lambda c: c["sensor"].update(bits=33)),

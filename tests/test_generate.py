@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -236,3 +237,57 @@ def test_verify_finds_a_truth_that_is_another_pose(made: Path, tmp_path: Path) -
     rows[1]["position_m"][0] += 1e-4
     pq.write_table(table.from_pylist(rows, schema=table.schema), directory / "truth.parquet")
     assert any("frame 1" in line and "not where the pose puts it" in line for line in problems_of(directory))
+
+
+LENSES = {
+    "distorted": ["camera.distortion.k1=-0.05", "camera.focus_distance_m=2.0", "camera.skew_px=3.0"],
+    # 300 px a radian: the sensor reaches 48 deg off the axis
+    "equidistant": ["camera.projection=equidistant", "camera.pixel_pitch_um=60.0", "exposure_s=6e-8"],
+}
+
+
+@pytest.fixture(scope="module", params=LENSES)
+def seen_by_a_lens(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("lens") / "set"
+    generate(load_plan(RECIPE, [*SMALL, "poses.count=1", *LENSES[request.param]]), directory)
+    return directory
+
+
+def changed(made: Path, directory: Path, **entry: object) -> Path:
+    """A copy with another entry for its camera."""
+    shutil.copytree(made, directory)
+    tree = json.loads((directory / "dataset.json").read_text())
+    tree["cameras"]["main"].update(entry)
+    (directory / "dataset.json").write_text(json.dumps(tree))
+    return directory
+
+
+def test_verify_projects_through_the_lens(seen_by_a_lens: Path, tmp_path: Path) -> None:
+    assert problems_of(seen_by_a_lens) == []
+    another = changed(seen_by_a_lens, tmp_path / "pinhole", projection="perspective", distortion=None)
+    assert any("not where the pose puts it" in line for line in problems_of(another))
+    directory = changed(seen_by_a_lens, tmp_path / "moved")
+    table = pq.read_table(directory / "truth.parquet")
+    for move in ([1e-4, 0.0, 0.0], [0.0, 0.0, 100.0]):  # the second puts the LEDs behind the camera
+        rows = table.to_pylist()
+        rows[0]["position_m"] = [a + b for a, b in zip(rows[0]["position_m"], move, strict=True)]
+        pq.write_table(table.from_pylist(rows, schema=table.schema), directory / "truth.parquet")
+        assert any("not where the pose puts it" in line for line in problems_of(directory))
+
+
+@pytest.mark.parametrize(
+    ("entry", "words"),
+    [
+        ({"projection": "stereographic"}, "projection"),
+        ({"distortion": {"k1": -100}}, "folds the image"),
+        ({"image_distance_mm": 17.0}, "image_distance_mm / pitch"),
+        ({"width_px": 3}, "width_px = 3"),
+    ],
+)
+def test_a_camera_that_cannot_be_is_refused_in_one_line(
+    made: Path, tmp_path: Path, entry: dict[str, object], words: str
+) -> None:
+    with pytest.raises(InputError, match=words) as refusal:
+        problems_of(changed(made, tmp_path / "set", **entry))
+    assert "\n" not in str(refusal.value)
+    assert "dataset.json" in str(refusal.value)

@@ -144,7 +144,7 @@ def daylight() -> Renderer:
 def test_agrees_with_mitsubas_own_integrator(name: str, office_renderer: Renderer, daylight: Renderer) -> None:
     camera, pose = VIEWS[name]
     renderer = daylight if name == "window pane" else office_renderer
-    samples = 128
+    samples = 64
     reference, variance = reference_cd_m2(renderer.scene, camera, pose, samples)
     rate = electron_rate_per_cd_m2(camera, "LED-B3", Silicon())
     u, v = np.meshgrid(np.arange(camera.width_px) + 0.5, np.arange(camera.height_px) + 0.5)

@@ -73,14 +73,19 @@ def generate(
         TimeRemainingColumn(),
     )
     bar = Progress(*columns, console=Console(stderr=True))
+    light = bar.add_task("light", total=1.0, visible=False)
     task = bar.add_task(plan.recipe.name, total=plan.recipe.frame_count)
 
     def progress(done: int, total: int) -> None:
         bar.start()  # not before the first report: a refusal is one line
         bar.update(task, completed=done, total=total)
 
+    def baking(stage: str, share: float) -> None:
+        bar.start()
+        bar.update(light, description=stage, completed=share, visible=share < 1)
+
     try:
-        made = make(plan, out, workers, scheduler, progress)
+        made = make(plan, out, workers, scheduler, progress, baking)
     finally:
         bar.stop()
     print(f"{out}: {plan.recipe.frame_count} frames{'' if made else ' (was already complete and intact)'}")
@@ -105,7 +110,9 @@ def verify(directory: Path, /) -> None:
 
 
 @app.command
-def show(scene: Path, /, *, out: Path | None = None) -> None:
+def show(
+    scene: Path, /, *, out: Path | None = None, reference: Annotated[bool, Parameter(negative=())] = False
+) -> None:
     """Draw a room's plan and a camera's view of it; print what share of poses sees four LEDs or more.
 
     Parameters
@@ -114,6 +121,8 @@ def show(scene: Path, /, *, out: Path | None = None) -> None:
         Scene file (TOML).
     out
         PNG to write; the scene's name with .png in the current folder where not given.
+    reference
+        Have Mitsuba's own path integrator render the view: slow, coarse, noisy, and independent of the fast way.
     """
     loaded = load_scene(scene)
     path = out or Path(f"{scene.stem}.png")
@@ -139,7 +148,7 @@ def show(scene: Path, /, *, out: Path | None = None) -> None:
             table.add_row(f"{height:g}", coverage.attitude, str(coverage.poses), str(coverage.seen), share)
     from vlcrender.show import draw  # starts Mitsuba
 
-    draw(loaded, camera, path)
+    draw(loaded, camera, path, reference)
     Console(width=max(Console().width, 100)).print(table)
     print(f"{path}: written")
 

@@ -14,7 +14,8 @@ import pyarrow.parquet as pq
 from matplotlib.image import imsave
 from numpy.typing import NDArray
 
-from vlcrender.camera import Camera
+from vlcrender.camera import Camera, image_of_points, transform
+from vlcrender.distortion import Distortion
 from vlcrender.errors import InputError
 from vlcrender.rig import Mounted
 from vlcrender.scene import Leds
@@ -64,7 +65,10 @@ class CameraEntry(Settings):
     K: Matrix
     pixel_pitch_um: float
     focal_length_mm: float
+    image_distance_mm: float
     f_number: float
+    projection: Literal["perspective", "equidistant"]
+    distortion: Distortion | None
     R_cam_rig: Matrix
     offset_m: tuple[float, float, float]
 
@@ -110,9 +114,24 @@ class DatasetFile(Settings):
 
 def camera_entry(mounted: Mounted) -> CameraEntry:
     """A camera as dataset.json tells of it."""
-    own = {"K": mounted.camera.matrix, "R_cam_rig": mounted.rotation, "offset_m": mounted.offset_m}
+    arrays = {"K": mounted.camera.matrix, "R_cam_rig": mounted.rotation, "offset_m": mounted.offset_m}
+    own = {"image_distance_mm": mounted.camera.image_distance_mm, **{key: a.tolist() for key, a in arrays.items()}}
     shared = mounted.camera.model_dump(include=set(CameraEntry.model_fields) - set(own))
-    return CameraEntry.model_validate({**shared, **{key: array.tolist() for key, array in own.items()}})
+    return CameraEntry.model_validate({**shared, **own})
+
+
+def _camera_of(entry: CameraEntry, source: str) -> Camera:
+    """A camera that images points as the entry says. `source` names it in the InputError for one that cannot be."""
+    (_, skew, u), (_, _, v), _ = entry.K
+    shared = entry.model_dump(include={"width_px", "height_px", "pixel_pitch_um", "projection", "distortion"})
+    # Focused at infinity, a lens has its focal length for image distance, which is all that a projection takes.
+    lens = {"focal_length_mm": entry.image_distance_mm, "principal_point_px": (u, v), "skew_px": skew}
+    camera = check({**shared, **lens}, Camera, source)
+    if not np.allclose(camera.matrix, entry.K, rtol=1e-12, atol=0):
+        raise InputError(
+            f"{source}: K is not [[f, skew, cx], [0, f, cy], [0, 0, 1]] with f = image_distance_mm / pitch"
+        )
+    return camera
 
 
 def led_map(leds: Leds) -> tuple[LedMapEntry, ...]:
@@ -234,16 +253,21 @@ def _refuse(message: str) -> Any:
 def problems_of(directory: Path) -> list[str]:
     """All that is missing or damaged in a dataset, a line each; empty where all is there and intact.
 
-    Raises InputError where there is no readable dataset.json.
+    Raises InputError where there is no readable dataset.json, or a camera in it cannot be.
     """
     dataset = read_dataset_file(directory)
+    cameras = {
+        name: _camera_of(entry, f"{directory / 'dataset.json'}: camera {name}")
+        for name, entry in dataset.cameras.items()
+    }
     found: list[str] = []
     frames = _read_rows(directory / "frames.parquet", FRAMES_SCHEMA, dataset.frame_count, found)
     truth = _read_rows(directory / "truth.parquet", TRUTH_SCHEMA, dataset.frame_count, found)
     for row in frames:
         found += _problems_of_frame(directory, row, dataset)
     for row in truth:
-        found += _problems_of_truth(row, frames[row["frame"]] if frames else None, dataset)
+        camera = cameras.get(frames[row["frame"]]["camera"]) if frames else None
+        found += _problems_of_truth(row, camera, dataset)
     return found
 
 
@@ -304,19 +328,19 @@ def _window(box: tuple[NDArray[np.int32], NDArray[np.int32]]) -> Window:
     return Window(row, column, last_row - row + 1, last_column - column + 1)
 
 
-def _problems_of_truth(row: Mapping[str, Any], frame: Mapping[str, Any] | None, dataset: DatasetFile) -> list[str]:
+def _problems_of_truth(row: Mapping[str, Any], camera: Camera | None, dataset: DatasetFile) -> list[str]:
     where = f"truth.parquet: frame {row['frame']}"
     rotation = np.array(row["R_cam_world"]).reshape(3, 3)
     if not (np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-9) and np.linalg.det(rotation) > 0):
         return [f"{where}: R_cam_world is not a rotation"]
-    if frame is None or frame["camera"] not in dataset.cameras:
+    if camera is None:
         return []
-    matrix = np.array(dataset.cameras[frame["camera"]].K)
     positions = {led.id: np.array(led.position_m) for led in dataset.led_map}
     for led in row["leds"]:
         if led["led"] not in positions:
             return [f"{where}: LED {led['led']} is not in the LED map"]
-        u, v, w = matrix @ rotation @ (positions[led["led"]] - np.array(row["position_m"]))
-        if np.hypot(u / w - led["u_px"], v / w - led["v_px"]) > 1e-6:
+        u, v = image_of_points(camera, transform(rotation, positions[led["led"]] - np.array(row["position_m"])))
+        # Not `>`: what the lens does not image has no pixel, and NaN is not above anything.
+        if not np.hypot(u - led["u_px"], v - led["v_px"]) <= 1e-6:
             return [f"{where}: LED {led['led']} is not where the pose puts it"]
     return []

@@ -27,8 +27,9 @@ from vlcrender.dataset import (
 )
 from vlcrender.errors import InputError
 from vlcrender.frame import EXPECTED, FRAMES, PREVIEWS, Job, Record, make_frame, poses_of_frame
+from vlcrender.irradiance import bake, room_mesh
 from vlcrender.recipe import Plan
-from vlcrender.render import check_inside
+from vlcrender.render import check_inside, share_cores
 
 
 def generate(
@@ -37,10 +38,12 @@ def generate(
     workers: int = 1,
     scheduler: str | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
+    baking: Callable[[str, float], None] = lambda stage, share: None,
 ) -> bool:
     """Make the dataset of a plan in `directory`. Returns False where it was already there, complete and intact.
 
-    Goes on from an interrupted run of the same plan. Raises InputError where the folder holds anything else.
+    Goes on from an interrupted run of the same plan. `progress` is told (frames done, frames in all), `baking` (stage
+    of the room's light, share done). Raises InputError where the folder holds anything else.
     """
     provenance = _provenance(plan)
     if (directory / "dataset.json").exists():
@@ -53,6 +56,7 @@ def generate(
         _, during = poses_of_frame(plan.recipe, plan.scene, frame)
         check_inside(plan.scene, during[0])
         check_inside(plan.scene, during[-1])
+    room_mesh(plan.scene)  # furniture that cannot be used is found before anything is written
     _prepare(directory, provenance, plan.recipe.expected)
     job = Job(
         plan.recipe.model_dump_json(), plan.scene.settings.model_dump_json(), str(plan.scene.folder), str(directory)
@@ -61,6 +65,7 @@ def generate(
     missing = [frame for frame in range(plan.recipe.frame_count) if frame not in done]
     if done:
         progress(len(done), plan.recipe.frame_count)
+    bake(plan.scene, progress=baking)  # into the cache, from which every worker takes it
     with (directory / "journal.jsonl").open("a", encoding="utf-8") as journal:
         for record in _records(job, missing, workers, scheduler):
             done[record["frame"]] = record
@@ -84,7 +89,7 @@ def _records(job: Job, frames: list[int], workers: int, scheduler: str | None) -
 def _in_processes(job: Job, frames: list[int], workers: int) -> Iterator[Record]:
     # spawn: a forked child of a process that ran kernels is left with one thread
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(workers, len(frames)), context, initializer=_leave_interrupts_to_parent) as pool:
+    with ProcessPoolExecutor(min(workers, len(frames)), context, _start_worker, (workers,)) as pool:
         pending: set[Future[Record]] = set()
         queue = iter(frames)
         try:
@@ -101,8 +106,9 @@ def _in_processes(job: Job, frames: list[int], workers: int) -> Iterator[Record]
                 future.cancel()
 
 
-def _leave_interrupts_to_parent() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+def _start_worker(workers: int) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # interrupts are the parent's
+    share_cores(workers)
 
 
 def _on_cluster(job: Job, frames: Iterable[int], address: str) -> Iterator[Record]:

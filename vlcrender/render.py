@@ -7,6 +7,7 @@ seen by way of a window pane is a patch too: the image that the camera's mirror 
 spreads each of them by what it does at their depth.
 """
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -414,6 +415,11 @@ def _overscan_px(camera: Camera) -> int:
 
 def _inside(window: Window, camera: Camera, reach: int) -> bool:
     return Window.of_sensor(camera).grown(reach - 1).holds(window)
+
+
+def share_cores(workers: int) -> None:
+    """Keep Dr.Jit in this process to its share of the cores: its idle threads wait busily, and take from others."""
+    dr.set_thread_count(max(1, (os.cpu_count() or 1) // workers))
 
 
 def check_inside(scene: Scene, pose: Pose) -> None:

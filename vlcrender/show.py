@@ -1,20 +1,26 @@
 """A picture of a room: its plan and what a camera in it sees, with the share of poses that see enough LEDs."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection, PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from numpy.typing import NDArray
 
-from vlcrender.camera import Camera, Pose, rays_world
+from vlcrender.camera import Camera, Pose, project, rays_world
+from vlcrender.lens import relative_illumination
+from vlcrender.photometry import Silicon, electron_rate_per_cd_m2
+from vlcrender.reference import reference_cd_m2
 from vlcrender.render import Renderer
 from vlcrender.scene import Scene
-from vlcrender.view import View
 from vlcrender.visibility import leds_in_view
 
 EXPOSURE_S = 160e-6
+REFERENCE_SCALE = 8
+REFERENCE_SAMPLES = 128
 WHITE_E = 4000.0
 
 
@@ -36,15 +42,22 @@ def show_pose(scene: Scene, camera: Camera) -> Pose:
     return best
 
 
-def draw(scene: Scene, camera: Camera, path: Path) -> Pose:
-    """Write a PNG with the plan and the view from `show_pose`. Returns that pose."""
+def draw(scene: Scene, camera: Camera, path: Path, reference: bool = False) -> Pose:
+    """Write a PNG with the plan and the view from `show_pose`. Returns that pose.
+
+    With `reference` the view is path-traced by Mitsuba, slowly and in larger pixels.
+    """
     pose = show_pose(scene, camera)
-    view = Renderer(scene).view(camera, pose)
+    electrons: NDArray[Any]
+    if reference:
+        electrons = _reference_electrons(scene, camera, pose)
+    else:
+        electrons = Renderer(scene).view(camera, pose).expected_electrons(EXPOSURE_S)
     figure = Figure(figsize=(14, 6.2), layout="constrained")
     plan, image = figure.subplots(1, 2, width_ratios=[1, 1.25])
     discs = _draw_plan(plan, scene, camera, pose)
     figure.colorbar(discs, ax=plan, label="LED luminance, cd/m$^2$", shrink=0.8)
-    _draw_view(image, scene, camera, pose, view)
+    _draw_view(image, scene, camera, pose, electrons)
     figure.savefig(path, dpi=110)
     return pose
 
@@ -94,9 +107,24 @@ def _draw_plan(axes: Axes, scene: Scene, camera: Camera, pose: Pose) -> EllipseC
     return discs
 
 
-def _draw_view(axes: Axes, scene: Scene, camera: Camera, pose: Pose, view: View) -> None:
-    electrons = view.expected_electrons(EXPOSURE_S)
-    block = max(1, camera.width_px // 1000)
+def _reference_electrons(scene: Scene, camera: Camera, pose: Pose) -> NDArray[np.float64]:
+    coarse = camera.model_copy(
+        update={
+            "width_px": camera.width_px // REFERENCE_SCALE,
+            "height_px": camera.height_px // REFERENCE_SCALE,
+            "pixel_pitch_um": camera.pixel_pitch_um * REFERENCE_SCALE,
+        }
+    )
+    cd_m2, _ = reference_cd_m2(scene, coarse, pose, REFERENCE_SAMPLES)
+    u, v = np.meshgrid(np.arange(coarse.width_px) + 0.5, np.arange(coarse.height_px) + 0.5)
+    # electrons of a pixel of the real size; both spectra as the LEDs'
+    rate = electron_rate_per_cd_m2(camera, scene.settings.led_spectrum, Silicon())
+    electrons: NDArray[np.float64] = EXPOSURE_S * rate * cd_m2 * relative_illumination(coarse, u, v)
+    return electrons
+
+
+def _draw_view(axes: Axes, scene: Scene, camera: Camera, pose: Pose, electrons: NDArray[Any]) -> None:
+    block = max(1, electrons.shape[1] // 1000)
     rows, columns = (n // block * block for n in electrons.shape)
     small = electrons[:rows, :columns].reshape(rows // block, block, columns // block, block).mean(axis=(1, 3))
     axes.imshow(
@@ -108,10 +136,10 @@ def _draw_view(axes: Axes, scene: Scene, camera: Camera, pose: Pose, view: View)
     )
     for index in leds_in_view(camera, pose, scene):
         led_id = int(scene.leds.ids[index])
-        patch = next(p for p in view.patches if p.led_id == led_id)
+        center, _ = project(camera, pose, scene.leds.centers_m[index])
         axes.annotate(
             str(led_id),
-            patch.center_px,
+            (float(center[0]), float(center[1])),
             xytext=(0, 9),
             textcoords="offset points",
             color="orange",

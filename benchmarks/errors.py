@@ -1,0 +1,80 @@
+"""What the fast way errs by, as shares of the shot noise's variance, at a peak of 4 000 electrons."""
+
+from pathlib import Path
+
+import numpy as np
+
+from vlcrender import background as background_module
+from vlcrender.backend import dr
+from vlcrender.camera import Camera, Pose
+from vlcrender.irradiance import bake
+from vlcrender.led_image import image_of_disc, leds_that_may_be_seen
+from vlcrender.render import Renderer
+from vlcrender.scene import load_scene
+
+PEAK_E = 4000.0
+POSES = [
+    Pose((3.15, 3.1, 0.6), tilt_x_deg=6.0, tilt_y_deg=-8.0, yaw_deg=20.0),
+    Pose((5.2, 1.0, 1.6), 57.0, 54.0, 139.0),
+    Pose((1.5, 2.0, 1.2), 40.0, 35.0, 110.0),
+]
+FINER = 8
+
+
+def main() -> None:
+    """Measure and print."""
+    scene = load_scene(Path(__file__).parent.parent / "scenes/office.toml")
+    light = bake(scene)
+    renderer, camera = Renderer(scene, light), Camera()
+    per_cd = PEAK_E / scene.leds.luminances_cd_m2.max()
+
+    # The bake: an error of the illuminance is one of the image, alike over a texel.
+    cd_m2 = light.led_cd_m2() + light.surround_cd_m2()
+    error_e = per_cd * light.albedo * light.sigma_lux / np.pi
+    print(f"bake, share of the shot noise's variance, worst corner        {(error_e**2 / (per_cd * cd_m2)).max():8.4%}")
+
+    # Where surfaces meet: the 8 x 8 grid against 32 x 32.
+    worst = 0.0
+    for pose in POSES:
+        coarse = per_cd * renderer.background_cd_m2(camera, pose).astype(float)
+        background_module.EDGE_GRID, kept = 32, background_module.EDGE_GRID
+        fine = per_cd * renderer.background_cd_m2(camera, pose).astype(float)
+        background_module.EDGE_GRID = kept
+        worst = max(worst, float(((coarse - fine) ** 2 / fine).max()))
+    print(f"edges between surfaces, worst pixel of {len(POSES)} views                {worst:8.4%}")
+
+    # LED edges: coverage against the mean of 8 x 8 exact coverages of pixels an eighth as wide.
+    fine_camera = Camera(
+        width_px=camera.width_px, height_px=camera.height_px, pixel_pitch_um=camera.pixel_pitch_um / FINER
+    )
+    worst, pixels = 0.0, 0
+    for pose in POSES:
+        for i in leds_that_may_be_seen(camera, pose, scene.leds.centers_m, scene.leds.radii_m):
+            image = image_of_disc(camera, pose, scene.leds.centers_m[i], float(scene.leds.radii_m[i]))
+            if image is None or image.visible_fraction < 1:
+                continue
+            rows, columns = image.coverage.shape
+            u, v = camera.center_px
+            shifted = fine_camera.model_copy(
+                update={
+                    "principal_point_px": (FINER * (u - image.column), FINER * (v - image.row)),
+                    "width_px": FINER * columns,
+                    "height_px": FINER * rows,
+                }
+            )
+            fine_image = image_of_disc(shifted, pose, scene.leds.centers_m[i], float(scene.leds.radii_m[i]))
+            assert fine_image is not None
+            whole = np.zeros((FINER * rows, FINER * columns))
+            r, c = fine_image.row, fine_image.column
+            whole[r : r + fine_image.coverage.shape[0], c : c + fine_image.coverage.shape[1]] = fine_image.coverage
+            mean = whole.reshape(rows, FINER, columns, FINER).mean(axis=(1, 3))
+            edge = (mean > 0) & (mean < 1)
+            light_e = PEAK_E * mean[edge] + per_cd * cd_m2.min()
+            worst = max(worst, float(((PEAK_E * (image.coverage - mean)[edge]) ** 2 / light_e).max()))
+            pixels += int(edge.sum())
+    print(f"LED edges, worst of {pixels} pixels                               {worst:8.4%}")
+    dr.sync_thread()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,38 @@
+"""Peak memory of making full office frames, after 20 and after more of them: it has to stay where it is.
+
+python benchmarks/memory.py [FRAMES]
+"""
+
+import resource
+import sys
+import tempfile
+from pathlib import Path
+
+from vlcrender.frame import EXPECTED, FRAMES, PREVIEWS, Job, make_frame
+from vlcrender.recipe import load_plan
+
+
+def peak_gib() -> float:
+    """Largest resident set of this process so far."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+
+
+def main() -> None:
+    """Measure and print."""
+    frames = int(sys.argv[1]) if len(sys.argv) > 1 else 60
+    root = Path(__file__).parent.parent
+    plan = load_plan(root / "datasets/quickstart.toml", [f"poses.count={frames}"])
+    with tempfile.TemporaryDirectory() as folder:
+        for name in (FRAMES, EXPECTED, PREVIEWS):
+            (Path(folder) / name).mkdir()
+        settings = plan.scene.settings.model_dump_json()
+        job = Job(plan.recipe.model_dump_json(), settings, str(plan.scene.folder), folder)
+        for frame in range(frames):
+            record = make_frame(job, frame)
+            (Path(folder) / record["device"]["file"]).unlink()
+            if frame + 1 in (20, frames):
+                print(f"peak memory after {frame + 1:4d} full frames   {peak_gib():.2f} GiB", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,94 @@
+"""Make the pictures of docs/effects.md: python docs/make_pictures.py"""
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from vlcrender.camera import Camera, Pose, rays_world
+from vlcrender.motion import Motion, poses_during
+from vlcrender.render import Renderer
+from vlcrender.rig import mounted_cameras
+from vlcrender.scene import Scene, build_scene
+from vlcrender.scene_settings import SceneSettings
+from vlcrender.settings import check, read_toml
+
+ROOT = Path(__file__).parent.parent
+OUT = ROOT / "docs/pictures"
+TILTED = Pose((3.0, 3.3, 1.0), tilt_x_deg=-18.0, tilt_y_deg=14.0, yaw_deg=25.0)
+NARROW = {"width_px": 800, "height_px": 600, "pixel_pitch_um": 6.0}
+WIDE = {**NARROW, "focal_length_mm": 3.0}
+FISH_EYE = {**NARROW, "focal_length_mm": 1.6, "projection": "equidistant"}
+
+TABLE_OBJ = """\
+v -0.4 -0.25 0
+v 0.4 -0.25 0
+v 0.4 0.25 0
+v -0.4 0.25 0
+f 1 2 3
+f 1 3 4
+f 3 2 1
+f 4 3 1
+"""
+
+
+def office(folder: Path = ROOT / "scenes", **changes: object) -> Scene:
+    """The office with other tables."""
+    tree = {**read_toml(ROOT / "scenes/office.toml"), **changes}
+    return build_scene(check(tree, SceneSettings, "picture"), "picture", folder)
+
+
+def main() -> None:
+    """Render and write all."""
+    plain = Renderer(office())
+    pane = {"wall": "x=0", "corner_m": [1.0, 0.9], "size_m": [5.0, 2.2], "luminance_cd_m2": 40.0}
+    glass = Renderer(office(window=[pane]))
+    lamps = read_toml(ROOT / "scenes/office.toml")["panels"]
+    squares = [{**lamps[0], "leds": {**lamps[0]["leds"], "shape": "square", "half_power_deg": 30.0}}]
+    OUT.mkdir(exist_ok=True)
+    table = OUT / "table.obj"
+    table.write_text(TABLE_OBJ)
+    ray = rays_world(Camera(**NARROW), TILTED, np.array([600.0, 330.0]))
+    place = np.array(TILTED.position_m) + ray * 1.6 / ray[2]
+    board = {"file": "table.obj", "position_m": place.tolist(), "yaw_deg": 30.0, "scale": 0.2, "reflectance": 0.2}
+    furnished = Renderer(office(OUT, furniture=[board]))
+    table.unlink()
+    main_camera = Camera(**NARROW)
+    (mounted,) = mounted_cameras(main_camera, ())
+    moving = Motion(angular_velocity_deg_s=(0.0, 400.0, 150.0))
+    shots = {
+        "pinhole": (plain, main_camera, TILTED, None),
+        "focused at infinity, f/2.2": (plain, Camera(**NARROW, focus_distance_m="infinity"), TILTED, None),
+        "turning at 400 deg/s, 4 ms": (
+            plain,
+            main_camera,
+            TILTED,
+            poses_during(moving, mounted, TILTED, 4e-3, plain.scene),
+        ),
+        "square LEDs of 30 deg half power": (Renderer(office(panels=squares)), main_camera, TILTED, None),
+        "a board hides LEDs": (furnished, main_camera, TILTED, None),
+        "3 mm lens: walls, light that bounces": (plain, Camera(**WIDE), TILTED, None),
+        "barrel distortion, k1 = -0.12": (plain, Camera(**WIDE, distortion={"k1": -0.12}), TILTED, None),
+        "equidistant fish-eye": (
+            plain,
+            Camera(**{**WIDE, "focal_length_mm": 1.6}, projection="equidistant"),
+            TILTED,
+            None,
+        ),
+        "vignetting, closed at 50 deg": (plain, Camera(**WIDE, vignetting_deg=50.0), TILTED, None),
+        "false LEDs in a window": (glass, Camera(**WIDE), Pose((2.5, 3.5, 1.2), tilt_y_deg=-60.0), None),
+    }
+    figure = Figure(figsize=(15, 6.2), layout="constrained")
+    for axes, (title, (renderer, camera, pose, during)) in zip(
+        figure.subplots(2, 5).ravel(), shots.items(), strict=True
+    ):
+        image = renderer.view(camera, pose, during=during).expected_electrons(1.0)
+        image = image / np.quantile(image, 0.5) / 12
+        axes.imshow(np.clip(image, 0, 1) ** (1 / 2.2), cmap="gray", vmin=0, vmax=1)
+        axes.set_title(title, fontsize=10)
+        axes.set_axis_off()
+    figure.savefig(OUT / "effects.png", dpi=90)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,89 @@
+"""Real lenses' pixels to a pinhole's."""
+
+import numpy as np
+import pytest
+from estimator_synthetic import Array
+
+from estimator.dataset import Camera, Distortion
+from estimator.errors import EstimationFailure
+from estimator.undistort import pinhole_pixels
+
+
+def camera(projection: str = "perspective", skew_px: float = 0.0, **coefficients: float) -> Camera:
+    """100 pixels to the image distance."""
+    none = dict.fromkeys(("k1", "k2", "k3", "p1", "p2"), 0.0)
+    return Camera.model_validate(
+        {
+            "width_px": 400,
+            "height_px": 300,
+            "K": ((100.0, skew_px, 200.0), (0.0, 100.0, 150.0), (0.0, 0.0, 1.0)),
+            "pixel_pitch_um": 100.0,
+            "focal_length_mm": 10.0,
+            "image_distance_mm": 10.0,
+            "f_number": 2.0,
+            "projection": projection,
+            "distortion": Distortion(**{**none, **coefficients}) if coefficients else None,
+            "R_cam_rig": ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+            "offset_m": (0.0, 0.0, 0.0),
+        }
+    )
+
+
+def pixels(*rows: tuple[float, float]) -> Array:
+    return np.array(rows)
+
+
+def test_a_pinhole_s_pixels_are_left_alone() -> None:
+    given = pixels((1.1, 2.3), (377.7, 3.9))
+    assert pinhole_pixels(given, camera()) is given
+
+
+@pytest.mark.parametrize(
+    ("coefficients", "seen", "straight"),
+    [
+        # x = 0.5: 0.5 (1 - 0.2 / 4) = 0.475
+        ({"k1": -0.2}, (247.5, 150.0), (250.0, 150.0)),
+        ({"k2": -0.8}, (200.0, 197.5), (200.0, 200.0)),
+        ({"k3": 3.2}, (252.5, 150.0), (250.0, 150.0)),
+        # (x, y) = (0.5, 0): y + p1 r^2 and x + 3 p2 x^2
+        ({"p1": 0.04}, (250.0, 151.0), (250.0, 150.0)),
+        ({"p2": 0.04}, (253.0, 150.0), (250.0, 150.0)),
+    ],
+)
+def test_a_point_by_hand(
+    coefficients: dict[str, float], seen: tuple[float, float], straight: tuple[float, float]
+) -> None:
+    assert pinhole_pixels(pixels(seen), camera(**coefficients)) == pytest.approx(pixels(straight), abs=1e-9)
+
+
+def test_a_barrel_s_pixels_go_outwards_and_a_pincushion_s_inwards() -> None:
+    given = pixels((240.0, 150.0), (170.0, 170.0), (200.0, 90.0))
+    radius = np.linalg.norm(given - [200, 150], axis=1)
+    for k1, sign in ((-0.1, 1), (0.1, -1)):
+        moved = np.linalg.norm(pinhole_pixels(given, camera(k1=k1)) - [200, 150], axis=1)
+        assert (sign * (moved - radius) > 0.1).all()
+
+
+def test_skew_is_not_part_of_the_lens() -> None:
+    """(x, y) = (0, 0.5) is seen at y = 0.475, half a pixel of skew a pixel down: u = 200 + 50 y."""
+    found = pinhole_pixels(pixels((223.75, 197.5)), camera(skew_px=50.0, k1=-0.2))
+    assert found == pytest.approx(pixels((225.0, 200.0)), abs=1e-9)
+
+
+def test_a_fish_eye_by_hand() -> None:
+    """45 deg is a radius of 25 pi px, and 1 of the image distance for a pinhole; the axis stays where it is."""
+    found = pinhole_pixels(pixels((200.0, 150.0 - 25 * np.pi), (200.0, 150.0)), camera("equidistant"))
+    assert found == pytest.approx(pixels((200.0, 50.0), (200.0, 150.0)), abs=1e-9)
+
+
+@pytest.mark.parametrize("theta_deg", [80.1, 95.0])
+def test_what_no_pinhole_sees_is_a_named_failure(theta_deg: float) -> None:
+    with pytest.raises(EstimationFailure, match=r"^undistort: a spot is 80 deg or more off the optical axis$"):
+        pinhole_pixels(pixels((200.0, 150.0), (200.0 + 100 * np.radians(theta_deg), 150.0)), camera("equidistant"))
+
+
+@pytest.mark.parametrize("coefficients", [{"k1": -0.5}, {"k1": 1e100, "k2": -1e100}, {"p2": -0.5}])
+def test_a_place_that_the_lens_images_nothing_at_is_a_named_failure(coefficients: dict[str, float]) -> None:
+    """r (1 - r^2 / 2) does not reach beyond 0.55."""
+    with pytest.raises(EstimationFailure, match=r"^undistort: the distortion cannot be undone at a spot$"):
+        pinhole_pixels(pixels((200.0, 150.0), (260.0, 151.0)), camera(**coefficients))

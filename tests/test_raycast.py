@@ -1,0 +1,112 @@
+"""What hides LEDs and what mirrors them: geometry and Fresnel's law against hand calculations."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import ROOT
+
+from vlcrender.camera import Camera, Pose, project
+from vlcrender.lens import relative_illumination
+from vlcrender.photometry import Silicon, electron_rate_per_cd_m2
+from vlcrender.raycast import pane_reflectance
+from vlcrender.render import Renderer
+from vlcrender.scene import Scene, build_scene
+from vlcrender.scene_settings import SceneSettings
+from vlcrender.settings import check, read_toml
+
+TABLE1 = read_toml(ROOT / "scenes/table1.toml")
+LAMP = {"id": 1, "position_m": [3.0, 3.5, 3.5], "radius_m": 0.03, "luminance_cd_m2": 10000.0}
+PANE = {"wall": "x=0", "corner_m": [0.5, 0.5], "size_m": [6.0, 2.5], "luminance_cd_m2": 0.0}
+WIDE = Camera(width_px=1000, height_px=800, pixel_pitch_um=20.0)
+
+
+def room(folder: Path | None = None, **changes: object) -> Scene:
+    tree = {**TABLE1, "led": [LAMP], "bake": {"texel_m": 1.0, "paths": 64}, **changes}
+    return build_scene(check(tree, SceneSettings, "test"), "test", folder or ROOT / "scenes")
+
+
+def test_a_pane_reflects_by_fresnels_law() -> None:
+    # straight on: F = (0.52 / 2.52)^2 = 4.258 % at each face, 2 F / (1 + F) = 8.168 %
+    assert pane_reflectance(1.0, 1.52, np.sqrt) == pytest.approx(0.08168, abs=1e-5)
+    # grazing: everything; no glass: nothing
+    assert pane_reflectance(1e-9, 1.52, np.sqrt) == pytest.approx(1.0, abs=1e-6)
+    assert pane_reflectance(0.5, 1.0, np.sqrt) == pytest.approx(0.0, abs=1e-12)
+    # at Brewster's angle atan(n) p-light passes: F = s^2 / 2 with s = cos(2 theta_B)
+    brewster = np.arctan(1.52)
+    face = np.cos(2 * brewster) ** 2 / 2
+    assert pane_reflectance(np.cos(brewster), 1.52, np.sqrt) == pytest.approx(2 * face / (1 + face), rel=1e-9)
+
+
+def test_the_mirror_image_of_an_led_is_where_geometry_puts_it() -> None:
+    """In a pane in the wall x = 0 the LED at x = 3 is seen as one at x = -3, dimmed by the pane."""
+    renderer = Renderer(room(window=[PANE]))
+    # towards the wall and up: the mirror image is 5 m away across and 2.5 m up
+    pose = Pose((2.0, 3.4, 1.0), tilt_y_deg=-60.0)
+    view = renderer.view(WIDE, pose)
+    (reflection,) = view.parts[0].reflections
+    assert reflection.led_id == 1
+    expected, _ = project(WIDE, pose, np.array([-3.0, 3.5, 3.5]))
+    rows, columns = reflection.electrons_per_s.shape
+    weight = reflection.electrons_per_s.sum(dtype=float)
+    u = (reflection.electrons_per_s.sum(axis=0) * (reflection.column + 0.5 + np.arange(columns))).sum() / weight
+    v = (reflection.electrons_per_s.sum(axis=1) * (reflection.row + 0.5 + np.arange(rows))).sum() / weight
+    # the ellipse's centre and the falling brightness: f r^2 / d^2 * tan = 900 * 0.03^2 / 5.6^2 * 2 = 0.05 px
+    assert np.hypot(u - expected[0], v - expected[1]) < 0.1
+    # brightness of a full pixel: L R cos^4 rate, R at the angle whose cosine is 5 / |(5, 0.1, 2.5)|
+    peak = np.unravel_index(np.argmax(reflection.electrons_per_s), reflection.electrons_per_s.shape)
+    at = np.array([reflection.column + peak[1] + 0.5, reflection.row + peak[0] + 0.5])
+    reflectance = pane_reflectance(5 / np.sqrt(25 + 0.01 + 6.25), 1.52, np.sqrt)
+    rate = electron_rate_per_cd_m2(WIDE, "LED-B3", Silicon())
+    whole = 10000 * reflectance * rate * float(relative_illumination(WIDE, *at))
+    assert reflection.electrons_per_s.max() == pytest.approx(whole, rel=0.01)
+
+
+def test_no_led_is_mirrored_where_the_pane_is_not() -> None:
+    low = {**PANE, "corner_m": [0.5, 0.1], "size_m": [6.0, 0.5]}
+    renderer = Renderer(room(window=[low]))
+    view = renderer.view(WIDE, Pose((2.0, 3.4, 1.0), tilt_y_deg=-60.0))
+    assert not view.parts[0].reflections
+
+
+def test_a_reflection_flickers_with_its_led() -> None:
+    part = Renderer(room(window=[PANE])).view(WIDE, Pose((2.0, 3.4, 1.0), tilt_y_deg=-60.0)).parts[0]
+    assert np.array_equal(part.expected_electrons(1e-3, {1: 0.0}), part.background_e_per_s * np.float32(1e-3))
+
+
+@pytest.mark.parametrize(("edge_x", "share"), [(2.9, 0.0), (3.0, 0.5), (3.1, 1.0)])
+def test_a_board_hides_as_much_of_an_led_as_it_covers(tmp_path: Path, edge_x: float, share: float) -> None:
+    """Camera straight below the LED; a board just below it whose edge is at edge_x leaves what is left of the edge."""
+    corners = [(edge_x, 3.0), (edge_x + 1, 3.0), (edge_x + 1, 4.0), (edge_x, 4.0)]
+    text = "".join(f"v {x} {y} 0\n" for x, y in corners) + "f 1 3 2\nf 1 4 3\n"
+    (tmp_path / "board.obj").write_text(text)
+    piece = {"file": "board.obj", "position_m": [0.0, 0.0, 3.49]}
+    camera = Camera(width_px=400, height_px=300, pixel_pitch_um=12.0)
+    view = Renderer(room(tmp_path, furniture=[piece])).view(camera, Pose((3.0, 3.5, 0.5)))
+    seen = [patch for patch in view.patches if patch.led_id == 1]
+    if share == 0:
+        assert not seen
+    else:
+        # 8 x 8 rays a pixel over an edge 30 px long: 1/16 px of 30 px across; and 1 cm of parallax in 3 m
+        assert seen[0].visible_fraction == pytest.approx(share, abs=0.01)
+
+
+def test_a_lambertian_order_dims_the_led_aside() -> None:
+    """L = L_0 cos^(m - 1): at 30 deg and a half-power angle of 30 deg, m = 4.82, so cos^3.82 = 0.577."""
+    pose = Pose((3.0 - 3.0 * np.tan(np.radians(30)), 3.5, 0.5), tilt_y_deg=30.0)
+    plain, narrow = (
+        Renderer(room(led=[{**LAMP, "half_power_deg": angle}])).view(WIDE, pose).patches[0].electrons_per_s.max()
+        for angle in (60.0, 30.0)
+    )
+    order = -np.log(2) / np.log(np.cos(np.radians(30)))
+    # the brightest pixel is at the LED's near rim: 3.82 tan(30 deg) * 0.03 m cos(30 deg) / 3.46 m = 1.7 % brighter
+    assert narrow / plain == pytest.approx(np.cos(np.radians(30)) ** (order - 1), rel=0.02)
+
+
+def test_a_square_led_has_the_light_of_its_area() -> None:
+    pose = Pose((3.0, 3.5, 0.5))
+    disc, square = (
+        Renderer(room(led=[{**LAMP, "shape": shape}])).view(WIDE, pose).patches[0].electrons_per_s.sum(dtype=float)
+        for shape in ("disc", "square")
+    )
+    assert square / disc == pytest.approx(4 / np.pi, rel=1e-3)
