@@ -10,7 +10,10 @@ from hypothesis import strategies as st
 
 from vlcrender.camera import Camera
 from vlcrender.errors import InputError
-from vlcrender.scene import Scene, load_scene
+from vlcrender.irradiance import room_mesh
+from vlcrender.scene import Scene, build_scene, load_scene
+from vlcrender.scene_settings import SceneSettings
+from vlcrender.settings import check
 from vlcrender.visibility import level_coverage
 
 ROOT = Path(__file__).parent.parent
@@ -128,6 +131,49 @@ def test_a_bad_panel_is_refused_in_one_line(tmp_path: Path, old: str, new: str, 
     path.write_text(OFFICE.replace(old, new, 1))
     with pytest.raises(InputError, match=message) as refusal:
         load_scene(path)
+    assert "\n" not in str(refusal.value)
+
+
+WINDOW = {"wall": "x=0", "corner_m": [1.0, 1.0], "size_m": [1.0, 1.0], "luminance_cd_m2": 100.0}
+BAD_ADDITIONS: list[tuple[dict[str, object], str]] = [
+    ({"window": [{**WINDOW, "size_m": [7.0, 1.0]}]}, r"window\[0\]: .*does not fit"),
+    ({"window": [WINDOW, {**WINDOW, "corner_m": [1.5, 1.5]}]}, r"window\[1\]: overlaps another window in wall x=0"),
+    ({"window": [{**WINDOW, "wall": "north"}]}, r"window\[0\]\.wall = \"north\": .*'x=0'"),
+    ({"window": [{**WINDOW, "refractive_index": 0.5}]}, r"refractive_index = 0\.5"),
+    ({"furniture": [{"file": "nowhere.ply"}]}, r"furniture\[0\]\.file = 'nowhere.ply': no such file"),
+    ({"furniture": [{"file": "chair.blend"}]}, r"furniture\[0\]\.file = \"chair.blend\""),
+    ({"bake": {"texel_m": 0.0}}, r"bake\.texel_m = 0\.0"),
+    ({"bake": {"paths": 2}}, r"bake\.paths = 2"),
+    ({"led": [{"id": 1, "position_m": [1, 1, 3], "radius_m": 0.01, "luminance_cd_m2": 1, "half_power_deg": 95}]}, "95"),
+]
+
+
+@pytest.mark.parametrize(("changes", "message"), BAD_ADDITIONS)
+def test_windows_furniture_and_bakes_that_cannot_be_are_refused(changes: dict[str, object], message: str) -> None:
+    with pytest.raises(InputError, match=message) as refusal:
+        build_scene(check({**tomllib.loads(TABLE1), **changes}, SceneSettings, "test"), "test")
+    assert "\n" not in str(refusal.value)
+
+
+FURNITURE_FILES = {
+    "noise.ply": b"\x00\x01 not a mesh",
+    "empty.obj": b"",
+    "far.obj": b"v 0 0 0\nv 90 0 0\nv 0 90 0\nf 1 2 3\n",
+    "nan.obj": b"v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n",
+    "broken.xml": b"<scene version='3.0.0'><shape",
+    "sphere.xml": b"<scene version='3.0.0'><shape type='sphere'/></scene>",
+    "lamp.xml": b"<scene version='3.0.0'><shape type='rectangle'><emitter type='area'/></shape></scene>",
+    "nothing.xml": b"<scene version='3.0.0'></scene>",
+}
+
+
+@pytest.mark.parametrize("name", FURNITURE_FILES)
+def test_furniture_that_is_no_mesh_in_the_room_is_refused(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(FURNITURE_FILES[name])
+    tree = {**tomllib.loads(TABLE1), "furniture": [{"file": name}]}
+    scene = build_scene(check(tree, SceneSettings, "test"), "test", tmp_path)
+    with pytest.raises(InputError, match=rf"furniture\[0\]\.file = '{name}'") as refusal:
+        room_mesh(scene)
     assert "\n" not in str(refusal.value)
 
 

@@ -326,7 +326,7 @@ class Renderer:
             window = Window(image.row, image.column, *image.coverage.shape)
             centers = _centers(window)
             rays = rays_world(camera, mirrored, centers)
-            cosine = np.abs(transform_dot(rays, normal)) / np.sqrt((rays**2).sum(axis=-1))
+            cosine = np.abs(_along(rays, normal)) / np.sqrt((rays**2).sum(axis=-1))
             weight = relative_illumination(camera, centers[..., 0], centers[..., 1])
             weight = weight * pane_reflectance(cosine, pane.refractive_index, np.sqrt)
             lit = _Lit(window, image.coverage, weight, 1.0, 1.0)
@@ -348,7 +348,7 @@ DEPTH_STEP = 0.005
 """Depths that differ by less than this part share a kernel: 0.2 px of a defocus disc of 35."""
 
 
-def transform_dot(vectors: Array, direction: Array) -> Array:
+def _along(vectors: Array, direction: Array) -> Array:
     """Dot products of vectors (..., 3) with one direction; written out as `camera.transform` is."""
     product: Array = vectors[..., 0] * direction[0] + vectors[..., 1] * direction[1] + vectors[..., 2] * direction[2]
     return product
