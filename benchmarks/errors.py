@@ -8,7 +8,8 @@ from vlcrender import background as background_module
 from vlcrender.backend import dr
 from vlcrender.camera import Camera, Pose
 from vlcrender.irradiance import bake
-from vlcrender.led_image import image_of_disc, leds_that_may_be_seen
+from vlcrender.led_image import image_of_led, leds_that_may_be_seen
+from vlcrender.led_shape import Disc
 from vlcrender.render import Renderer
 from vlcrender.scene import load_scene
 
@@ -50,7 +51,7 @@ def main() -> None:
     worst, pixels = 0.0, 0
     for pose in POSES:
         for i in leds_that_may_be_seen(camera, pose, scene.leds.centers_m, scene.leds.radii_m):
-            image = image_of_disc(camera, pose, scene.leds.centers_m[i], float(scene.leds.radii_m[i]))
+            image = image_of_led(camera, pose, scene.leds.centers_m[i], Disc(float(scene.leds.radii_m[i])))
             if image is None or image.visible_fraction < 1:
                 continue
             rows, columns = image.coverage.shape
@@ -62,7 +63,7 @@ def main() -> None:
                     "height_px": FINER * rows,
                 }
             )
-            fine_image = image_of_disc(shifted, pose, scene.leds.centers_m[i], float(scene.leds.radii_m[i]))
+            fine_image = image_of_led(shifted, pose, scene.leds.centers_m[i], Disc(float(scene.leds.radii_m[i])))
             assert fine_image is not None
             whole = np.zeros((FINER * rows, FINER * columns))
             r, c = fine_image.row, fine_image.column

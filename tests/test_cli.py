@@ -77,6 +77,10 @@ GENERATE_MISTAKES: dict[str, tuple[list[str], list[str]]] = {
     "workers": (["--workers", "0"], ["--workers 0", "1 or more"]),
     "workers is a word": (["--workers", "many"], ["--workers", "many"]),
     "unknown option": (["--frobnicate"], ["--frobnicate"]),
+    "overscan behind distortion": (
+        ["--set", 'windows={kind="leds", overscan=true}', "--set", "camera.distortion.k1=-0.05"],
+        ["windows.overscan = true", "distortion"],
+    ),
     "unreachable": (["--set", "poses.min_leds=900"], ["frame 0", "900 LEDs", "lower min_leds"]),
 }
 

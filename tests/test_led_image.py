@@ -7,10 +7,16 @@ from hypothesis import strategies as st
 
 from vlcrender.camera import Camera, Pose, project, rays_world
 from vlcrender.distortion import Distortion
-from vlcrender.led_image import image_of_disc, image_of_led, image_of_square, leds_that_may_be_seen
+from vlcrender.led_image import LedImage, image_of_led, leds_that_may_be_seen
 from vlcrender.led_shape import Disc, Rectangle, circle_polygon_area, rectangle_polygon_area
 
 SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+
+
+def image_of_disc(
+    camera: Camera, pose: Pose, center_m: np.ndarray, radius_m: float, margin_px: int = 0
+) -> LedImage | None:
+    return image_of_led(camera, pose, center_m, Disc(radius_m), margin_px)
 
 
 def area(polygon: np.ndarray, radius: float) -> float:
@@ -252,7 +258,7 @@ def test_an_image_goes_on_beyond_the_sensor_where_asked(camera: Camera) -> None:
 
 def test_a_level_square_of_whole_pixels_covers_them_and_nothing_else() -> None:
     # 0.1 m at 3 m is 500 px; sides run along pixel borders
-    image = image_of_square(Camera(), Pose((3.0, 3.0, 0.5)), np.array([3.0, 3.0, 3.5]), 0.1)
+    image = image_of_led(Camera(), Pose((3.0, 3.0, 0.5)), np.array([3.0, 3.0, 3.5]), Rectangle((0.1, 0.1)))
     assert image is not None
     assert image.coverage.sum() == pytest.approx(250_000, rel=1e-9)
     assert image.coverage[1:-1, 1:-1].min() > 1 - 1e-9

@@ -110,3 +110,19 @@ def test_a_square_led_has_the_light_of_its_area() -> None:
         for shape in ("disc", "square")
     )
     assert square / disc == pytest.approx(4 / np.pi, rel=1e-3)
+
+
+def test_a_panel_hung_low_hides_an_led_above_it() -> None:
+    """No furniture in it: an LED on the ceiling, a panel 0.5 m below it between LED and camera."""
+    leds = {"columns": 1, "rows": 1, "pitch_m": [0.1, 0.1], "radius_m": 0.01, "first_id": 10}
+    panel = {
+        "columns": 1,
+        "rows": 1,
+        "first_center_m": [3.0, 3.5, 3.0],
+        "pitch_m": [1.0, 1.0],
+        "size_m": [0.4, 0.4, 0.05],
+    }
+    panel |= {"reflectance": 0.7, "leds": {**leds, "luminance_cd_m2": [5000.0, 5000.0]}}
+    lamps = [LAMP, {**LAMP, "id": 2, "position_m": [3.6, 3.5, 3.5]}]
+    view = Renderer(room(led=lamps, panels=[panel])).view(WIDE, Pose((3.0, 3.5, 0.5)))
+    assert sorted(patch.led_id for patch in view.patches) == [2, 10]

@@ -8,13 +8,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from vlcrender.camera import Camera
+from vlcrender.camera import Camera, Pose
 from vlcrender.errors import InputError
 from vlcrender.irradiance import room_mesh
 from vlcrender.scene import Scene, build_scene, load_scene
 from vlcrender.scene_settings import SceneSettings
 from vlcrender.settings import check
-from vlcrender.visibility import level_coverage
+from vlcrender.visibility import leds_in_view, level_coverage
 
 ROOT = Path(__file__).parent.parent
 TABLE1 = (ROOT / "scenes/table1.toml").read_text()
@@ -72,6 +72,17 @@ def test_table1_as_printed_sees_four_leds_from_36_of_122500_level_poses(table1: 
         assert coverage.seen == {0.0: 0, 90.0: 36}[yaw]
 
 
+def assert_refused(folder: Path, text: str, old: str, new: str, message: str) -> None:
+    """A scene file with `old` replaced by `new` is refused in one line that names the file."""
+    assert old in text
+    path = folder / "bad.toml"
+    path.write_text(text.replace(old, new, 1))
+    with pytest.raises(InputError, match=message) as refusal:
+        load_scene(path)
+    assert "\n" not in str(refusal.value)
+    assert str(path) in str(refusal.value)
+
+
 BAD_TABLE1 = [
     ("radius_m = 0.01", "radius_m = -0.01", r"led\[0\]\.radius_m = -0\.01: .*greater than 0"),
     ("radius_m = 0.01", "radius_cm = 1.0", r"unknown key led\[0\]\.radius_cm; did you mean radius_m\?"),
@@ -105,13 +116,7 @@ BAD_TABLE1 = [
     ("old", "new", "message"), BAD_TABLE1, ids=[row[1].replace("\n", " ") or "nothing" for row in BAD_TABLE1]
 )
 def test_a_bad_scene_is_refused_in_one_line(tmp_path: Path, old: str, new: str, message: str) -> None:
-    assert old in TABLE1
-    path = tmp_path / "bad.toml"
-    path.write_text(TABLE1.replace(old, new, 1))
-    with pytest.raises(InputError, match=message) as refusal:
-        load_scene(path)
-    assert "\n" not in str(refusal.value)
-    assert str(path) in str(refusal.value)
+    assert_refused(tmp_path, TABLE1, old, new, message)
 
 
 BAD_OFFICE = [
@@ -126,12 +131,7 @@ BAD_OFFICE = [
 
 @pytest.mark.parametrize(("old", "new", "message"), BAD_OFFICE, ids=[row[1].replace("\n", " ") for row in BAD_OFFICE])
 def test_a_bad_panel_is_refused_in_one_line(tmp_path: Path, old: str, new: str, message: str) -> None:
-    assert old in OFFICE
-    path = tmp_path / "bad.toml"
-    path.write_text(OFFICE.replace(old, new, 1))
-    with pytest.raises(InputError, match=message) as refusal:
-        load_scene(path)
-    assert "\n" not in str(refusal.value)
+    assert_refused(tmp_path, OFFICE, old, new, message)
 
 
 WINDOW = {"wall": "x=0", "corner_m": [1.0, 1.0], "size_m": [1.0, 1.0], "luminance_cd_m2": 100.0}
@@ -175,6 +175,19 @@ def test_furniture_that_is_no_mesh_in_the_room_is_refused(tmp_path: Path, name: 
     with pytest.raises(InputError, match=rf"furniture\[0\]\.file = '{name}'") as refusal:
         room_mesh(scene)
     assert "\n" not in str(refusal.value)
+
+
+def test_a_square_led_counts_as_seen_only_with_its_corners() -> None:
+    """Half side 0.01 m at 3 m is 50 px, its corner 71 px from the centre; yaw of 45 deg turns it to the border."""
+    led = {"id": 1, "position_m": [3.0, 3.0, 3.5], "radius_m": 0.01, "luminance_cd_m2": 1e4}
+    # the centre is 60 px inside the left border
+    pose = Pose((3.0 + 1940 * 3 / 15000 * np.sqrt(0.5), 3.0 + 1940 * 3 / 15000 * np.sqrt(0.5), 0.5), yaw_deg=45.0)
+    seen = {}
+    for shape in ("disc", "square"):
+        tree = {**tomllib.loads(TABLE1), "led": [{**led, "shape": shape}]}
+        scene = build_scene(check(tree, SceneSettings, "test"), "test")
+        seen[shape] = len(leds_in_view(Camera(), pose, scene))
+    assert seen == {"disc": 1, "square": 0}
 
 
 def test_a_room_without_leds_is_refused(tmp_path: Path) -> None:

@@ -44,7 +44,7 @@ class Background:
         origin = mi.Point3f(*_opaque(np.array([pose.position_m]))[0])
         hit = self.room.look(origin, direction, self._values[rates])
         value = relative_illumination(camera, u, v, dr, hit.value)
-        return Hit(value, hit.surface, hit.distance_m, hit.mirrored_m)
+        return Hit(value, hit.surface, hit.distance_m)
 
     def images(
         self, camera: Camera, pose: Pose, frames: Sequence[Window], rates: tuple[float, float]

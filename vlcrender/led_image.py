@@ -44,18 +44,6 @@ class LedImage:
     """Share of the LED's whole image, by area, that falls on the sensor."""
 
 
-def image_of_disc(camera: Camera, pose: Pose, center_m: Array, radius_m: float, margin_px: int = 0) -> LedImage | None:
-    """`image_of_led` of a disc."""
-    return image_of_led(camera, pose, center_m, Disc(radius_m), margin_px)
-
-
-def image_of_square(
-    camera: Camera, pose: Pose, center_m: Array, side_m: float, yaw_deg: float = 0.0, margin_px: int = 0
-) -> LedImage | None:
-    """`image_of_led` of a square."""
-    return image_of_led(camera, pose, center_m, Rectangle((side_m, side_m), yaw_deg), margin_px)
-
-
 def image_of_led(
     camera: Camera, pose: Pose, center_m: Array, shape: Disc | Rectangle, margin_px: int = 0
 ) -> LedImage | None:

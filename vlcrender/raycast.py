@@ -22,14 +22,12 @@ Array = NDArray[np.float64]
 class Hit:
     """Dr.Jit arrays, one entry a ray: light seen, number of the surface met, and the distance to it in metres.
 
-    `surface` counts surfaces, then furniture, then panes, then nothing. Behind a pane, `mirrored_m` is how far the
-    mirrored ray gets; 0 elsewhere.
+    `surface` counts surfaces, then furniture, then panes, then nothing.
     """
 
     value: Any
     surface: Any
     distance_m: Any
-    mirrored_m: Any
 
 
 class Room:
@@ -78,18 +76,16 @@ class Room:
     def look(self, origin: Any, direction: Any, values: Any, coherent: bool = True) -> Hit:
         """Cast rays (Dr.Jit points and unit directions, world)."""
         value, surface, distance = self._meet(origin, direction, values, coherent, mi.Bool(True))
-        mirrored: Any = mi.Float(0.0)
         if self._panes:
             on_pane = (surface >= self.first_pane) & (surface < self.nothing)
             normal = dr.gather(mi.Vector3f, self._pane_normal, surface)
             cosine = dr.abs(dr.dot(direction, normal))
             onward = direction - 2 * dr.dot(direction, normal) * normal
             start = dr.fma(direction, distance, origin) + normal * 1e-5
-            second, _, mirrored = self._meet(start, onward, values, False, on_pane)
+            second, _, _ = self._meet(start, onward, values, False, on_pane)
             reflectance = pane_reflectance(cosine, dr.gather(mi.Float, self._pane_index, surface), dr.sqrt)
             value = dr.select(on_pane, dr.lerp(value, second, reflectance), value)
-            mirrored = dr.select(on_pane, mirrored, 0.0)
-        return Hit(value, surface, distance, mirrored)
+        return Hit(value, surface, distance)
 
     def _meet(self, origin: Any, direction: Any, values: Any, coherent: bool, active: Any) -> tuple[Any, Any, Any]:
         hit = self._scene.ray_intersect_preliminary(mi.Ray3f(origin, direction), coherent=coherent, active=active)

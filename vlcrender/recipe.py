@@ -54,6 +54,16 @@ class Recipe(Settings):
                 )
         return self
 
+    @model_validator(mode="after")
+    def _overscan_needs_a_lens_that_goes_on(self) -> Self:
+        bent = [c.name for c in self.cameras if c.camera.distortion is not None]
+        if self.windows is not None and self.windows.overscan and bent:
+            raise ValueError(
+                f"windows.overscan = true: camera {bent[0]!r} has a distortion, which says nothing of what lies far "
+                "beyond the sensor; leave one of them out"
+            )
+        return self
+
     @property
     def cameras(self) -> tuple[Mounted, ...]:
         """All cameras, `main` first."""

@@ -75,7 +75,11 @@ class Renderer:
             Rectangle((2 * float(r), 2 * float(r))) if square else Disc(float(r))
             for r, square in zip(scene.leds.radii_m, scene.leds.squares, strict=True)
         ]
-        self._reaches_m = scene.leds.radii_m * np.where(scene.leds.squares, np.sqrt(2), 1.0)
+        undersides_m = [grid.first_center_m[2] for grid in scene.settings.panels]
+        # What may stand between camera and LED: furniture, and panels that hang lower than an LED.
+        self._may_hide = bool(scene.settings.furniture) or min(undersides_m, default=np.inf) < scene.leds.centers_m[
+            :, 2
+        ].max() * (1 - SAME_PLACE)
 
     def view(
         self, camera: Camera, pose: Pose, windows: LedWindows | None = None, during: Sequence[Pose] | None = None
@@ -132,8 +136,12 @@ class Renderer:
 
     def _kernels(self, camera: Camera, pose: Pose) -> dict[int, Array | None]:
         """By LED, what the lens makes of a point at its depth. One for all depths that differ by less than a part."""
-        _, depths = project(camera, pose, self.scene.leds.centers_m)
-        candidates = leds_that_may_be_seen(camera, pose, self.scene.leds.centers_m, self._reaches_m, BLUR_MARGIN_PX)
+        leds = self.scene.leds
+        towards_m = leds.centers_m - np.array(pose.position_m)
+        # A fish-eye has no plane of focus: its depth is the distance.
+        fish_eye = camera.projection == "equidistant"
+        depths = np.linalg.norm(towards_m, axis=1) if fish_eye else _along(towards_m, pose.rotation[2])
+        candidates = leds_that_may_be_seen(camera, pose, self.scene.leds.centers_m, leds.reaches_m, BLUR_MARGIN_PX)
         if camera.focus_distance_m is None and camera.psf == "none":
             return dict.fromkeys(range(len(depths)))
         near = np.maximum(depths, 0.05)
@@ -250,7 +258,7 @@ class Renderer:
         leds = self.scene.leds
         overscan = windows is not None and windows.overscan
         reach = _overscan_px(camera) if overscan else spread
-        for i in leds_that_may_be_seen(camera, pose, leds.centers_m, self._reaches_m, reach):
+        for i in leds_that_may_be_seen(camera, pose, leds.centers_m, leds.reaches_m, reach):
             image = image_of_led(camera, pose, leds.centers_m[i], self._shapes[i], reach)
             if image is None:
                 continue
@@ -259,7 +267,7 @@ class Renderer:
                 continue  # an LED cut by the widest overscan is left out
             coverage = image.coverage
             seen = 1.0
-            if self.scene.settings.furniture:
+            if self._may_hide:
                 clear = self._clear_share(camera, pose, float(leds.centers_m[i, 2]), window, coverage > 0)
                 seen = float((coverage * clear).sum() / coverage.sum())
                 coverage = coverage * clear
@@ -319,7 +327,7 @@ class Renderer:
             tuple(map(tuple, mirror.tolist())),
         )
         found = []
-        for i in leds_that_may_be_seen(camera, mirrored, leds.centers_m, self._reaches_m):
+        for i in leds_that_may_be_seen(camera, mirrored, leds.centers_m, leds.reaches_m):
             image = image_of_led(camera, mirrored, leds.centers_m[i], self._shapes[i])
             if image is None:
                 continue

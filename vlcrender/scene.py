@@ -72,6 +72,11 @@ class Leds:
         """Area of each face."""
         return np.where(self.squares, 4.0, np.pi) * self.radii_m**2
 
+    @property
+    def reaches_m(self) -> NDArray[np.float64]:
+        """From each centre to the face's farthest point: a square's corner, a disc's rim."""
+        return np.where(self.squares, np.sqrt(2.0), 1.0) * self.radii_m
+
 
 @dataclass(frozen=True)
 class Scene:

@@ -42,8 +42,8 @@ def show_pose(scene: Scene, camera: Camera) -> Pose:
     return best
 
 
-def draw(scene: Scene, camera: Camera, path: Path, reference: bool = False) -> Pose:
-    """Write a PNG with the plan and the view from `show_pose`. Returns that pose.
+def draw(scene: Scene, camera: Camera, path: Path, reference: bool = False) -> None:
+    """Write a PNG with the plan and the view from `show_pose`.
 
     With `reference` the view is path-traced by Mitsuba, slowly and in larger pixels.
     """
@@ -59,7 +59,6 @@ def draw(scene: Scene, camera: Camera, path: Path, reference: bool = False) -> P
     figure.colorbar(discs, ax=plan, label="LED luminance, cd/m$^2$", shrink=0.8)
     _draw_view(image, scene, camera, pose, electrons)
     figure.savefig(path, dpi=110)
-    return pose
 
 
 def _draw_plan(axes: Axes, scene: Scene, camera: Camera, pose: Pose) -> EllipseCollection:

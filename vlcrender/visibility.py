@@ -33,14 +33,14 @@ class Coverage:
 
 
 def leds_in_view(camera: Camera, pose: Pose, scene: Scene, margin_px: float = 0.0) -> NDArray[np.int64]:
-    """Indices of the LEDs whose whole disc is on the sensor, at least `margin_px` from its border."""
+    """Indices of the LEDs whose whole face (a square's circle) is on the sensor, `margin_px` or more inside."""
     leds = scene.leds
     centers_cam = transform(pose.rotation, leds.centers_m - np.array(pose.position_m))
     candidates = np.flatnonzero(_on_sensor(camera, centers_cam))
     angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     rim = np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=1)
-    # The circumscribed 24-gon: what holds it holds the disc.
-    points = leds.centers_m[candidates, None, :] + rim * (leds.radii_m[candidates, None, None] / np.cos(np.pi / 24))
+    # The circumscribed 24-gon: what holds it holds the circle.
+    points = leds.centers_m[candidates, None, :] + rim * (leds.reaches_m[candidates, None, None] / np.cos(np.pi / 24))
     pixels, _ = project(camera, pose, points)
     inside = (pixels >= margin_px) & (pixels <= np.array([camera.width_px, camera.height_px]) - margin_px)
     seen = inside.all(axis=(-1, -2)) & (pose.position_m[2] < leds.centers_m[candidates, 2])
