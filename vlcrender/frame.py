@@ -58,6 +58,7 @@ def make_frame(job: Job, frame: int) -> Record:
     device = {
         "frame": frame,
         "shot": shot,
+        "pose": shot,
         "file": file,
         "sha256": digest,
         "camera": mounted.name,
@@ -78,6 +79,7 @@ def make_frame(job: Job, frame: int) -> Record:
             {"led": p.led_id, "u_px": p.center_px[0], "v_px": p.center_px[1], "visible_fraction": p.visible_fraction}
             for p in sorted(view.patches, key=lambda p: p.led_id)
         ],
+        "bound_m2": None,
     }
     return {"frame": frame, "device": device, "truth": truth}
 
