@@ -89,14 +89,14 @@ class SensorEntry(Settings):
     full_well_e: float
     black_level_dn: int
     noise: str
-    prnu: float = 0.0
-    dark_current_e_s: float = 0.0
-    dsnu_e: float = 0.0
-    read_noise_e: float = 0.0
-    adc_noise_dn: float = 0.0
-    row_offset_e: float = 0.0
-    column_offset_e: float = 0.0
-    mosaic: str = "none"
+    prnu: float
+    dark_current_e_s: float
+    dsnu_e: float
+    read_noise_e: float
+    adc_noise_dn: float
+    row_offset_e: float
+    column_offset_e: float
+    mosaic: str
 
 
 class AccelerometerEntry(Settings):

@@ -46,7 +46,13 @@ def make_frame(job: Job, frame: int) -> Record:
     view = renderer.view(camera, pose, recipe.windows, during)
     noise = f"{recipe.seed}/{frame}/shot-noise"
     expected = [(part.window, part.expected_electrons(recipe.exposure_s)) for part in view.parts]
-    dn = [(window, expose(recipe.sensor, image, noise, window.row, window.column)) for window, image in expected]
+    dn = [
+        (
+            window,
+            expose(recipe.sensor, image, noise, window.row, window.column, recipe.exposure_s, mounted.name),
+        )
+        for window, image in expected
+    ]
     attributes = exr_attributes(camera, mounted.name, recipe.exposure_s, frame)
     file = f"{FRAMES}/{frame:06d}.exr"
     digest = write_exr(directory / file, dn, sensor, attributes)
