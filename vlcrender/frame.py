@@ -5,20 +5,24 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from vlcrender.camera import Pose
+from vlcrender.camera import Camera, Pose
 from vlcrender.dataset import exr_attributes, write_exr, write_preview
 from vlcrender.downlink import decoded_spots
 from vlcrender.exposure import expose
+from vlcrender.irradiance import bake
+from vlcrender.mosaic import mosaicked
 from vlcrender.motion import poses_during
+from vlcrender.photometry import detectors, electron_rate_per_cd_m2
 from vlcrender.poses import pose_of_frame
 from vlcrender.recipe import Recipe
 from vlcrender.render import Renderer
 from vlcrender.scene import Scene, build_scene
 from vlcrender.scene_settings import SceneSettings
+from vlcrender.sensor import Sensor
 from vlcrender.streams import stream
 from vlcrender.windows import Window
 
-FRAMES, EXPECTED, PREVIEWS = "frames", "expected", "previews"
+FRAMES, EXPECTED, PREVIEWS, PROCESSED = "frames", "expected", "previews", "processed"
 
 Record = dict[str, Any]
 """One frame's rows: {"frame": n, "device": row of frames.parquet, "truth": row of truth.parquet}."""
@@ -36,39 +40,42 @@ class Job:
 
 def make_frame(job: Job, frame: int) -> Record:
     """Render, expose and write one frame; depends on nothing but its arguments."""
-    recipe, renderer = _renderer(job.recipe_json, job.scene_json, job.scene_folder)
+    recipe, renderers = _renderers(job.recipe_json, job.scene_json, job.scene_folder)
+    scene = renderers[0].scene
     directory = Path(job.directory)
-    shot, which = divmod(frame, len(recipe.cameras))
+    pose_number, shot, which = recipe.place_of_frame(frame)
     mounted = recipe.cameras[which]
     camera, sensor = mounted.camera, Window.of_sensor(mounted.camera)
-    main, during = poses_of_frame(recipe, renderer.scene, frame)
+    main, during = poses_of_frame(recipe, scene, frame)
     pose = mounted.pose(main)
-    view = renderer.view(camera, pose, recipe.windows, during)
+    views = [renderer.view(camera, pose, recipe.windows, during) for renderer in renderers]
+    view = views[0] if recipe.sensor.mosaic == "none" else mosaicked(views, recipe.sensor.mosaic)
+    exposure_s = recipe.time_s(view)
     noise = f"{recipe.seed}/{frame}/shot-noise"
-    expected = [(part.window, part.expected_electrons(recipe.exposure_s)) for part in view.parts]
+    expected = [(part.window, part.expected_electrons(exposure_s)) for part in view.parts]
     dn = [
-        (
-            window,
-            expose(recipe.sensor, image, noise, window.row, window.column, recipe.exposure_s, mounted.name),
-        )
+        (window, expose(recipe.sensor, image, noise, window.row, window.column, exposure_s, mounted.name))
         for window, image in expected
     ]
-    attributes = exr_attributes(camera, mounted.name, recipe.exposure_s, frame)
+    attributes = exr_attributes(camera, mounted.name, exposure_s, frame)
     file = f"{FRAMES}/{frame:06d}.exr"
     digest = write_exr(directory / file, dn, sensor, attributes)
     if recipe.expected:
         write_exr(directory / EXPECTED / f"{frame:06d}.exr", expected, sensor, attributes)
     write_preview(directory / PREVIEWS / f"{frame:06d}.png", dn, sensor, recipe.sensor.largest_dn)
+    if recipe.processed is not None:
+        picture = recipe.processed.develop(dn[0][1], recipe.sensor, _balance(camera, recipe.sensor, scene))
+        recipe.processed.write(directory / PROCESSED / f"{frame:06d}{recipe.processed.suffix}", picture)
     # One accelerometer on the rig: its error belongs to the shot.
     reading = mounted.rotation @ recipe.accelerometer.reading_m_s2(main, stream(recipe.seed, shot, "accelerometer"))
     device = {
         "frame": frame,
         "shot": shot,
-        "pose": shot,
+        "pose": pose_number,
         "file": file,
         "sha256": digest,
         "camera": mounted.name,
-        "exposure_s": recipe.exposure_s,
+        "exposure_s": exposure_s,
         "capturable": all(sensor.holds(part.window) for part in view.parts),
         "accelerometer_m_s2": reading.tolist(),
         "spots": decoded_spots(view.parts, camera.width_px, stream(recipe.seed, frame, "demodulator")),
@@ -92,13 +99,22 @@ def make_frame(job: Job, frame: int) -> Record:
 
 def poses_of_frame(recipe: Recipe, scene: Scene, frame: int) -> tuple[Pose, tuple[Pose, ...]]:
     """The pose of the camera `main` at mid-exposure, and those of the frame's own camera during the exposure."""
-    shot, which = divmod(frame, len(recipe.cameras))
-    main = pose_of_frame(recipe.poses, shot, recipe.seed, recipe.camera, scene)
-    return main, poses_during(recipe.motion, recipe.cameras[which], main, recipe.exposure_s, scene)
+    pose_number, _, which = recipe.place_of_frame(frame)
+    main = pose_of_frame(recipe.poses, pose_number, recipe.seed, recipe.camera, scene)
+    # Without a time there is no motion, and the other way round: the recipe sees to it.
+    return main, poses_during(recipe.motion, recipe.cameras[which], main, recipe.exposure_s or 0.0, scene)
+
+
+def _balance(camera: Camera, sensor: Sensor, scene: Scene) -> tuple[float, float, float]:
+    """What makes the LEDs' light white: multipliers of red, green and blue, at least 1 so that white stays white."""
+    rates = [electron_rate_per_cd_m2(camera, scene.settings.led_spectrum, d) for d in detectors(sensor)]
+    red, green, blue = (max(rates) / rate if rate > 0 else 1.0 for rate in (rates if len(rates) == 3 else rates * 3))
+    return red, green, blue
 
 
 @cache
-def _renderer(recipe_json: str, scene_json: str, scene_folder: str) -> tuple[Recipe, Renderer]:
-    """One renderer a process and plan."""
+def _renderers(recipe_json: str, scene_json: str, scene_folder: str) -> tuple[Recipe, tuple[Renderer, ...]]:
+    """One renderer a process and plan, or one for each colour of a mosaic."""
     scene = build_scene(SceneSettings.model_validate_json(scene_json), "scene", Path(scene_folder))
-    return Recipe.model_validate_json(recipe_json), Renderer(scene)
+    recipe, light = Recipe.model_validate_json(recipe_json), bake(scene)
+    return recipe, tuple(Renderer(scene, light, detector) for detector in detectors(recipe.sensor))

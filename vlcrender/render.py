@@ -22,7 +22,7 @@ from vlcrender.irradiance import Light, bake
 from vlcrender.led_image import image_of_led, leds_that_may_be_seen
 from vlcrender.led_shape import Disc, Rectangle
 from vlcrender.lens import blur, blur_kernel, relative_illumination
-from vlcrender.photometry import Silicon, electron_rate_per_cd_m2
+from vlcrender.photometry import Detector, Silicon, electron_rate_per_cd_m2
 from vlcrender.raycast import pane_reflectance
 from vlcrender.scene import Pane, Scene
 from vlcrender.view import Image, LedPatch, Reflection, View, ViewPart
@@ -65,10 +65,10 @@ class _Lit:
 class Renderer:
     """Renders views of one scene."""
 
-    def __init__(self, scene: Scene, light: Light | None = None, silicon: Silicon | None = None) -> None:
-        """Prepare a scene. `light` is its bake, made or taken from the cache where not given."""
+    def __init__(self, scene: Scene, light: Light | None = None, detector: Detector | None = None) -> None:
+        """Prepare a scene. `light` is its bake, made or taken from the cache where not given; `detector`, silicon."""
         self.scene = scene
-        self.silicon = silicon or Silicon()
+        self.detector = detector or Silicon()
         self._light = light or bake(scene)
         self._background = Background(scene, self._light)
         self._shapes = [
@@ -129,7 +129,7 @@ class Renderer:
         """Electrons a second of 1 cd/m2 on the axis: of light that left an LED, and of all other light."""
         settings = self.scene.settings
         lamp, other = (
-            electron_rate_per_cd_m2(camera, spectrum, self.silicon)
+            electron_rate_per_cd_m2(camera, spectrum, self.detector)
             for spectrum in (settings.led_spectrum, settings.ambient.spectrum)
         )
         return lamp, other

@@ -106,6 +106,11 @@ class Sensor(Settings):
         return int(2**self.bits - 1)
 
     @property
+    def white_dn(self) -> int:
+        """The digital number of a full well, or the converter's largest where that is less."""
+        return min(self.largest_dn, round(self.full_well_e / self.gain_at_iso_e_per_dn) + self.black_level_dn)
+
+    @property
     def gain_at_iso_e_per_dn(self) -> float:
         """Electrons a digital number at the sensor's ISO: 1 / K of EMVA 1288."""
         return self.gain_e_per_dn * (self.base_iso / self.iso)
