@@ -1,21 +1,27 @@
 """One frame of a dataset: where its cameras are, what they see, what is written of it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from vlcrender.bounds import position_bound_m2
 from vlcrender.camera import Pose
 from vlcrender.dataset import exr_attributes, write_exr, write_preview
 from vlcrender.downlink import decoded_spots
-from vlcrender.exposure import expose
+from vlcrender.exposure import expose, variance_e2
 from vlcrender.motion import poses_during
 from vlcrender.poses import pose_of_frame
 from vlcrender.recipe import Recipe
 from vlcrender.render import Renderer
+from vlcrender.rig import Mounted
 from vlcrender.scene import Scene, build_scene
 from vlcrender.scene_settings import SceneSettings
 from vlcrender.streams import stream
+from vlcrender.view import Image
 from vlcrender.windows import Window
 
 FRAMES, EXPECTED, PREVIEWS = "frames", "expected", "previews"
@@ -79,9 +85,35 @@ def make_frame(job: Job, frame: int) -> Record:
             {"led": p.led_id, "u_px": p.center_px[0], "v_px": p.center_px[1], "visible_fraction": p.visible_fraction}
             for p in sorted(view.patches, key=lambda p: p.led_id)
         ],
-        "bound_m2": None,
+        "bound_m2": _bound_m2(recipe, renderer, mounted, main, expected, [spot["led"] for spot in device["spots"]]),
     }
     return {"frame": frame, "device": device, "truth": truth}
+
+
+def _bound_m2(
+    recipe: Recipe,
+    renderer: Renderer,
+    mounted: Mounted,
+    main: Pose,
+    expected: Sequence[tuple[Window, Image]],
+    led_ids: Sequence[int],
+) -> list[float] | None:
+    """The frame's Cramér-Rao bound, row by row; None where it is not asked for or nothing is determined."""
+    if not recipe.bound:
+        return None
+    position = np.array(mounted.pose(main).position_m)
+    bound = position_bound_m2(
+        mounted.camera,
+        main,
+        lambda pose: renderer.led_patches(mounted.camera, mounted.pose(pose), recipe.windows, mounted.pose(main)),
+        recipe.exposure_s,
+        [(window, variance_e2(recipe.sensor, image)) for window, image in expected],
+        led_ids,
+        float(np.median(np.linalg.norm(renderer.scene.leds.centers_m - position, axis=1))),
+        recipe.accelerometer.error_deg,
+        recipe.windows is not None and recipe.windows.overscan,
+    )
+    return None if bound is None else bound.ravel().tolist()
 
 
 def poses_of_frame(recipe: Recipe, scene: Scene, frame: int) -> tuple[Pose, tuple[Pose, ...]]:
