@@ -1,25 +1,31 @@
 """One frame of a dataset: where its cameras are, what they see, what is written of it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from vlcrender.bounds import position_bound_m2
 from vlcrender.camera import Camera, Pose
 from vlcrender.dataset import exr_attributes, write_exr, write_preview
 from vlcrender.downlink import decoded_spots
-from vlcrender.exposure import expose
+from vlcrender.exposure import expose, variance_e2
 from vlcrender.irradiance import bake
-from vlcrender.mosaic import mosaicked
+from vlcrender.mosaic import MosaicRenderer
 from vlcrender.motion import poses_during
 from vlcrender.photometry import detectors, electron_rate_per_cd_m2
 from vlcrender.poses import pose_of_frame
 from vlcrender.recipe import Recipe
 from vlcrender.render import Renderer
+from vlcrender.rig import Mounted
 from vlcrender.scene import Scene, build_scene
 from vlcrender.scene_settings import SceneSettings
 from vlcrender.sensor import Sensor
 from vlcrender.streams import stream
+from vlcrender.view import Image
 from vlcrender.windows import Window
 
 FRAMES, EXPECTED, PREVIEWS, PROCESSED = "frames", "expected", "previews", "processed"
@@ -40,16 +46,14 @@ class Job:
 
 def make_frame(job: Job, frame: int) -> Record:
     """Render, expose and write one frame; depends on nothing but its arguments."""
-    recipe, renderers = _renderers(job.recipe_json, job.scene_json, job.scene_folder)
-    scene = renderers[0].scene
+    recipe, renderer = _renderer(job.recipe_json, job.scene_json, job.scene_folder)
     directory = Path(job.directory)
     pose_number, shot, which = recipe.place_of_frame(frame)
     mounted = recipe.cameras[which]
     camera, sensor = mounted.camera, Window.of_sensor(mounted.camera)
-    main, during = poses_of_frame(recipe, scene, frame)
+    main, during = poses_of_frame(recipe, renderer.scene, frame)
     pose = mounted.pose(main)
-    views = [renderer.view(camera, pose, recipe.windows, during) for renderer in renderers]
-    view = views[0] if recipe.sensor.mosaic == "none" else mosaicked(views, recipe.sensor.mosaic)
+    view = renderer.view(camera, pose, recipe.windows, during)
     exposure_s = recipe.time_s(view)
     noise = f"{recipe.seed}/{frame}/shot-noise"
     expected = [(part.window, part.expected_electrons(exposure_s)) for part in view.parts]
@@ -64,7 +68,7 @@ def make_frame(job: Job, frame: int) -> Record:
         write_exr(directory / EXPECTED / f"{frame:06d}.exr", expected, sensor, attributes)
     write_preview(directory / PREVIEWS / f"{frame:06d}.png", dn, sensor, recipe.sensor.largest_dn)
     if recipe.processed is not None:
-        picture = recipe.processed.develop(dn[0][1], recipe.sensor, _balance(camera, recipe.sensor, scene))
+        picture = recipe.processed.develop(dn[0][1], recipe.sensor, _balance(camera, recipe.sensor, renderer.scene))
         recipe.processed.write(directory / PROCESSED / f"{frame:06d}{recipe.processed.suffix}", picture)
     # One accelerometer on the rig: its error belongs to the shot.
     reading = mounted.rotation @ recipe.accelerometer.reading_m_s2(main, stream(recipe.seed, shot, "accelerometer"))
@@ -92,9 +96,36 @@ def make_frame(job: Job, frame: int) -> Record:
             {"led": p.led_id, "u_px": p.center_px[0], "v_px": p.center_px[1], "visible_fraction": p.visible_fraction}
             for p in sorted(view.patches, key=lambda p: p.led_id)
         ],
-        "bound_m2": None,
+        "bound_m2": _bound_m2(recipe, renderer, mounted, main, exposure_s, expected, device["spots"]),
     }
     return {"frame": frame, "device": device, "truth": truth}
+
+
+def _bound_m2(
+    recipe: Recipe,
+    renderer: Renderer | MosaicRenderer,
+    mounted: Mounted,
+    main: Pose,
+    exposure_s: float,
+    expected: Sequence[tuple[Window, Image]],
+    spots: Sequence[dict[str, Any]],
+) -> list[float] | None:
+    """The frame's Cramér-Rao bound, row by row; None where it is not asked for or nothing is determined."""
+    if not recipe.bound:
+        return None
+    position = np.array(mounted.pose(main).position_m)
+    bound = position_bound_m2(
+        mounted.camera,
+        main,
+        lambda pose: renderer.led_patches(mounted.camera, mounted.pose(pose), recipe.windows, mounted.pose(main)),
+        exposure_s,
+        [(window, variance_e2(recipe.sensor, image, exposure_s)) for window, image in expected],
+        [spot["led"] for spot in spots],
+        float(np.median(np.linalg.norm(renderer.scene.leds.centers_m - position, axis=1))),
+        recipe.accelerometer.error_deg,
+        recipe.windows is not None and recipe.windows.overscan,
+    )
+    return None if bound is None else bound.ravel().tolist()
 
 
 def poses_of_frame(recipe: Recipe, scene: Scene, frame: int) -> tuple[Pose, tuple[Pose, ...]]:
@@ -113,8 +144,10 @@ def _balance(camera: Camera, sensor: Sensor, scene: Scene) -> tuple[float, float
 
 
 @cache
-def _renderers(recipe_json: str, scene_json: str, scene_folder: str) -> tuple[Recipe, tuple[Renderer, ...]]:
-    """One renderer a process and plan, or one for each colour of a mosaic."""
+def _renderer(recipe_json: str, scene_json: str, scene_folder: str) -> tuple[Recipe, Renderer | MosaicRenderer]:
+    """One renderer a process and plan."""
     scene = build_scene(SceneSettings.model_validate_json(scene_json), "scene", Path(scene_folder))
     recipe, light = Recipe.model_validate_json(recipe_json), bake(scene)
-    return recipe, tuple(Renderer(scene, light, detector) for detector in detectors(recipe.sensor))
+    of_colours = tuple(Renderer(scene, light, detector) for detector in detectors(recipe.sensor))
+    mosaic = recipe.sensor.mosaic
+    return recipe, of_colours[0] if mosaic == "none" else MosaicRenderer(of_colours, mosaic)

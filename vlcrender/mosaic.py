@@ -1,13 +1,18 @@
 """A mosaic of colour filters on the pixels: each pixel sees the view through its own."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vlcrender.camera import Camera, Pose
 from vlcrender.quantum_efficiency import COLOURS
-from vlcrender.view import Image, LedPatch, Reflection, View, ViewPart
-from vlcrender.windows import Window
+from vlcrender.render import Renderer
+from vlcrender.scene import Scene
+from vlcrender.view import LedPatch, View, ViewPart
+from vlcrender.windows import LedWindows, Window
 
 
 def colour_of_pixels(mosaic: str, window: Window) -> NDArray[np.intp]:
@@ -19,37 +24,55 @@ def colour_of_pixels(mosaic: str, window: Window) -> NDArray[np.intp]:
     return pixels
 
 
-def mosaicked(views: Sequence[View], mosaic: str) -> View:
-    """What a sensor with a mosaic has of a view; `views` are one of all pixels under each of COLOURS.
+@dataclass(frozen=True)
+class MosaicRenderer:
+    """Renders views through a mosaic: whole ones under each of COLOURS, of which each pixel takes its own.
 
-    They include the lens's blur, which comes before the filters.
+    So the lens's blur comes before the filters.
     """
-    parts = []
-    for of_colours in zip(*(view.parts for view in views), strict=True):
-        first = of_colours[0]
-        background = _picked([part.background_e_per_s for part in of_colours], mosaic, first.window)
-        patches = tuple(
-            LedPatch(
-                led_id=same[0].led_id,
-                center_px=same[0].center_px,
-                row=same[0].row,
-                column=same[0].column,
-                electrons_per_s=_picked([patch.electrons_per_s for patch in same], mosaic, same[0].window),
-                visible_fraction=same[0].visible_fraction,
-                imaged_fraction=same[0].imaged_fraction,
-            )
-            for same in zip(*(part.patches for part in of_colours), strict=True)
-        )
-        reflections = tuple(
-            Reflection(r.led_id, r.row, r.column, r.electrons_per_s * (colour_of_pixels(mosaic, r.window) == colour))
-            for colour, part in enumerate(of_colours)
-            for r in part.reflections
-        )
-        parts.append(ViewPart(first.window, background, patches, reflections))
-    return View(tuple(parts))
 
+    of_colours: tuple[Renderer, ...]
+    mosaic: str
 
-def _picked(images: Sequence[Image], mosaic: str, window: Window) -> Image:
-    """Of each pixel of a window the image of its colour."""
-    picked: Image = np.take_along_axis(np.stack(images), colour_of_pixels(mosaic, window)[None], axis=0)[0]
-    return picked
+    @property
+    def scene(self) -> Scene:
+        """What is rendered."""
+        return self.of_colours[0].scene
+
+    def view(
+        self, camera: Camera, pose: Pose, windows: LedWindows | None = None, during: Sequence[Pose] | None = None
+    ) -> View:
+        """As `Renderer.view`."""
+        views = [renderer.view(camera, pose, windows, during) for renderer in self.of_colours]
+        return View(tuple(map(self._part, zip(*(view.parts for view in views), strict=True))))
+
+    def led_patches(
+        self, camera: Camera, pose: Pose, windows: LedWindows | None = None, blurred_at: Pose | None = None
+    ) -> tuple[LedPatch, ...]:
+        """As `Renderer.led_patches`."""
+        return self._patches([r.led_patches(camera, pose, windows, blurred_at) for r in self.of_colours])
+
+    def _part(self, parts: Sequence[ViewPart]) -> ViewPart:
+        window = parts[0].window
+        return ViewPart(
+            window,
+            self._picked([part.background_e_per_s for part in parts], window),
+            self._patches([part.patches for part in parts]),
+            tuple(
+                replace(r, electrons_per_s=r.electrons_per_s * (colour_of_pixels(self.mosaic, r.window) == colour))
+                for colour, part in enumerate(parts)
+                for r in part.reflections
+            ),
+        )
+
+    def _patches(self, of_colours: Sequence[Sequence[LedPatch]]) -> tuple[LedPatch, ...]:
+        return tuple(
+            replace(same[0], electrons_per_s=self._picked([p.electrons_per_s for p in same], same[0].window))
+            for same in zip(*of_colours, strict=True)
+        )
+
+    def _picked(self, images: Sequence[NDArray[Any]], window: Window) -> NDArray[Any]:
+        """Of each pixel of a window the image of its colour."""
+        colours = colour_of_pixels(self.mosaic, window)[None]
+        picked: NDArray[Any] = np.take_along_axis(np.stack(images), colours, axis=0)[0]
+        return picked

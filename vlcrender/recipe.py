@@ -44,6 +44,8 @@ class Recipe(Settings):
     """Whether the noise-free images are written too."""
     processed: Processed | None = None
     """Whether pictures as a phone makes them are written too, and how."""
+    bound: bool = False
+    """Whether each frame's Cramér-Rao bound is computed: some seconds for a full frame of many LEDs."""
     camera: Camera = Camera()
     sensor: Sensor = Sensor()
     accelerometer: Accelerometer = Accelerometer()
@@ -76,6 +78,14 @@ class Recipe(Settings):
                 raise ValueError(
                     f"rig: {name!r} is the name of more than one camera (the one under camera is {MAIN!r})"
                 )
+        return self
+
+    @model_validator(mode="after")
+    def _bounds_are_of_noisy_cameras_at_rest(self) -> Self:
+        if self.bound and self.motion is not None:
+            raise ValueError("bound = true: is for cameras at rest; leave out [motion]")
+        if self.bound and self.sensor.noise == "none":
+            raise ValueError('bound = true: without noise there is none; sensor.noise must not be "none"')
         return self
 
     @model_validator(mode="after")

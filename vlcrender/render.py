@@ -94,17 +94,10 @@ class Renderer:
         for place in places:
             check_inside(self.scene, place)
         kernels = self._kernels(camera, pose)
-        spread = max((kernel.shape[0] // 2 for kernel in kernels.values() if kernel is not None), default=0)
+        spread = _spread(kernels)
         images = [dict(self._led_images(camera, place, windows, spread)) for place in places]
-        lit = {i: window.grown(_radius(kernels[i])) for i, window in _around(images).items()}
-        sensor = Window.of_sensor(camera)
-        if windows is None:
-            frames: tuple[Window, ...] = (sensor,)
-            lit = {i: window.common(sensor) for i, window in lit.items() if sensor.overlaps(window)}
-        else:
-            if not windows.overscan:
-                lit = {i: window.common(sensor) for i, window in lit.items() if sensor.overlaps(window)}
-            frames = led_windows(lit.values(), camera, windows)
+        lit = _lit_windows(camera, images, kernels, windows)
+        frames = (Window.of_sensor(camera),) if windows is None else led_windows(lit.values(), camera, windows)
         _check_size(frames, camera)
         backgrounds, reflections = self._rooms(camera, places, frames, images, spread, kernels)
         patches = self._patches(camera, pose, images, lit, kernels)
@@ -119,6 +112,17 @@ class Renderer:
                 for frame, background in zip(frames, backgrounds, strict=True)
             )
         )
+
+    def led_patches(
+        self, camera: Camera, pose: Pose, windows: LedWindows | None = None, blurred_at: Pose | None = None
+    ) -> tuple[LedPatch, ...]:
+        """The LEDs' own light alone: the patches of `view` in double precision, without the room behind them.
+
+        Blurred as at the pose `blurred_at` where given: kernels change in steps of depth, which differences would see.
+        """
+        kernels = self._kernels(camera, blurred_at or pose)
+        images = [dict(self._led_images(camera, pose, windows, _spread(kernels)))]
+        return self._patches(camera, pose, images, _lit_windows(camera, images, kernels, windows), kernels, np.float64)
 
     def background_cd_m2(self, camera: Camera, pose: Pose) -> Image:
         """Luminance of the room times relative illumination, mean over each pixel, (height, width); sharp, no LEDs."""
@@ -209,6 +213,7 @@ class Renderer:
         images: Sequence[Mapping[int, _Lit]],
         lit: Mapping[int, Window],
         kernels: Mapping[int, Array | None],
+        precision: type[np.floating] = np.float32,
     ) -> tuple[LedPatch, ...]:
         """The LEDs' own light, the mean over the images at several poses."""
         leds = self.scene.leds
@@ -234,7 +239,7 @@ class Renderer:
                     center_px=(float(center_px[i, 0]), float(center_px[i, 1])),
                     row=window.row,
                     column=window.column,
-                    electrons_per_s=np.ascontiguousarray(spread, dtype=np.float32),
+                    electrons_per_s=np.ascontiguousarray(spread, dtype=precision),
                     visible_fraction=sum(image.visible_fraction for image in seen) / len(images),
                     imaged_fraction=sum(image.imaged_fraction for image in seen) / len(images),
                 )
@@ -376,6 +381,25 @@ def _around(images: Sequence[Mapping[int, _Lit]]) -> dict[int, Window]:
         for i, image in of_pose.items():
             lit[i] = lit[i].around(image.window) if i in lit else image.window
     return dict(sorted(lit.items()))
+
+
+def _lit_windows(
+    camera: Camera,
+    images: Sequence[Mapping[int, _Lit]],
+    kernels: Mapping[int, Array | None],
+    windows: LedWindows | None,
+) -> dict[int, Window]:
+    """The pixels of the view that each LED lights, blur included, by the LED's index."""
+    lit = {i: window.grown(_radius(kernels[i])) for i, window in _around(images).items()}
+    if windows is not None and windows.overscan:
+        return lit
+    sensor = Window.of_sensor(camera)
+    return {i: window.common(sensor) for i, window in lit.items() if sensor.overlaps(window)}
+
+
+def _spread(kernels: Mapping[int, Array | None]) -> int:
+    """How far light is blurred at most, pixels."""
+    return max(map(_radius, kernels.values()), default=0)
 
 
 def _radius(kernel: Array | None) -> int:
