@@ -39,9 +39,12 @@ def exposed(sensor: Sensor, mean: float, key: str = "a", exposure_s: float = 0.0
     return (image.astype(float) - sensor.black_level_dn) * sensor.gain_at_iso_e_per_dn
 
 
-def test_without_a_term_it_is_shot_noise_alone() -> None:
-    means = np.linspace(0, 3000, N, dtype=np.float32).reshape(ROWS, COLUMNS)
-    assert np.array_equal(expose(Sensor(noise="full"), means, "a"), expose(Sensor(), means, "a"))
+@pytest.mark.parametrize("gain", [0.5, 1.0, 2.0, 4.0])
+def test_without_a_term_it_is_shot_noise_alone(gain: float) -> None:
+    """Halves included, which go to the even number before the black level is added."""
+    means = np.linspace(0, 7000, N, dtype=np.float32).reshape(ROWS, COLUMNS)
+    shot, full = (Sensor(noise=noise, gain_e_per_dn=gain, black_level_dn=63) for noise in ("shot", "full"))
+    assert np.array_equal(expose(full, means, "a"), expose(shot, means, "a"))
 
 
 # Variance of the variance of n normal numbers: 2 sigma^4 / (n - 1); of Poisson numbers (2 mu^2 + mu) / n. Five sigma.
@@ -176,6 +179,34 @@ def test_the_variance_told_is_the_variance_had() -> None:
     assert abs(electrons.mean() - (mean + 100)) < 5 * np.sqrt(expected / n)
     assert abs(electrons.var(ddof=1) - expected) < 5 * np.sqrt(2 / n) * expected  # nearly normal: excess 1 / 800
     assert np.isinf(variance_e2(EVERYTHING, np.full((1, 1), 5950, dtype=np.float32), 0.2)).all()
+
+
+@pytest.mark.parametrize(
+    ("term", "mean", "lines"),
+    [
+        ({"prnu": 0.2}, 200.0, 0),
+        ({"dark_current_e_s": 50.0}, 0.0, 0),
+        ({"dsnu_e": 5.0}, 0.0, 0),
+        ({"read_noise_e": 5.0}, 0.0, 0),
+        ({"adc_noise_dn": 8.0}, 0.0, 0),
+        ({"row_offset_e": 5.0}, 0.0, ROWS // 4),
+        ({"column_offset_e": 5.0}, 0.0, COLUMNS // 4),
+    ],
+    ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
+)
+def test_a_binned_sensor_has_the_noise_of_the_sums(term: dict[str, float], mean: float, lines: int) -> None:
+    fine = Sensor(**FINE, **term, black_level_dn=2000, serial=1)
+    sums = exposed(fine, mean, "fine", 2.0).reshape(ROWS // 4, 4, COLUMNS // 4, 4).sum(axis=(1, 3))
+    small = fine.binned(4)
+    binned = exposed(small, 16 * mean, "binned", 2.0)
+    n = lines or sums.size  # offsets: as many draws as lines
+    expected = float(variance_e2(small, np.full((1, 1), 16 * mean, dtype=np.float32), 2.0)[0, 0])
+    # The sums are of finer numbers, of whose rounding there is less: both variances, 5 sigma each.
+    for sample, rounding in ((sums, 16 * ROUNDING_E2), (binned, 256 * ROUNDING_E2)):
+        v = expected - 256 * ROUNDING_E2 + rounding
+        assert abs(sample.var() - v) < 5 * np.sqrt(2 / (n - 1)) * v
+        assert abs(sample.mean() - 16 * mean - small.dark_electrons(2.0)) < 5 * np.sqrt(v / n)
+    assert small.white_dn == fine.white_dn
 
 
 def patterns(serial: int, camera: str = "main") -> np.ndarray:

@@ -85,7 +85,7 @@ def _full_chain(
         of_column, _ = normals(seed_of(f"{individual}/columns"), column, mi.UInt32(0))
         electrons = electrons + number(sensor.dark_noise_e) * noise
         electrons = electrons + number(sensor.row_offset_e) * of_row + number(sensor.column_offset_e) * of_column
-        level = dr.round(electrons / number(sensor.gain_at_iso_e_per_dn) + number(sensor.black_level_dn))  # 9
+        level = dr.round(electrons / number(sensor.gain_at_iso_e_per_dn)) + number(sensor.black_level_dn)  # 8 and 9
         dn: Any = mi.UInt32(dr.clip(level, 0.0, number(sensor.largest_dn)))
         dr.eval(dn)
     image: NDArray[np.uint32] = dn.numpy().reshape(expected_e.shape)
