@@ -23,6 +23,7 @@ bench: $(READY)
 	$(BIN)/python benchmarks/full_frame.py
 	$(BIN)/python benchmarks/windows.py
 	$(BIN)/python benchmarks/errors.py
+	$(BIN)/python benchmarks/sensor.py
 	$(BIN)/python benchmarks/memory.py
 
 $(READY): requirements.txt pyproject.toml
