@@ -122,7 +122,7 @@ ERRORS = [
     (["run", "{tmp}/nowhere"], "nowhere: no such folder"),
     (["run", "{tmp}"], "not a dataset"),
     (["run"], "DATASET"),
-    (["run", "{data}", "--variant", "best"], "--variant best: unknown; allowed: huynh2016, huynh2016-as-printed, pnp"),
+    (["run", "{data}", "--variant", "best"], "variant best: unknown; allowed: huynh2016, huynh2016-as-printed, pnp"),
     (["run", "{data}", "--variant"], "--variant"),
     (["run", "{data}", "more"], "more"),
     (["run", "{data}", "--fast"], "--fast"),

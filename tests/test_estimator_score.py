@@ -10,10 +10,15 @@ from estimator_synthetic import small_dataset
 from estimator.dataset import Led
 from estimator.errors import InputError
 from estimator.estimates import EstimateRow, LedRange, write_estimates
-from estimator.score import Scores, length_text, read_or_score, score_dataset, score_variant
+from estimator.score import Scores, read_or_score, score_dataset, score_variant
+from estimator.truth import TruthRow
 
 LEDS = {10: Led(id=10, position_m=(1.0, 2.0, 3.5), radius_m=0.01, shape="disc")}
 TRUTH = (1.0, 2.0, 0.5)
+
+
+def truths(count: int, bound_m2: tuple[float, ...] | None = None) -> list[TruthRow]:
+    return [TruthRow(frame=frame, position_m=TRUTH, bound_m2=bound_m2) for frame in range(count)]
 
 
 def ok(frame: int, position: tuple[float, float, float], *ranges_m: float, time_s: float = 0.1) -> EstimateRow:
@@ -28,7 +33,7 @@ def failed(frame: int, reason: str, *ranges_m: float) -> EstimateRow:
 
 def test_errors_of_a_frame_by_hand() -> None:
     """(0.03, 0.04, -0.12) off: 0.05 m horizontal, 0.12 m too low, 0.13 m in all; the LED is 3 m above the camera."""
-    score = score_variant("x", [ok(0, (1.03, 2.04, 0.38), 3.02)], [TRUTH], LEDS)
+    score = score_variant("x", [ok(0, (1.03, 2.04, 0.38), 3.02)], truths(1), LEDS)
     (row,) = score.rows
     assert row.horizontal_error_m == pytest.approx(0.05)
     assert row.vertical_error_m == pytest.approx(-0.12)
@@ -44,7 +49,7 @@ def test_a_summary_by_hand() -> None:
     rows = [
         ok(i, (1.0, 2.0, 0.5 + h), time_s=t) for i, (h, t) in enumerate(zip(heights, (0.1, 0.2, 0.2, 5), strict=True))
     ]
-    score = score_variant("x", rows, [TRUTH] * 4, LEDS)
+    score = score_variant("x", rows, truths(4), LEDS)
     summary = score.error_3d
     assert summary is not None
     assert summary.median_m == pytest.approx(2.5)
@@ -55,12 +60,12 @@ def test_a_summary_by_hand() -> None:
     assert score.horizontal is not None
     assert score.horizontal.max_m == pytest.approx(0)
     assert score.median_time_s == pytest.approx(0.2)
-    assert score.median_range_error_m is None
+    assert score.range_error is None
 
 
 def test_failures_are_counted_by_reason_and_stay_in_the_rows() -> None:
     rows = [failed(0, "a: x", 4.0), ok(1, TRUTH, 3.1), failed(2, "b: y", 3.5), failed(3, "a: x")]
-    score = score_variant("x", rows, [TRUTH] * 4, LEDS)
+    score = score_variant("x", rows, truths(4), LEDS)
     assert (score.frames, score.ok, score.failed) == (4, 1, 3)
     assert score.failures == {"a: x": 2, "b: y": 1}
     assert [row.reason for row in score.rows] == ["a: x", "", "b: y", "a: x"]
@@ -68,11 +73,12 @@ def test_failures_are_counted_by_reason_and_stay_in_the_rows() -> None:
     assert score.error_3d.max_m == 0
     # Ranges of failed frames count: errors 1.0, 0.1 and 0.5 m.
     assert score.ranges == 3
-    assert score.median_range_error_m == pytest.approx(0.5)
+    assert score.range_error is not None
+    assert score.range_error.median_m == pytest.approx(0.5)
 
 
 def test_without_a_success_there_is_no_summary() -> None:
-    score = score_variant("x", [failed(0, "a: x")], [TRUTH], LEDS)
+    score = score_variant("x", [failed(0, "a: x")], truths(1), LEDS)
     assert (score.error_3d, score.horizontal, score.vertical, score.median_time_s) == (None, None, None, None)
 
 
@@ -136,16 +142,3 @@ def test_what_cannot_be_scored_is_named(tmp_path: Path) -> None:
     (folder / "truth.parquet").unlink()
     with pytest.raises(InputError, match=r"truth.parquet: no such file"):
         score_dataset(folder)
-
-
-def test_lengths_for_people() -> None:
-    lengths = [None, 0.0, 1.234e-5, 0.0123456, 0.5, 12.345, 4.2e7]
-    assert [length_text(length) for length in lengths] == [
-        "–",
-        "0 µm",
-        "12.3 µm",
-        "12.3 mm",
-        "500 mm",
-        "12.3 m",
-        "4.2e+07 m",
-    ]
