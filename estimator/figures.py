@@ -9,13 +9,14 @@ from estimator.score_table import length_text
 from estimator.svg import cross, line, mark, picture, text
 
 WIDTH = 960
-LEFT, RIGHT, TOP, BOTTOM = 72, 16, 12, 40
+LEFT, RIGHT, TOP, BOTTOM = 72, 28, 12, 40
 INNER = WIDTH - LEFT - RIGHT
 HEIGHT = 300
 """Of the axes; a variant's lane of failures has LANE more."""
 LANE = 12
 SMALLEST_SHOWN_M = 1e-6
 MOST_LABELS = 12
+MOST_LARGE_MARKS = 1000
 SHARES = (0, 25, 50, 75, 95, 100)
 
 
@@ -64,6 +65,7 @@ def error_plot(variants: Sequence[VariantScore]) -> str:
     def y(error_m: float) -> float:
         return TOP + HEIGHT * (1 - decades.share(error_m))
 
+    radius = 3 if frames * len(variants) <= MOST_LARGE_MARKS else 2
     parts = []
     for decade_m in decades.labelled_m():
         parts.append(line(LEFT, y(decade_m), WIDTH - RIGHT, y(decade_m), "rule"))
@@ -82,7 +84,7 @@ def error_plot(variants: Sequence[VariantScore]) -> str:
                 parts.append(cross(x(row.frame), lane_y, index, f"{place}: {row.reason}"))
             else:
                 title = f"{place}: {length_text(row.error_3d_m)}"
-                parts.append(mark(x(row.frame), y(row.error_3d_m), 3, index, title))
+                parts.append(mark(x(row.frame), y(row.error_3d_m), radius, index, title))
     half = min(0.4 * INNER / max(frames, 1), 8.0)
     ledges = [f"M{x(frame) - half:.1f} {y(size_m):.1f}h{2 * half:.1f}" for frame, size_m in frames_with_bound(variants)]
     if ledges:

@@ -27,12 +27,13 @@ MOST_PREVIEWS = 12
 MOST_LARGE_PLANS = 6
 
 STYLE = """
-:root { color-scheme: light dark; --ink: #1c2024; --soft: #667078; --line: #dde2e6; --paper: #fff; --back: #f4f6f8; }
+:root { color-scheme: light dark; --ink: #1c2024; --soft: #667078; --line: #dde2e6; --paper: #fff; --back: #f4f6f8;
+  --see: .75; }
 @media (prefers-color-scheme: dark) {
-  :root { --ink: #e6e9ec; --soft: #9aa4ad; --line: #363d44; --paper: #1d2126; --back: #14171a; }
+  :root { --ink: #e6e9ec; --soft: #9aa4ad; --line: #363d44; --paper: #1d2126; --back: #14171a; --see: 1; }
 }
 * { box-sizing: border-box; }
-body { margin: 0 auto; max-width: 1200px; padding: 32px 20px 64px; background: var(--back); color: var(--ink);
+body { margin: 0 auto; max-width: 1320px; padding: 32px 20px 64px; background: var(--back); color: var(--ink);
   font: 15px/1.5 system-ui, sans-serif; }
 h1 { font-size: 26px; margin: 0 0 4px; }
 h2 { font-size: 21px; margin: 48px 0 4px; }
@@ -45,11 +46,13 @@ table { border-collapse: collapse; width: 100%; font-size: 14px; font-variant-nu
 th { color: var(--soft); font-weight: 500; font-size: 13px; vertical-align: bottom; }
 th, td { padding: 5px 10px; text-align: right; white-space: nowrap; border-bottom: 1px solid var(--line); }
 tbody tr:last-child td { border-bottom: 0; }
-tr > :first-child { position: sticky; left: 0; background: var(--paper); padding-left: 18px; }
+tr > :first-child { position: sticky; left: 0; background: var(--paper); }
 tr > :last-child { padding-right: 18px; }
 small { display: block; color: var(--soft); font-size: 11.5px; font-weight: 400; }
 .text { text-align: left; }
-.wrap { white-space: normal; }
+.wrap, tr > td:first-child { white-space: normal; }
+tr > :first-child { min-width: 215px; padding-left: 37px; text-indent: -19px; }
+tr > th:first-child { text-indent: 0; padding-left: 18px; }
 .failed { color: #d03b3b; font-weight: 600; }
 svg.key { display: inline-block; width: 12px; height: 12px; margin-right: 7px; vertical-align: -1px; }
 .name { margin-right: 18px; white-space: nowrap; }
@@ -65,8 +68,9 @@ svg .led { fill: #e8b100; stroke: none; }
 svg .rule { stroke: var(--line); }
 svg .truth { fill: none; stroke: var(--ink); }
 svg path { fill: none; stroke-width: 1.6; }
-svg .bound { stroke: var(--ink); stroke-width: 1.6; }
-svg .mark { fill-opacity: .75; stroke: none !important; }
+svg .bound { stroke: var(--ink); stroke-width: 2; }
+svg .mark { fill-opacity: var(--see); stroke: none !important; }
+svg.key .mark { fill-opacity: 1; }
 """
 
 
@@ -109,7 +113,7 @@ def _dataset(folder: Path, scores: Scores) -> str:
         f'<span class="name">{_name(scores, index)}</span>' for index, variant in enumerate(scores.variants)
     )
     bounded = len(frames_with_bound(scores.variants))
-    of_frames = f" Black ledges: the Cramér-Rao bound, on {bounded} of {frames} frames." if bounded else ""
+    of_frames = f" Ledges: the Cramér-Rao bound, on {bounded} of {frames} frames." if bounded else ""
     of_all = " Upright line: the bound's root mean square." if bounded else ""
     return f"""<section>
 <h2>{escape(scores.dataset)}</h2>
@@ -176,6 +180,8 @@ def _folded(headers: Sequence[str], cells: Sequence[str], tag: str) -> str:
     folded: list[str] = []
     for header, cell in zip(headers, cells, strict=True):
         if header.endswith("interval"):
+            if cell == "–":
+                continue
             folded[-1] = folded[-1].removesuffix(f"</{tag}>") + f"<small>{escape(cell)}</small></{tag}>"
         else:
             kind = ' class="failed"' if header == "failed" and cell not in ("0", header) else ""
@@ -202,7 +208,9 @@ def _outside_note(scores: Scores, variant: VariantScore) -> str:
 
 
 def _name(scores: Scores, index: int) -> str:
-    return f"{key(index)}{escape(scores.variants[index].variant)}"
+    """A variant's mark and name, which may be broken before its options."""
+    name = escape(scores.variants[index].variant)
+    return key(index) + name.replace(":", ":<wbr>").replace(",", ",<wbr>")
 
 
 def _previews(folder: Path) -> str:

@@ -63,7 +63,8 @@ def limit_cells(score: VariantScore) -> tuple[str, ...]:
         verdict = "" if honesty.within else " (too sure)" if honesty.mean > honesty.high else " (too modest)"
         interval = f"{honesty.low:.3g} to {honesty.high:.3g}"
         of_nees = (f"{honesty.mean:.3g}{verdict}", interval, str(honesty.frames))
-    return (*of_bound, *of_nees, f"{score.ambiguous} ({share_text(score.ambiguous, score.ok)})")
+    share = f" ({share_text(score.ambiguous, score.ok)})" if score.ambiguous else ""
+    return (*of_bound, *of_nees, f"{score.ambiguous}{share}")
 
 
 def pair_cells(pair: Comparison) -> tuple[str, ...]:

@@ -82,6 +82,49 @@ def test_without_a_success_there_is_no_summary() -> None:
     assert (score.error_3d, score.horizontal, score.vertical, score.median_time_s) == (None, None, None, None)
 
 
+def test_the_bound_is_held_against_the_frames_that_have_it_and_succeeded() -> None:
+    """Errors 3, 4 and 12 mm; bounds of 6 mm on frames 1 and 3, of which 3 failed: 6 / 4."""
+    x, y, z = TRUTH
+    rows = [ok(0, (x + 0.003, y, z)), ok(1, (x, y + 0.004, z)), ok(2, (x, y, z + 0.012)), failed(3, "a: x")]
+    bound_m2 = (12e-6, 0.0, 0.0, 0.0, 12e-6, 0.0, 0.0, 0.0, 12e-6)
+    truth = [row.model_copy(update={"bound_m2": bound_m2 if row.frame % 2 else None}) for row in truths(4)]
+    score = score_variant("x", rows, truth, LEDS)
+    assert score.against_bound is not None
+    assert score.against_bound.frames == 1
+    assert score.against_bound.efficiency == pytest.approx(1.5)
+    assert [row.bound_m for row in score.rows] == [None, pytest.approx(0.006), None, pytest.approx(0.006)]
+
+
+def test_reported_covariances_and_ambiguity_are_counted() -> None:
+    """An error of one and of two standard deviations: 1 and 4, mean 2.5; the third frame says nothing of itself."""
+    x, y, z = TRUTH
+    covariance_m2 = (1e-4, 0.0, 0.0, 0.0, 1e-4, 0.0, 0.0, 0.0, 1e-4)
+    rows = [ok(k, (x + 0.01 * (k + 1), y, z)).model_copy(update={"covariance_m2": covariance_m2}) for k in range(2)]
+    rows.append(ok(2, TRUTH).model_copy(update={"ambiguous": True}))
+    score = score_variant("x", rows, truths(3), LEDS)
+    assert score.nees is not None
+    assert (score.nees.frames, score.nees.mean) == (2, pytest.approx(2.5))
+    assert [row.nees for row in score.rows] == [pytest.approx(1), pytest.approx(4), None]
+    assert (score.ambiguous, score.coverage) == (1, 1.0)
+
+
+def test_to_fail_the_worst_frames_costs_coverage_and_gains_nothing() -> None:
+    """The ok frames' own summary falls to a tenth; what counts all frames does not."""
+    x, y, z = TRUTH
+    rows = [ok(k, (x + (0.01 if k < 15 else 1.0), y, z)) for k in range(20)]
+    honest = score_variant("x", rows, truths(20), LEDS)
+    dropped = score_variant("x", [*rows[:15], *(failed(k, "a: too hard") for k in range(15, 20))], truths(20), LEDS)
+    assert honest.error_3d is not None
+    assert dropped.error_3d is not None
+    assert dropped.error_3d.rmse_m < honest.error_3d.rmse_m / 10
+    assert (honest.coverage, dropped.coverage) == (1.0, 0.75)
+    assert honest.of_all is not None
+    assert dropped.of_all is not None
+    assert dropped.of_all.median_m == pytest.approx(0.01)
+    assert (honest.of_all.p95_m, dropped.of_all.p95_m) == (pytest.approx(1.0), None)
+    assert dropped.frames == honest.frames == len(dropped.rows)
+
+
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = small_dataset(tmp_path_factory.mktemp("scored"))
