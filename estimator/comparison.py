@@ -2,7 +2,6 @@
 
 import numpy as np
 from pydantic import Field
-from scipy.stats import wilcoxon
 
 from estimator.score import VariantScore
 from estimator.summary import Interval, median_interval
@@ -45,8 +44,14 @@ def compare(a: VariantScore, b: VariantScore) -> Comparison:
         b_nearer=sum(difference_m > 0 for difference_m in differences_m),
         median_difference_m=float(np.median(differences_m)) if differences_m else None,
         interval=median_interval(differences_m),
-        wilcoxon_p=float(wilcoxon(differences_m).pvalue) if any(differences_m) else None,
+        wilcoxon_p=_signed_rank_p(differences_m) if any(differences_m) else None,
     )
+
+
+def _signed_rank_p(differences_m: list[float]) -> float:
+    from scipy.stats import wilcoxon  # as in estimator.summary
+
+    return float(wilcoxon(differences_m).pvalue)
 
 
 def best(variants: tuple[VariantScore, ...]) -> VariantScore:

@@ -5,7 +5,6 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy.stats import bootstrap, chi2
 
 from estimator.tables import Number, Row, Size
 
@@ -126,6 +125,9 @@ def _interval(values_m: Sequence[float], statistic: Callable[..., Floats]) -> In
     """
     if len(values_m) < 2:
         return None
+    # Here and below: its import takes a second, which commands that score nothing are spared.
+    from scipy.stats import bootstrap
+
     result = bootstrap(
         (np.array(values_m, dtype=np.float64),),
         statistic,
@@ -164,6 +166,8 @@ def nees(squares: Sequence[float]) -> Nees | None:
     """Mean and interval of `e^T C^-1 e` over frames; None without any."""
     if not squares:
         return None
+    from scipy.stats import chi2
+
     count = len(squares)
     low, high = (float(limit) / count for limit in chi2.interval(NEES_CONFIDENCE, 3 * count))
     mean = float(np.mean(squares))

@@ -64,6 +64,17 @@ def test_score_prints_json(dataset: Path, capsys: pytest.CaptureFixture[str]) ->
     assert {v["variant"]: v["ok"] for v in scores["variants"]}["pnp"] == 3
 
 
+def test_compare_prints_a_line_a_number(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The corrected paper against itself as printed, which answers no frame of these."""
+    assert main(["compare", str(dataset), "huynh2016", "huynh2016-as-printed"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "A = huynh2016, B = huynh2016-as-printed"
+    cells = {line[:15].strip(): line[15:].strip() for line in lines[1:]}
+    assert (cells["both"], cells["only A"], cells["neither"], cells["Wilcoxon p"]) == ("0", "3", "0", "–")
+    assert main(["compare", str(dataset), "huynh2016", "pnp", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["both"] == 3
+
+
 class Page(HTMLParser):
     """Collects what a page refers to, and checks that its elements close."""
 
@@ -130,6 +141,12 @@ ERRORS = [
     (["--fast"], "--fast"),
     (["score", "{tmp}/nowhere"], "nowhere: no such folder"),
     (["score", "{data}", "--jsn"], "--jsn"),
+    (["run", "{data}", "--workers", "0"], "--workers 0: is not 1 or more"),
+    (["run", "{data}", "--workers", "many"], "--workers"),
+    (["compare", "{data}", "pnp"], "B"),
+    (["compare", "{data}", "pnp", "pnp"], "pnp and pnp: needed two different variants"),
+    (["compare", "{data}", "pnp", "best"], "none of variant best; there are: huynh2016, huynh2016-as-printed, pnp"),
+    (["compare", "{tmp}/nowhere", "pnp", "huynh2016"], "nowhere: no such folder"),
     (["report", "--out", "{tmp}/x.html"], "DATASETS"),
     (["report", "{data}"], "--out"),
     (["report", "{data}", "--out", "{tmp}"], "is a folder"),

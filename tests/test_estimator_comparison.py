@@ -60,3 +60,5 @@ def test_the_best_is_nearest_over_all_frames() -> None:
     choosy, steady, lost = scored("a", [0.0, None, None]), scored("b", [1.0] * 3), scored("c", [None] * 3)
     assert best((choosy, steady, lost)) is steady
     assert best((lost, choosy)) is choosy
+    nearer = scored("d", [0.1, 0.1, None])
+    assert best((steady, nearer)) is nearer

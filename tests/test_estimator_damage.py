@@ -15,6 +15,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from estimator.cli import main
+from estimator.errors import InputError
+from estimator.estimates import write_estimates
 
 
 @pytest.fixture(scope="module")
@@ -182,3 +184,10 @@ def test_a_name_with_options_comes_back_from_disk(folder: Path, capsys: pytest.C
     assert main(["compare", str(folder), "pnp", name, "--json"]) == 0
     pair = json.loads(capsys.readouterr().out)
     assert (pair["b"], pair["both"], pair["a_nearer"], pair["wilcoxon_p"]) == (name, 3, 0, None)
+
+
+@pytest.mark.parametrize("name", ["", ".hidden", "../x", "a/b", "a b", "a\nb", "é", "x" * 201])
+def test_a_name_that_no_file_should_have_is_not_written(tmp_path: Path, name: str) -> None:
+    with pytest.raises(InputError, match="the name becomes a file's; allowed: at most 200 of A-Z"):
+        write_estimates(tmp_path, name, [])
+    assert list(tmp_path.iterdir()) == []
