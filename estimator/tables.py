@@ -31,8 +31,8 @@ Triple = Annotated[tuple[Number, Number, Number], Strict(False)]
 SMALLEST_VARIANCE = 1e-60
 """A covariance below this would overflow where an error is measured by it."""
 MOST_ASYMMETRY = 1e-6
-LEAST_EIGENVALUE = 1e-12
-"""Of the correlations: below it the inverse, in double precision, is noise."""
+LEAST_EIGENVALUE = 1e-14
+"""Of the correlations: below it the inverse, in double precision, has not two digits left."""
 
 
 def is_covariance(values: Sequence[float]) -> bool:
