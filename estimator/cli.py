@@ -58,7 +58,8 @@ def variants() -> None:
     width = max(len(variant.name) for variant in usable)
     for variant in usable:
         source = registry.source(variant.name)
-        print(f"{variant.name:{width}}  {variant.summary}{source and f' (external: {source})'}")
+        summary = " ".join(variant.summary.split())  # one of a plug-in may have several lines
+        print(f"{variant.name:{width}}  {summary}{source and f' (external: {source})'}")
     _warn(complaints)
 
 

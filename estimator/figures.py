@@ -1,5 +1,6 @@
 """Errors as pictures: over the frames, and their distribution. Colours come from the page's style."""
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -70,7 +71,8 @@ def error_plot(variants: Sequence[VariantScore]) -> str:
     for decade_m in decades.labelled_m():
         parts.append(line(LEFT, y(decade_m), WIDTH - RIGHT, y(decade_m), "rule"))
         parts.append(text(LEFT - 8, y(decade_m) + 4, length_text(decade_m), "end"))
-    ticks = range(0, frames, max(1, math.ceil(frames / 12)))
+    steps = (digit * 10**decade for decade in itertools.count() for digit in (1, 2, 5))
+    ticks = range(0, frames, next(step for step in steps if MOST_LABELS * step >= frames))
     parts += [text(x(frame), bottom + 16, str(frame), "middle") for frame in ticks]
     parts.append(text(LEFT + INNER / 2, bottom + 34, "frame", "middle"))
     parts.append(text(LEFT - 20, (lanes_top + bottom) / 2 + 4, "failed", "end"))

@@ -110,6 +110,13 @@ def test_a_bad_plugin_is_one_line_and_the_others_run(
     assert output.err.count("\n") == 1
 
 
+def test_a_composition_is_taken_with_its_own_summary(install: Install, capsys: pytest.CaptureFixture[str]) -> None:
+    source = "from estimator.pipeline import Variant\nv = Variant('mine', 'Two\\nlines', print)"
+    install("composed", source, {"mine": "composed:v"})
+    assert main(["variants"]) == 0
+    assert capsys.readouterr().out.splitlines()[-1].split(maxsplit=1)[1] == "Two lines (external: composed 0.1)"
+
+
 def test_a_name_registered_twice_is_not_used(install: Install) -> None:
     install("one", GOOD, {"x": "one:f"})
     install("two", GOOD, {"x": "two:f"})

@@ -76,6 +76,13 @@ def test_the_axis_holds_errors_and_bounds_and_no_more_labels_than_fit() -> None:
     assert len(Decades(-6, 100).labelled_m()) <= 13
 
 
+@pytest.mark.parametrize(("frames", "step"), [(1, 1), (12, 1), (13, 2), (200, 20), (601, 100)])
+def test_frames_are_numbered_in_round_steps(frames: int, step: int) -> None:
+    svg = error_plot([scored([None] * frames)])
+    numbers = [int(n) for n in re.findall(r'text-anchor="middle">(\d+)</text>', svg)]
+    assert numbers == list(range(0, frames, step))
+
+
 def test_odd_scores_make_a_page_too(tmp_path: Path) -> None:
     """No variant, no frame, nothing answered, one perfect frame, an error beyond all bounds."""
     for variants in (
