@@ -201,12 +201,13 @@ class _Version(BaseModel):
 
 
 def read_or_score(folder: Path) -> Scores:
-    """scores.json where it is newer than all estimates and covers them, else new scores; raises InputError.
+    """scores.json where it is newer than the truth and all estimates, and covers them, else new scores.
 
-    An older version's scores are made again.
+    The truth need not be there where scores.json is. An older version's scores are made again. Raises InputError.
     """
     path, estimates = folder / "scores.json", _estimate_paths(folder)
-    if not path.exists() or any(estimate.stat().st_mtime > path.stat().st_mtime for estimate in estimates):
+    sources = [source for source in (*estimates, folder / "truth.parquet") if source.exists()]
+    if not path.exists() or any(source.stat().st_mtime > path.stat().st_mtime for source in sources):
         return score_dataset(folder)
     content = path.read_bytes()
     try:

@@ -4,6 +4,8 @@ import json
 import os
 from pathlib import Path
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from estimator_synthetic import small_dataset
 
@@ -165,6 +167,20 @@ def test_scores_are_made_again_only_where_estimates_are_newer_or_other(dataset: 
     write_estimates(dataset, "one", [ok(0, TRUTH), ok(1, TRUTH), ok(2, TRUTH)])
     os.utime(dataset / "estimates/one.parquet", (later, later))
     assert read_or_score(dataset).variants[0].ok == 3
+
+
+def test_scores_are_made_again_where_the_truth_is_newer(tmp_path: Path) -> None:
+    """As when a dataset is made again, with bounds."""
+    folder = small_dataset(tmp_path)
+    write_estimates(folder, "one", [ok(frame, TRUTH) for frame in range(3)])
+    assert score_dataset(folder).variants[0].rows[0].bound_m is None
+    table = pq.read_table(folder / "truth.parquet")
+    bounds = pa.array([[1e-6, 0, 0, 0, 1e-6, 0, 0, 0, 2e-6]] * 3, table.schema.field("bound_m2").type)
+    index = table.schema.get_field_index("bound_m2")
+    pq.write_table(table.set_column(index, "bound_m2", bounds), folder / "truth.parquet")
+    later = (folder / "scores.json").stat().st_mtime + 10
+    os.utime(folder / "truth.parquet", (later, later))
+    assert read_or_score(folder).variants[0].rows[0].bound_m == pytest.approx(2e-3)
 
 
 def test_what_cannot_be_scored_is_named(tmp_path: Path) -> None:
