@@ -1,4 +1,4 @@
-"""The commands `estimator variants | run | score | report`. Errors are one line on stderr and exit code 2."""
+"""The commands `estimator variants | run | score | compare | report`. Errors are one line on stderr and exit code 2."""
 
 import os
 import sys
@@ -14,15 +14,26 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from estimator.batch import estimate_dataset
+from estimator.comparison import compare as compare_variants
 from estimator.dataset import read_dataset
 from estimator.errors import InputError
 from estimator.estimates import write_estimates
 from estimator.files import write_atomically
-from estimator.pipeline import Variant
+from estimator.registry import Registry
 from estimator.report import page
-from estimator.score import TABLE_HEADERS, Scores, read_or_score, score_dataset, table_cells
-from estimator.variants import VARIANTS
+from estimator.score import Scores, read_or_score, score_dataset
+from estimator.score_table import (
+    ERROR_HEADERS,
+    ERROR_NOTE,
+    LIMIT_HEADERS,
+    LIMIT_NOTE,
+    PAIR_HEADERS,
+    PAIR_NOTE,
+    error_cells,
+    limit_cells,
+    pair_cells,
+)
+from estimator.workers import estimate_with_workers
 
 INTERNAL_ERROR = 1
 USER_ERROR = 2
@@ -41,14 +52,21 @@ app = App(
 
 @app.command
 def variants() -> None:
-    """List the named pipelines, a line each."""
-    width = max(len(name) for name in VARIANTS)
-    for variant in VARIANTS.values():
-        print(f"{variant.name:{width}}  {variant.summary}")
+    """List the named pipelines, a line each; those of other packages say whose they are."""
+    registry = Registry.read()
+    usable, complaints = registry.all()
+    width = max(len(variant.name) for variant in usable)
+    for variant in usable:
+        source = registry.source(variant.name)
+        summary = " ".join(variant.summary.split())  # one of a plug-in may have several lines
+        print(f"{variant.name:{width}}  {summary}{source and f' (external: {source})'}")
+    _warn(complaints)
 
 
 @app.command
-def run(dataset: Path, /, *, variant: Annotated[list[str] | None, Parameter(negative=())] = None) -> None:
+def run(
+    dataset: Path, /, *, variant: Annotated[list[str] | None, Parameter(negative=())] = None, workers: int = 1
+) -> None:
     """Estimate every frame's position and write DATASET/estimates/VARIANT.parquet.
 
     Parameters
@@ -57,13 +75,17 @@ def run(dataset: Path, /, *, variant: Annotated[list[str] | None, Parameter(nega
         Folder of a dataset.
     variant
         Pipeline to run, may be given several times; all of them when left out.
+    workers
+        Processes to share the frames among; the answers are the same for any number.
     """
-    chosen = _choose(variant)
+    if workers < 1:
+        raise InputError(f"--workers {workers}: is not 1 or more")
+    names = _choose(variant)
     content = read_dataset(dataset)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True)) as progress:
         task = progress.add_task("frames", total=len(content.frames))
-        rows = estimate_dataset(content, chosen, on_frame=lambda: progress.advance(task))
+        rows = estimate_with_workers(content, names, workers, on_frame=lambda: progress.advance(task))
     for name, of_variant in rows.items():
         path = write_estimates(dataset, name, of_variant)
         ok = sum(row.status == "ok" for row in of_variant)
@@ -86,6 +108,38 @@ def score(dataset: Path, /, *, json: Annotated[bool, Parameter(negative=())] = F
         print(scores.model_dump_json(indent=1))
     else:
         _print_scores(scores)
+
+
+@app.command
+def compare(dataset: Path, a: str, b: str, /, *, json: Annotated[bool, Parameter(negative=())] = False) -> None:
+    """Compare two variants frame by frame, scoring the dataset where needed.
+
+    Parameters
+    ----------
+    dataset
+        Folder of a dataset with estimates.
+    a
+        A variant.
+    b
+        Another one.
+    json
+        Print JSON instead of a table.
+    """
+    if a == b:
+        raise InputError(f"{a} and {b}: needed two different variants")
+    scores = {of_variant.variant: of_variant for of_variant in read_or_score(dataset).variants}
+    for name in (a, b):
+        if name not in scores:
+            raise InputError(f"{dataset / 'estimates'}: none of variant {name}; there are: {', '.join(scores)}")
+    pair = compare_variants(scores[a], scores[b])
+    if json:
+        print(pair.model_dump_json(indent=1))
+        return
+    print(f"A = {a}, B = {b}")
+    width = max(map(len, PAIR_HEADERS))
+    for header, cell in zip(PAIR_HEADERS, pair_cells(pair), strict=True):
+        print(f"{header:{width}}  {cell}")
+    print(PAIR_NOTE)
 
 
 @app.command
@@ -135,26 +189,49 @@ def _complain(message: str, code: int) -> int:
     return code
 
 
-def _choose(names: Sequence[str] | None) -> list[Variant]:
-    """The variants named, once each; all for None."""
+def _choose(names: Sequence[str] | None) -> list[str]:
+    """The variants named, once each; for None all that can be used, with a warning about each that cannot."""
+    registry = Registry.read()
     if names is None:
-        return list(VARIANTS.values())
-    for name in names:
-        if name not in VARIANTS:
-            raise InputError(f"--variant {name}: unknown; allowed: {', '.join(VARIANTS)}")
-    return [VARIANTS[name] for name in dict.fromkeys(names)]
+        usable, complaints = registry.all()
+        _warn(complaints)
+    else:
+        usable = [registry.named(name) for name in names]
+    return list(dict.fromkeys(variant.name for variant in usable))
+
+
+def _warn(complaints: Sequence[str]) -> None:
+    for complaint in complaints:
+        print("estimator: warning:", " ".join(complaint.split()), file=sys.stderr)
 
 
 def _print_scores(scores: Scores) -> None:
-    # Where the output is no terminal, nothing has to be squeezed into its width.
-    console = Console() if sys.stdout.isatty() else Console(width=150)
-    table = Table(title=escape(f"{scores.dataset}: errors of the frames that succeeded"), title_justify="left")
-    table.add_column("variant", no_wrap=True)
-    for header in TABLE_HEADERS:
-        table.add_column(header, justify="right")
-    for of_variant in scores.variants:
-        table.add_row(escape(of_variant.variant), *table_cells(of_variant))
-    console.print(table)
+    rows = [(of_variant.variant, error_cells(of_variant), limit_cells(of_variant)) for of_variant in scores.variants]
+    errors = _table(f"{scores.dataset}: errors", ERROR_HEADERS, [(name, *cells) for name, cells, _ in rows])
+    _print_table(errors, ERROR_NOTE)
+    if any(of_variant.against_bound or of_variant.nees or of_variant.ambiguous for of_variant in scores.variants):
+        title = "the bound, and what the variants say of themselves"
+        limits = _table(title, LIMIT_HEADERS, [(name, *cells) for name, _, cells in rows])
+        _print_table(limits, LIMIT_NOTE)
     for of_variant in scores.variants:
         for reason, count in of_variant.failures.items():
-            console.print(f"{of_variant.variant}: {count} x {reason}", markup=False, highlight=False)
+            print(f"{of_variant.variant}: {count} x {reason}")
+
+
+def _table(title: str, headers: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
+    table = Table(title=escape(title), title_justify="left")
+    table.add_column("variant", no_wrap=True)
+    for header in headers:
+        table.add_column(header, justify="right")
+    for row in rows:
+        table.add_row(*map(escape, row))
+    return table
+
+
+def _print_table(table: Table, note: str) -> None:
+    console = Console()
+    if not console.is_terminal:
+        # Nothing has to be squeezed into a terminal's width.
+        console = Console(width=Console(width=10_000).measure(table).maximum)
+    console.print(table)
+    console.print(note, markup=False, highlight=False)

@@ -1,6 +1,7 @@
 """A variant's answers on disk: estimates/VARIANT.parquet, one row a frame (datasets/FORMAT.md)."""
 
 import io
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
@@ -12,7 +13,7 @@ from pydantic import Field, Strict, model_validator
 from estimator.dataset import LedId
 from estimator.errors import InputError
 from estimator.files import write_atomically
-from estimator.tables import Number, Row, Triple, read_rows
+from estimator.tables import Covariance, Number, Row, Triple, read_rows
 
 COLUMNS = {
     "frame": pa.int64(),
@@ -24,6 +25,10 @@ COLUMNS = {
     "ranges": pa.list_(pa.struct([("led", pa.int64()), ("range_m", pa.float64())])),
     "time_s": pa.float64(),
 }
+
+# Most file systems end at 255 bytes, of which a temporary file's name takes some.
+NAME = r"[A-Za-z0-9][A-Za-z0-9._:=,+-]{0,199}"
+NAME_RULE = "at most 200 of A-Z a-z 0-9 . _ : = , + -, a letter or digit first"
 
 
 class LedRange(Row):
@@ -45,7 +50,7 @@ class EstimateRow(Row):
     position_m: Triple | None
     ranges: Annotated[tuple[LedRange, ...], Strict(False)]
     time_s: float = Field(ge=0, le=1e9)
-    covariance_m2: Annotated[tuple[Number, ...], Strict(False), Field(min_length=9, max_length=9)] | None = None
+    covariance_m2: Covariance | None = None
     ambiguous: bool = False
 
     @model_validator(mode="after")
@@ -57,12 +62,14 @@ class EstimateRow(Row):
 
 
 def estimates_path(folder: Path, variant: str) -> Path:
-    """Where a dataset keeps this variant's estimates."""
+    """Where a dataset keeps this variant's estimates; raises InputError for a name that no file can have."""
+    if not re.fullmatch(NAME, variant):
+        raise InputError(f"variant {variant!r}: the name becomes a file's; allowed: {NAME_RULE}")
     return folder / "estimates" / f"{variant}.parquet"
 
 
 def write_estimates(folder: Path, variant: str, rows: Sequence[EstimateRow]) -> Path:
-    """Write a variant's rows, replacing what was there in one step; returns the path, raises OSError."""
+    """Write a variant's rows, replacing what was there in one step; returns the path, raises InputError, OSError."""
     path = estimates_path(folder, variant)
     path.parent.mkdir(exist_ok=True)
     schema = pa.schema(list(COLUMNS.items()))

@@ -1,110 +1,125 @@
-"""Scores as inline SVG: errors over the frames, and the room seen from above. Colours come from the page's style."""
+"""Errors as pictures: over the frames, and their distribution. Colours come from the page's style."""
 
+import itertools
 import math
 from collections.abc import Sequence
-from html import escape
+from dataclasses import dataclass
 
-from estimator.score import VariantScore, length_text
-from estimator.tables import Triple
+from estimator.score import VariantScore
+from estimator.score_table import length_text
+from estimator.svg import cross, line, mark, picture, text
 
 WIDTH = 960
+LEFT, RIGHT, TOP, BOTTOM = 72, 28, 12, 40
+INNER = WIDTH - LEFT - RIGHT
+HEIGHT = 300
+"""Of the axes; a variant's lane of failures has LANE more."""
+LANE = 12
 SMALLEST_SHOWN_M = 1e-6
-MARGINS = {"left": 72, "right": 16, "top": 12, "bottom": 40}
+MOST_LABELS = 12
+MOST_LARGE_MARKS = 1000
+SHARES = (0, 25, 50, 75, 95, 100)
+
+
+@dataclass(frozen=True)
+class Decades:
+    """A logarithmic axis from 10**low to 10**high metres."""
+
+    low: int
+    high: int
+
+    @classmethod
+    def of(cls, variants: Sequence[VariantScore]) -> "Decades":
+        """Around all errors and bounds that are there to be shown."""
+        rows = [row for variant in variants for row in variant.rows]
+        errors_m = [row.error_3d_m for row in rows if row.error_3d_m is not None]
+        shown_m = [max(size_m, SMALLEST_SHOWN_M) for size_m in errors_m + [b for _, b in frames_with_bound(variants)]]
+        low = math.floor(math.log10(min(shown_m, default=1e-3)))
+        return cls(low, max(math.ceil(math.log10(max(shown_m, default=1.0))), low + 1))
+
+    def share(self, size_m: float) -> float:
+        """How far along the axis, 0 to 1."""
+        return (math.log10(max(size_m, SMALLEST_SHOWN_M)) - self.low) / (self.high - self.low)
+
+    def labelled_m(self) -> list[float]:
+        """The decades to be labelled, all of them unless there are too many."""
+        step = math.ceil((self.high - self.low) / MOST_LABELS)
+        return [10.0**decade for decade in range(self.low, self.high + 1, step)]
+
+
+def frames_with_bound(variants: Sequence[VariantScore]) -> list[tuple[int, float]]:
+    """Frames that have a bound, and its root mean square in metres; they are the same for every variant."""
+    rows = variants[0].rows if variants else ()
+    return [(row.frame, row.bound_m) for row in rows if row.bound_m is not None]
 
 
 def error_plot(variants: Sequence[VariantScore]) -> str:
-    """3D error of each frame on a logarithmic axis, a colour a variant; failed frames are crosses in lanes below."""
-    lane = 16
-    plot_height = 300
-    lanes_top = MARGINS["top"] + plot_height + 14
-    height = lanes_top + lane * len(variants) + MARGINS["bottom"]
-    errors_m = [max(row.error_3d_m, SMALLEST_SHOWN_M) for v in variants for row in v.rows if row.error_3d_m is not None]
-    low = math.floor(math.log10(min(errors_m, default=1e-3)))
-    high = max(math.ceil(math.log10(max(errors_m, default=1.0))), low + 1)
+    """3D error of each frame on a logarithmic axis, a mark a variant; failed frames are crosses in lanes below."""
+    decades = Decades.of(variants)
     frames = max((v.frames for v in variants), default=0)
+    lanes_top = TOP + HEIGHT + 14
+    bottom = lanes_top + LANE * len(variants)
 
-    def x(frame: int) -> float:
-        inner = WIDTH - MARGINS["left"] - MARGINS["right"]
-        return MARGINS["left"] + inner * (frame + 0.5) / max(frames, 1)
+    def x(frame: float) -> float:
+        return LEFT + INNER * (frame + 0.5) / max(frames, 1)
 
     def y(error_m: float) -> float:
-        share = (math.log10(max(error_m, SMALLEST_SHOWN_M)) - low) / (high - low)
-        return MARGINS["top"] + plot_height * (1 - share)
+        return TOP + HEIGHT * (1 - decades.share(error_m))
 
+    radius = 3 if frames * len(variants) <= MOST_LARGE_MARKS else 2
     parts = []
-    for decade in range(low, high + 1):
-        at = y(10.0**decade)
-        parts.append(_line(MARGINS["left"], at, WIDTH - MARGINS["right"], at, "rule"))
-        parts.append(_text(MARGINS["left"] - 8, at + 4, length_text(10.0**decade), "end"))
-    ticks = range(0, frames, max(1, math.ceil(frames / 12)))
-    axis_y = lanes_top + lane * len(variants)
-    parts += [_text(x(frame), axis_y + 16, str(frame), "middle") for frame in ticks]
-    parts.append(_text(WIDTH / 2, axis_y + 34, "frame", "middle"))
+    for decade_m in decades.labelled_m():
+        parts.append(line(LEFT, y(decade_m), WIDTH - RIGHT, y(decade_m), "rule"))
+        parts.append(text(LEFT - 8, y(decade_m) + 4, length_text(decade_m), "end"))
+    steps = (digit * 10**decade for decade in itertools.count() for digit in (1, 2, 5))
+    ticks = range(0, frames, next(step for step in steps if MOST_LABELS * step >= frames))
+    parts += [text(x(frame), bottom + 16, str(frame), "middle") for frame in ticks]
+    parts.append(text(LEFT + INNER / 2, bottom + 34, "frame", "middle"))
+    parts.append(text(LEFT - 20, (lanes_top + bottom) / 2 + 4, "failed", "end"))
     for index, variant in enumerate(variants):
-        lane_y = lanes_top + lane * (index + 0.5)
-        parts.append(_line(MARGINS["left"], lane_y, WIDTH - MARGINS["right"], lane_y, "rule"))
-        parts.append(_text(MARGINS["left"] - 8, lane_y + 4, "failed", "end"))
+        lane_y = lanes_top + LANE * (index + 0.5)
+        parts.append(line(LEFT, lane_y, WIDTH - RIGHT, lane_y, "rule"))
+        parts.append(mark(LEFT - 10, lane_y, 3, index))
         for row in variant.rows:
             place = f"{variant.variant}, frame {row.frame}"
             if row.error_3d_m is None:
-                title = escape(f"{place}: {row.reason}")
-                parts.append(_cross(x(row.frame), lane_y, f"v{index}", title))
+                parts.append(cross(x(row.frame), lane_y, index, f"{place}: {row.reason}"))
             else:
-                title = escape(f"{place}: {length_text(row.error_3d_m)}")
-                parts.append(_dot(x(row.frame), y(row.error_3d_m), 3, f"v{index}", title))
-    return _svg(WIDTH, height, "3D error of each frame", parts)
+                title = f"{place}: {length_text(row.error_3d_m)}"
+                parts.append(mark(x(row.frame), y(row.error_3d_m), radius, index, title))
+    half = min(0.4 * INNER / max(frames, 1), 8.0)
+    ledges = [f"M{x(frame) - half:.1f} {y(size_m):.1f}h{2 * half:.1f}" for frame, size_m in frames_with_bound(variants)]
+    if ledges:
+        parts.append(f'<path class="bound" d="{"".join(ledges)}"/>')
+    return picture(WIDTH, bottom + BOTTOM, "3D error of each frame", parts)
 
 
-def plan(room_m: Triple, leds_m: Sequence[Triple], variant: VariantScore, index: int) -> str:
-    """The room from above, x right and y up: LEDs, true positions (rings), estimates (dots) and the errors between."""
-    width, border = 460.0, 12.0
-    scale = (width - 2 * border) / room_m[0]
-    height = room_m[1] * scale + 2 * border
+def distribution_plot(variants: Sequence[VariantScore]) -> str:
+    """The share of all frames whose 3D error does not exceed a size: a curve ends at the share that was answered."""
+    decades = Decades.of(variants)
+    bottom = TOP + HEIGHT
 
-    def place(point_m: Triple) -> tuple[float, float]:
-        return border + point_m[0] * scale, height - border - point_m[1] * scale
+    def x(error_m: float) -> float:
+        return LEFT + INNER * decades.share(error_m)
 
-    parts = [f'<rect x="{border}" y="{border}" width="{width - 2 * border}" height="{room_m[1] * scale:.1f}"/>']
-    parts += [
-        f'<rect class="led" x="{u - 2:.1f}" y="{v - 2:.1f}" width="4" height="4"/>' for u, v in map(place, leds_m)
-    ]
-    for row in variant.rows:
-        u, v = place(row.true_m)
-        if row.estimate_m is None:
-            parts.append(_cross(u, v, f"v{index}", escape(f"frame {row.frame}: {row.reason}")))
-            continue
-        title = escape(f"frame {row.frame}: {length_text(row.error_3d_m)}")
-        # Far outside, a coordinate says no more than a nearer one, and viewers choke on huge numbers.
-        a, b = (max(-1e4, min(1e4, value)) for value in place(row.estimate_m))
-        parts.append(_line(u, v, a, b, f"v{index}"))
-        parts.append(f'<circle class="truth" cx="{u:.1f}" cy="{v:.1f}" r="4"/>')
-        parts.append(_dot(a, b, 2.5, f"v{index}", title))
-    return _svg(width, height, "plan of the room", parts)
+    def y(share: float) -> float:
+        return bottom - HEIGHT * share
 
-
-def outside(room_m: Triple, variant: VariantScore) -> int:
-    """How many of a variant's estimates lie beyond the plan's walls."""
-    estimates = [row.estimate_m for row in variant.rows if row.estimate_m is not None]
-    return sum(not (0 <= x <= room_m[0] and 0 <= y <= room_m[1]) for x, y, _ in estimates)
-
-
-def _svg(width: float, height: float, label: str, parts: Sequence[str]) -> str:
-    body = "\n".join(parts)
-    return f'<svg viewBox="0 0 {width:.0f} {height:.0f}" role="img" aria-label="{escape(label)}">\n{body}\n</svg>'
-
-
-def _line(x1: float, y1: float, x2: float, y2: float, kind: str) -> str:
-    return f'<line class="{kind}" x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}"/>'
-
-
-def _text(x: float, y: float, text: str, anchor: str) -> str:
-    return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{escape(text)}</text>'
-
-
-def _dot(x: float, y: float, radius: float, kind: str, title: str) -> str:
-    return f'<circle class="{kind}" cx="{x:.1f}" cy="{y:.1f}" r="{radius}"><title>{title}</title></circle>'
-
-
-def _cross(x: float, y: float, kind: str, title: str) -> str:
-    strokes = f"M{x - 3:.1f} {y - 3:.1f}l6 6m0 -6l-6 6"
-    return f'<path class="{kind}" d="{strokes}"><title>{title}</title></path>'
+    parts = []
+    for percent in SHARES:
+        parts.append(line(LEFT, y(percent / 100), WIDTH - RIGHT, y(percent / 100), "rule"))
+        parts.append(text(LEFT - 8, y(percent / 100) + 4, f"{percent} %", "end"))
+    for decade_m in decades.labelled_m():
+        parts.append(line(x(decade_m), TOP, x(decade_m), bottom, "rule"))
+        parts.append(text(x(decade_m), bottom + 16, length_text(decade_m), "middle"))
+    parts.append(text(LEFT + INNER / 2, bottom + 34, "3D error, share of all frames", "middle"))
+    bounds_m = [size_m for _, size_m in frames_with_bound(variants)]
+    if bounds_m:
+        rms_m = math.sqrt(math.fsum(size_m**2 for size_m in bounds_m) / len(bounds_m))
+        parts.append(line(x(rms_m), TOP, x(rms_m), bottom, "bound"))
+    for index, variant in enumerate(variants):
+        errors_m = sorted(row.error_3d_m for row in variant.rows if row.error_3d_m is not None)
+        steps = [f"H{x(error_m):.1f}V{y(k / variant.frames):.1f}" for k, error_m in enumerate(errors_m, 1)]
+        parts.append(f'<path class="curve v{index}" d="M{LEFT} {bottom}{"".join(steps)}H{WIDTH - RIGHT}"/>')
+        parts.append(mark(WIDTH - RIGHT, y(len(errors_m) / max(variant.frames, 1)), 3.5, index))
+    return picture(WIDTH, bottom + BOTTOM, "distribution of the 3D errors over all frames", parts)

@@ -1,29 +1,35 @@
-"""Estimates against the truth: per frame and per variant. The only module that opens truth.parquet."""
+"""Estimates against the truth: per frame and per variant. Every frame is in the count, answered or not."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
-import pyarrow as pa
-from pydantic import Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from estimator.dataset import Dataset, Led, LedId, read_dataset
 from estimator.errors import InputError
 from estimator.estimates import EstimateRow, read_estimates
 from estimator.files import write_atomically
-from estimator.tables import Number, Row, Triple, first_problem, read_rows
+from estimator.summary import (
+    AgainstBound,
+    Interval,
+    Nees,
+    OfAll,
+    Summary,
+    against_bound,
+    median_interval,
+    nees,
+    of_all,
+    rmse_interval,
+    squared_in_sigmas,
+    summary,
+)
+from estimator.tables import Number, Positive, Row, Size, Triple, first_problem
+from estimator.truth import TruthRow, read_truth
 
-TRUTH_COLUMNS = {"frame": pa.int64(), "position_m": pa.list_(pa.float64())}
-Size = Annotated[float, Field(ge=0)]
-
-
-class TruthRow(Row):
-    """Where the camera of one frame was, world metres."""
-
-    frame: int
-    position_m: Triple
+VERSION = 2
 
 
 class RangeError(Row):
@@ -34,7 +40,11 @@ class RangeError(Row):
 
 
 class FrameScore(Row):
-    """One frame of one variant; errors are null where it failed. `vertical_error_m` is signed, positive is too high."""
+    """One frame of one variant; errors are null where it failed. `vertical_error_m` is signed, positive is too high.
+
+    `bound_m` is the root of the trace of the frame's Cramer-Rao bound, null without one; `nees` is `e^T C^-1 e` where
+    the variant reports a covariance.
+    """
 
     frame: int
     status: Literal["ok", "failed"]
@@ -44,37 +54,45 @@ class FrameScore(Row):
     error_3d_m: Size | None
     horizontal_error_m: Size | None
     vertical_error_m: Number | None
+    bound_m: Size | None
+    nees: Size | None
+    ambiguous: bool
     range_errors: tuple[RangeError, ...]
     time_s: Size
 
-
-class Summary(Row):
-    """Of the absolute errors of the frames that succeeded, metres; `p95_m` is interpolated linearly."""
-
-    median_m: Size
-    mean_m: Size
-    rmse_m: Size
-    p95_m: Size
-    max_m: Size
+    @model_validator(mode="after")
+    def _status_fits(self) -> "FrameScore":
+        errors = (self.estimate_m, self.error_3d_m, self.horizontal_error_m, self.vertical_error_m)
+        if any((error is None) == (self.status == "ok") for error in errors):
+            raise ValueError("an ok frame has an estimate and errors, a failed one none")
+        return self
 
 
 class VariantScore(Row):
-    """One variant over all frames. Summaries are over its `ok` frames, null without any; read them beside `failed`.
+    """One variant over all frames.
 
-    The median range error is over all distances the variant made, failed frames' included, for a frame can fail after
-    its distances are made.
+    `of_all` counts failed frames as infinitely wrong. Every other summary is over the `ok` frames, null without any: it
+    is to be read beside `coverage`, their share of all. The two intervals are of `error_3d`. Range errors are of all
+    distances the variant made, failed frames' included, for a frame can fail after its distances are made.
     """
 
     variant: str
     frames: int
     ok: int
     failed: int
+    coverage: float | None = Field(ge=0, le=1)
+    ambiguous: int
     failures: dict[str, int]
+    of_all: OfAll | None
     error_3d: Summary | None
+    median_interval: Interval | None
+    rmse_interval: Interval | None
     horizontal: Summary | None
     vertical: Summary | None
     ranges: int
-    median_range_error_m: Size | None
+    range_error: Summary | None
+    against_bound: AgainstBound | None
+    nees: Nees | None
     median_time_s: Size | None
     rows: tuple[FrameScore, ...]
 
@@ -83,72 +101,81 @@ class Scores(Row):
     """scores.json: all that a report needs of a dataset, the truth included."""
 
     format: Literal["estimator-scores"] = "estimator-scores"
-    version: Literal[1] = 1
+    version: Literal[2] = 2
     dataset: str
-    room_m: Triple
+    room_m: tuple[Positive, Positive, Positive]
     led_map: tuple[Led, ...]
     variants: tuple[VariantScore, ...]
 
+    @model_validator(mode="after")
+    def _same_frames(self) -> "Scores":
+        first = list(range(len(self.variants[0].rows))) if self.variants else []
+        if any([row.frame for row in variant.rows] != first for variant in self.variants):
+            raise ValueError("every variant has to have the frames 0, 1, 2, ... in order, and all the same")
+        return self
+
 
 def score_variant(
-    variant: str, estimates: Sequence[EstimateRow], true_m: Sequence[Triple], leds: Mapping[int, Led]
+    variant: str, estimates: Sequence[EstimateRow], truth: Sequence[TruthRow], leds: Mapping[int, Led]
 ) -> VariantScore:
-    """Score one variant's rows against the true positions of the same frames, world metres."""
-    rows = tuple(score_frame(row, truth, leds) for row, truth in zip(estimates, true_m, strict=True))
+    """Score one variant's rows against the truth of the same frames."""
+    rows = tuple(score_frame(row, true, leds) for row, true in zip(estimates, truth, strict=True))
     good = [row for row in rows if row.status == "ok"]
-    range_errors_m = [abs(error.error_m) for row in rows for error in row.range_errors]
+    errors_m = [row.error_3d_m for row in good if row.error_3d_m is not None]
+    bounded = [(row.error_3d_m, row.bound_m) for row in good if row.error_3d_m is not None and row.bound_m is not None]
+    range_errors_m = [error.error_m for row in rows for error in row.range_errors]
     return VariantScore(
         variant=variant,
         frames=len(rows),
         ok=len(good),
         failed=len(rows) - len(good),
+        coverage=len(good) / len(rows) if rows else None,
+        ambiguous=sum(row.ambiguous for row in good),
         failures=dict(Counter(row.reason for row in rows if row.status == "failed").most_common()),
-        error_3d=_summary([row.error_3d_m for row in good]),
-        horizontal=_summary([row.horizontal_error_m for row in good]),
-        vertical=_summary([row.vertical_error_m for row in good]),
+        of_all=of_all([row.error_3d_m for row in rows]),
+        error_3d=summary(errors_m),
+        median_interval=median_interval(errors_m),
+        rmse_interval=rmse_interval(errors_m),
+        horizontal=summary([row.horizontal_error_m for row in good if row.horizontal_error_m is not None]),
+        vertical=summary([row.vertical_error_m for row in good if row.vertical_error_m is not None]),
         ranges=len(range_errors_m),
-        median_range_error_m=float(np.median(range_errors_m)) if range_errors_m else None,
+        range_error=summary(range_errors_m),
+        against_bound=against_bound([error_m for error_m, _ in bounded], [bound_m for _, bound_m in bounded]),
+        nees=nees([row.nees for row in good if row.nees is not None]),
         median_time_s=float(np.median([row.time_s for row in good])) if good else None,
         rows=rows,
     )
 
 
-def score_frame(estimate: EstimateRow, true_m: Triple, leds: Mapping[int, Led]) -> FrameScore:
+def score_frame(estimate: EstimateRow, truth: TruthRow, leds: Mapping[int, Led]) -> FrameScore:
     """Score one frame: position errors where there is a position, range errors for the ranges there are."""
-    truth = np.array(true_m)
-    error = horizontal = vertical = None
+    true_m = np.array(truth.position_m)
+    error = horizontal = vertical = squares = None
     if estimate.position_m is not None:
-        difference = np.array(estimate.position_m) - truth
-        error, horizontal = float(np.linalg.norm(difference)), float(np.linalg.norm(difference[:2]))
-        vertical = float(difference[2])
+        difference_m = np.array(estimate.position_m) - true_m
+        error, horizontal = float(np.linalg.norm(difference_m)), float(np.linalg.norm(difference_m[:2]))
+        vertical = float(difference_m[2])
+        if estimate.covariance_m2 is not None:
+            squares = squared_in_sigmas(difference_m, estimate.covariance_m2)
     range_errors = tuple(
-        RangeError(led=r.led, error_m=r.range_m - float(np.linalg.norm(np.array(leds[r.led].position_m) - truth)))
+        RangeError(led=r.led, error_m=r.range_m - float(np.linalg.norm(np.array(leds[r.led].position_m) - true_m)))
         for r in estimate.ranges
     )
+    bound_m2 = truth.bound_m2
     return FrameScore(
         frame=estimate.frame,
         status=estimate.status,
         reason=estimate.reason,
-        true_m=true_m,
+        true_m=truth.position_m,
         estimate_m=estimate.position_m,
         error_3d_m=error,
         horizontal_error_m=horizontal,
         vertical_error_m=vertical,
+        bound_m=None if bound_m2 is None else float(np.sqrt(bound_m2[0] + bound_m2[4] + bound_m2[8])),
+        nees=squares,
+        ambiguous=estimate.ambiguous,
         range_errors=range_errors,
         time_s=estimate.time_s,
-    )
-
-
-def _summary(errors_m: Sequence[float | None]) -> Summary | None:
-    if not errors_m:
-        return None
-    size_m = np.abs(np.array(errors_m, dtype=np.float64))
-    return Summary(
-        median_m=float(np.median(size_m)),
-        mean_m=float(size_m.mean()),
-        rmse_m=float(np.sqrt((size_m**2).mean())),
-        p95_m=float(np.percentile(size_m, 95)),
-        max_m=float(size_m.max()),
     )
 
 
@@ -158,24 +185,35 @@ def score_dataset(folder: Path) -> Scores:
     paths = _estimate_paths(folder)
     if not paths:
         raise InputError(f"{folder / 'estimates'}: no estimates to score; make them with `estimator run {folder}`")
-    true_m = _read_truth(folder / "truth.parquet", len(dataset.frames))
+    truth = read_truth(folder / "truth.parquet", len(dataset.frames))
     scores = Scores(
         dataset=dataset.name,
         room_m=dataset.room_m,
         led_map=tuple(dataset.leds.values()),
-        variants=tuple(score_variant(path.stem, _read_known(path, dataset), true_m, dataset.leds) for path in paths),
+        variants=tuple(score_variant(path.stem, _read_known(path, dataset), truth, dataset.leds) for path in paths),
     )
     write_atomically(folder / "scores.json", scores.model_dump_json(indent=1).encode() + b"\n")
     return scores
 
 
+class _Version(BaseModel):
+    version: int
+
+
 def read_or_score(folder: Path) -> Scores:
-    """scores.json where it is newer than all estimates and covers them, else new scores; raises InputError."""
+    """scores.json where it is newer than the truth and all estimates, and covers them, else new scores.
+
+    The truth need not be there where scores.json is. An older version's scores are made again. Raises InputError.
+    """
     path, estimates = folder / "scores.json", _estimate_paths(folder)
-    if not path.exists() or any(estimate.stat().st_mtime > path.stat().st_mtime for estimate in estimates):
+    sources = [source for source in (*estimates, folder / "truth.parquet") if source.exists()]
+    if not path.exists() or any(source.stat().st_mtime > path.stat().st_mtime for source in sources):
         return score_dataset(folder)
+    content = path.read_bytes()
     try:
-        scores = Scores.model_validate_json(path.read_bytes())
+        if _Version.model_validate_json(content).version < VERSION:
+            return score_dataset(folder)
+        scores = Scores.model_validate_json(content)
     except ValidationError as error:
         raise InputError(f"{path}: {first_problem(error)}") from None
     if estimates and [score.variant for score in scores.variants] != [estimate.stem for estimate in estimates]:
@@ -183,38 +221,12 @@ def read_or_score(folder: Path) -> Scores:
     return scores
 
 
-TABLE_HEADERS = ("ok", "failed", "median", "mean", "RMSE", "p95", "max", "horizontal", "vertical", "range", "time")
-
-
-def table_cells(score: VariantScore) -> tuple[str, ...]:
-    """A variant's row under TABLE_HEADERS: 3D errors from median to max, then medians of the rest."""
-    parts = [score.error_3d] * 5 + [score.horizontal, score.vertical]
-    fields = ["median_m", "mean_m", "rmse_m", "p95_m", "max_m", "median_m", "median_m"]
-    lengths_m = [None if part is None else getattr(part, field) for part, field in zip(parts, fields, strict=True)]
-    lengths = [length_text(length_m) for length_m in [*lengths_m, score.median_range_error_m]]
-    time_s = score.median_time_s
-    return (str(score.ok), str(score.failed), *lengths, "–" if time_s is None else f"{time_s * 1e3:.0f} ms")
-
-
-def length_text(metres: float | None) -> str:
-    """A length for people, to three digits: `12.3 mm`, `1.23 m`; a dash for None."""
-    if metres is None:
-        return "–"
-    for size_m, unit in ((1.0, "m"), (1e-3, "mm")):
-        if abs(metres) >= size_m:
-            return f"{metres / size_m:.3g} {unit}" if abs(metres) < 1000 else f"{metres:.2g} m"
-    return f"{metres / 1e-6:.3g} µm"
-
-
 def _estimate_paths(folder: Path) -> list[Path]:
-    return sorted((folder / "estimates").glob("*.parquet"), key=lambda path: path.stem)
-
-
-def _read_truth(path: Path, frame_count: int) -> list[Triple]:
-    rows = read_rows(path, TRUTH_COLUMNS, TruthRow)
-    if [row.frame for row in rows] != list(range(frame_count)):
-        raise InputError(f"{path}: {len(rows)} rows, needed one for each of the {frame_count} frames, in order")
-    return [row.position_m for row in rows]
+    paths = sorted((folder / "estimates").glob("*.parquet"), key=lambda path: path.stem)
+    for path in paths:
+        if not path.stem.isprintable():
+            raise InputError(f"{folder / 'estimates'}: {path.name!r}: needed a name of printable characters")
+    return paths
 
 
 def _read_known(path: Path, dataset: Dataset) -> tuple[EstimateRow, ...]:

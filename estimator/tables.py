@@ -1,12 +1,13 @@
 """Parquet files as checked rows, and the one-line wording of what is wrong with them."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, TypeVar
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from pydantic import BaseModel, ConfigDict, Field, Strict, TypeAdapter, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, Strict, TypeAdapter, ValidationError
 
 from estimator.errors import InputError
 
@@ -22,8 +23,40 @@ LARGEST = 1e100
 Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 Positive = Annotated[float, Field(gt=0, le=LARGEST)]
 NotNegative = Annotated[float, Field(ge=0, le=LARGEST)]
+Size = Annotated[float, Field(ge=0)]
+"""Of what was reckoned, so it may be larger than what is read."""
 # Arrow hands over lists; only the container is converted, the numbers in it stay strict.
 Triple = Annotated[tuple[Number, Number, Number], Strict(False)]
+
+SMALLEST_VARIANCE = 1e-60
+"""A covariance below this would overflow where an error is measured by it."""
+MOST_ASYMMETRY = 1e-6
+LEAST_EIGENVALUE = 1e-14
+"""Of the correlations: below it the inverse, in double precision, has not two digits left."""
+
+
+def is_covariance(values: Sequence[float]) -> bool:
+    """Whether nine finite numbers, row by row, are a symmetric, positive definite 3 x 3 matrix."""
+    matrix = np.reshape(np.asarray(values, dtype=np.float64), (3, 3))
+    variances = np.diag(matrix)
+    # Also false for NaN.
+    if not (variances >= SMALLEST_VARIANCE).all() or not np.abs(matrix).max() <= LARGEST:
+        return False
+    correlations = matrix / np.sqrt(np.outer(variances, variances))
+    if np.abs(correlations - correlations.T).max() > MOST_ASYMMETRY:
+        return False
+    return bool(np.linalg.eigvalsh(correlations).min() >= LEAST_EIGENVALUE)
+
+
+def _check_covariance(values: tuple[float, ...]) -> tuple[float, ...]:
+    if not is_covariance(values):
+        raise ValueError("has to be a symmetric, positive definite 3 x 3 matrix, row by row")
+    return values
+
+
+Covariance = Annotated[
+    tuple[Number, ...], Strict(False), Field(min_length=9, max_length=9), AfterValidator(_check_covariance)
+]
 
 RowT = TypeVar("RowT", bound=Row)
 

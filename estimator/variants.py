@@ -1,6 +1,7 @@
 """The named pipelines: from what a device has, one frame, to where it is."""
 
 from estimator.dataset import DeviceFrame
+from estimator.errors import InputError
 from estimator.huynh2016 import huynh2016, huynh2016_as_printed
 from estimator.pipeline import Estimate, Variant
 from estimator.position import position_from_pixels
@@ -31,3 +32,10 @@ VARIANTS = {
         Variant("pnp", "perspective-n-point (SQPNP, IPPE, Levenberg-Marquardt) on raw centroids, no gravity", pnp),
     )
 }
+
+
+def variant_named(name: str) -> Variant:
+    """The pipeline of this name; raises InputError for one there is none of."""
+    if name not in VARIANTS:
+        raise InputError(f"variant {name}: unknown; allowed: {', '.join(VARIANTS)}")
+    return VARIANTS[name]

@@ -14,6 +14,7 @@ from estimator_synthetic import small_dataset
 
 from estimator import cli
 from estimator.cli import main
+from estimator.estimates import EstimateRow, write_estimates
 from estimator.variants import VARIANTS
 
 
@@ -62,6 +63,24 @@ def test_score_prints_json(dataset: Path, capsys: pytest.CaptureFixture[str]) ->
     scores = json.loads(capsys.readouterr().out)
     assert scores == json.loads((dataset / "scores.json").read_text())
     assert {v["variant"]: v["ok"] for v in scores["variants"]}["pnp"] == 3
+
+
+def test_compare_prints_a_line_a_number(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """PnP, which answers three frames of three, against one that answers none."""
+    folder = small_dataset(tmp_path)
+    assert main(["run", str(folder), "--variant", "pnp"]) == 0
+    lost = [
+        EstimateRow(frame=k, status="failed", reason="a: b", position_m=None, ranges=(), time_s=0) for k in range(3)
+    ]
+    write_estimates(folder, "lost", lost)
+    capsys.readouterr()
+    assert main(["compare", str(folder), "pnp", "lost"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "A = pnp, B = lost"
+    cells = {line[:15].strip(): line[15:].strip() for line in lines[1:]}
+    assert (cells["both"], cells["only A"], cells["neither"], cells["Wilcoxon p"]) == ("0", "3", "0", "–")
+    assert main(["compare", str(folder), "pnp", "lost", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["only_a"] == 3
 
 
 class Page(HTMLParser):
@@ -122,7 +141,7 @@ ERRORS = [
     (["run", "{tmp}/nowhere"], "nowhere: no such folder"),
     (["run", "{tmp}"], "not a dataset"),
     (["run"], "DATASET"),
-    (["run", "{data}", "--variant", "best"], "--variant best: unknown; allowed: huynh2016, huynh2016-as-printed, pnp"),
+    (["run", "{data}", "--variant", "best"], "variant best: unknown; allowed: huynh2016, huynh2016-as-printed, pnp"),
     (["run", "{data}", "--variant"], "--variant"),
     (["run", "{data}", "more"], "more"),
     (["run", "{data}", "--fast"], "--fast"),
@@ -130,6 +149,12 @@ ERRORS = [
     (["--fast"], "--fast"),
     (["score", "{tmp}/nowhere"], "nowhere: no such folder"),
     (["score", "{data}", "--jsn"], "--jsn"),
+    (["run", "{data}", "--workers", "0"], "--workers 0: is not 1 or more"),
+    (["run", "{data}", "--workers", "many"], "--workers"),
+    (["compare", "{data}", "pnp"], "B"),
+    (["compare", "{data}", "pnp", "pnp"], "pnp and pnp: needed two different variants"),
+    (["compare", "{data}", "pnp", "best"], "none of variant best; there are: huynh2016, "),
+    (["compare", "{tmp}/nowhere", "pnp", "huynh2016"], "nowhere: no such folder"),
     (["report", "--out", "{tmp}/x.html"], "DATASETS"),
     (["report", "{data}"], "--out"),
     (["report", "{data}", "--out", "{tmp}"], "is a folder"),

@@ -4,16 +4,23 @@ import json
 import os
 from pathlib import Path
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from estimator_synthetic import small_dataset
 
 from estimator.dataset import Led
 from estimator.errors import InputError
 from estimator.estimates import EstimateRow, LedRange, write_estimates
-from estimator.score import Scores, length_text, read_or_score, score_dataset, score_variant
+from estimator.score import Scores, read_or_score, score_dataset, score_variant
+from estimator.truth import TruthRow
 
 LEDS = {10: Led(id=10, position_m=(1.0, 2.0, 3.5), radius_m=0.01, shape="disc")}
 TRUTH = (1.0, 2.0, 0.5)
+
+
+def truths(count: int, bound_m2: tuple[float, ...] | None = None) -> list[TruthRow]:
+    return [TruthRow(frame=frame, position_m=TRUTH, bound_m2=bound_m2) for frame in range(count)]
 
 
 def ok(frame: int, position: tuple[float, float, float], *ranges_m: float, time_s: float = 0.1) -> EstimateRow:
@@ -28,7 +35,7 @@ def failed(frame: int, reason: str, *ranges_m: float) -> EstimateRow:
 
 def test_errors_of_a_frame_by_hand() -> None:
     """(0.03, 0.04, -0.12) off: 0.05 m horizontal, 0.12 m too low, 0.13 m in all; the LED is 3 m above the camera."""
-    score = score_variant("x", [ok(0, (1.03, 2.04, 0.38), 3.02)], [TRUTH], LEDS)
+    score = score_variant("x", [ok(0, (1.03, 2.04, 0.38), 3.02)], truths(1), LEDS)
     (row,) = score.rows
     assert row.horizontal_error_m == pytest.approx(0.05)
     assert row.vertical_error_m == pytest.approx(-0.12)
@@ -44,7 +51,7 @@ def test_a_summary_by_hand() -> None:
     rows = [
         ok(i, (1.0, 2.0, 0.5 + h), time_s=t) for i, (h, t) in enumerate(zip(heights, (0.1, 0.2, 0.2, 5), strict=True))
     ]
-    score = score_variant("x", rows, [TRUTH] * 4, LEDS)
+    score = score_variant("x", rows, truths(4), LEDS)
     summary = score.error_3d
     assert summary is not None
     assert summary.median_m == pytest.approx(2.5)
@@ -55,12 +62,12 @@ def test_a_summary_by_hand() -> None:
     assert score.horizontal is not None
     assert score.horizontal.max_m == pytest.approx(0)
     assert score.median_time_s == pytest.approx(0.2)
-    assert score.median_range_error_m is None
+    assert score.range_error is None
 
 
 def test_failures_are_counted_by_reason_and_stay_in_the_rows() -> None:
     rows = [failed(0, "a: x", 4.0), ok(1, TRUTH, 3.1), failed(2, "b: y", 3.5), failed(3, "a: x")]
-    score = score_variant("x", rows, [TRUTH] * 4, LEDS)
+    score = score_variant("x", rows, truths(4), LEDS)
     assert (score.frames, score.ok, score.failed) == (4, 1, 3)
     assert score.failures == {"a: x": 2, "b: y": 1}
     assert [row.reason for row in score.rows] == ["a: x", "", "b: y", "a: x"]
@@ -68,12 +75,56 @@ def test_failures_are_counted_by_reason_and_stay_in_the_rows() -> None:
     assert score.error_3d.max_m == 0
     # Ranges of failed frames count: errors 1.0, 0.1 and 0.5 m.
     assert score.ranges == 3
-    assert score.median_range_error_m == pytest.approx(0.5)
+    assert score.range_error is not None
+    assert score.range_error.median_m == pytest.approx(0.5)
 
 
 def test_without_a_success_there_is_no_summary() -> None:
-    score = score_variant("x", [failed(0, "a: x")], [TRUTH], LEDS)
+    score = score_variant("x", [failed(0, "a: x")], truths(1), LEDS)
     assert (score.error_3d, score.horizontal, score.vertical, score.median_time_s) == (None, None, None, None)
+
+
+def test_the_bound_is_held_against_the_frames_that_have_it_and_succeeded() -> None:
+    """Errors 3, 4 and 12 mm; bounds of 6 mm on frames 1 and 3, of which 3 failed: 6 / 4."""
+    x, y, z = TRUTH
+    rows = [ok(0, (x + 0.003, y, z)), ok(1, (x, y + 0.004, z)), ok(2, (x, y, z + 0.012)), failed(3, "a: x")]
+    bound_m2 = (12e-6, 0.0, 0.0, 0.0, 12e-6, 0.0, 0.0, 0.0, 12e-6)
+    truth = [row.model_copy(update={"bound_m2": bound_m2 if row.frame % 2 else None}) for row in truths(4)]
+    score = score_variant("x", rows, truth, LEDS)
+    assert score.against_bound is not None
+    assert score.against_bound.frames == 1
+    assert score.against_bound.efficiency == pytest.approx(1.5)
+    assert [row.bound_m for row in score.rows] == [None, pytest.approx(0.006), None, pytest.approx(0.006)]
+
+
+def test_reported_covariances_and_ambiguity_are_counted() -> None:
+    """An error of one and of two standard deviations: 1 and 4, mean 2.5; the third frame says nothing of itself."""
+    x, y, z = TRUTH
+    covariance_m2 = (1e-4, 0.0, 0.0, 0.0, 1e-4, 0.0, 0.0, 0.0, 1e-4)
+    rows = [ok(k, (x + 0.01 * (k + 1), y, z)).model_copy(update={"covariance_m2": covariance_m2}) for k in range(2)]
+    rows.append(ok(2, TRUTH).model_copy(update={"ambiguous": True}))
+    score = score_variant("x", rows, truths(3), LEDS)
+    assert score.nees is not None
+    assert (score.nees.frames, score.nees.mean) == (2, pytest.approx(2.5))
+    assert [row.nees for row in score.rows] == [pytest.approx(1), pytest.approx(4), None]
+    assert (score.ambiguous, score.coverage) == (1, 1.0)
+
+
+def test_to_fail_the_worst_frames_costs_coverage_and_gains_nothing() -> None:
+    """The ok frames' own summary falls to a tenth; what counts all frames does not."""
+    x, y, z = TRUTH
+    rows = [ok(k, (x + (0.01 if k < 15 else 1.0), y, z)) for k in range(20)]
+    honest = score_variant("x", rows, truths(20), LEDS)
+    dropped = score_variant("x", [*rows[:15], *(failed(k, "a: too hard") for k in range(15, 20))], truths(20), LEDS)
+    assert honest.error_3d is not None
+    assert dropped.error_3d is not None
+    assert dropped.error_3d.rmse_m < honest.error_3d.rmse_m / 10
+    assert (honest.coverage, dropped.coverage) == (1.0, 0.75)
+    assert honest.of_all is not None
+    assert dropped.of_all is not None
+    assert dropped.of_all.median_m == pytest.approx(0.01)
+    assert (honest.of_all.p95_m, dropped.of_all.p95_m) == (pytest.approx(1.0), None)
+    assert dropped.frames == honest.frames == len(dropped.rows)
 
 
 @pytest.fixture(scope="module")
@@ -118,6 +169,20 @@ def test_scores_are_made_again_only_where_estimates_are_newer_or_other(dataset: 
     assert read_or_score(dataset).variants[0].ok == 3
 
 
+def test_scores_are_made_again_where_the_truth_is_newer(tmp_path: Path) -> None:
+    """As when a dataset is made again, with bounds."""
+    folder = small_dataset(tmp_path)
+    write_estimates(folder, "one", [ok(frame, TRUTH) for frame in range(3)])
+    assert score_dataset(folder).variants[0].rows[0].bound_m is None
+    table = pq.read_table(folder / "truth.parquet")
+    bounds = pa.array([[1e-6, 0, 0, 0, 1e-6, 0, 0, 0, 2e-6]] * 3, table.schema.field("bound_m2").type)
+    index = table.schema.get_field_index("bound_m2")
+    pq.write_table(table.set_column(index, "bound_m2", bounds), folder / "truth.parquet")
+    later = (folder / "scores.json").stat().st_mtime + 10
+    os.utime(folder / "truth.parquet", (later, later))
+    assert read_or_score(folder).variants[0].rows[0].bound_m == pytest.approx(2e-3)
+
+
 def test_what_cannot_be_scored_is_named(tmp_path: Path) -> None:
     folder = small_dataset(tmp_path)
     with pytest.raises(InputError, match="no estimates to score"):
@@ -136,16 +201,3 @@ def test_what_cannot_be_scored_is_named(tmp_path: Path) -> None:
     (folder / "truth.parquet").unlink()
     with pytest.raises(InputError, match=r"truth.parquet: no such file"):
         score_dataset(folder)
-
-
-def test_lengths_for_people() -> None:
-    lengths = [None, 0.0, 1.234e-5, 0.0123456, 0.5, 12.345, 4.2e7]
-    assert [length_text(length) for length in lengths] == [
-        "–",
-        "0 µm",
-        "12.3 µm",
-        "12.3 mm",
-        "500 mm",
-        "12.3 m",
-        "4.2e+07 m",
-    ]

@@ -1,0 +1,112 @@
+"""The page's parts: marks that tell many variants apart, curves that end where the answers do, the bound in sight."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+from test_estimator_score import LEDS, TRUTH, failed, ok, truths
+
+from estimator.figures import Decades, distribution_plot, error_plot
+from estimator.report import page
+from estimator.score import Scores, VariantScore, score_variant
+from estimator.svg import COLOURS, DASHES, MARKS, mark, style_of_variants
+
+BOUND = (1e-6, 0.0, 0.0, 0.0, 1e-6, 0.0, 0.0, 0.0, 2e-6)
+
+
+def scored(
+    errors_m: Sequence[float | None], name: str = "x", bound_m2: tuple[float, ...] | None = None
+) -> VariantScore:
+    x, y, z = TRUTH
+    rows = [failed(k, "a: b") if e is None else ok(k, (x + e, y, z)) for k, e in enumerate(errors_m)]
+    return score_variant(name, rows, truths(len(rows), bound_m2), LEDS)
+
+
+def scores_of(variants: Sequence[VariantScore]) -> Scores:
+    return Scores(dataset="set", room_m=(4.0, 5.0, 3.5), led_map=tuple(LEDS.values()), variants=tuple(variants))
+
+
+def test_28_variants_have_marks_and_curves_of_their_own() -> None:
+    count = len(COLOURS) * len(MARKS)
+    style = style_of_variants(count)
+    looks = set()
+    for index in range(count):
+        (colour,) = re.findall(rf"svg \.v{index} {{ stroke: (#\w+);", style)
+        (dash,) = re.findall(rf"svg \.curve\.v{index} {{ stroke-dasharray: ([^;]+);", style)
+        shape = re.sub(rf"v{index}\b", "", mark(0, 0, 1, index))
+        looks.add((colour, dash, shape))
+        assert (colour, shape) not in [(c, s) for c, d, s in looks if d != dash]
+    assert len(looks) == count
+    assert len(DASHES) == len(MARKS)
+
+
+def curve_ends(svg: str) -> list[float]:
+    """Shares at which the curves end, from the height of their last step between the first rules (0 and 100 %)."""
+    rules = [float(y) for y in re.findall(r'<line class="rule" x1="72\.0" y1="([\d.]+)"', svg)]
+    bottom, top = max(rules), min(rules)
+    ends = []
+    for path in re.findall(r'<path class="curve v\d+" d="M72 \d+([^"]*)"', svg):
+        steps = [float(y) for y in re.findall(r"V([\d.]+)", path)]
+        ends.append((bottom - steps[-1]) / (bottom - top) if steps else 0.0)
+    return ends
+
+
+def test_a_curve_ends_at_the_share_of_all_frames_that_was_answered() -> None:
+    """To a tenth of a pixel of 300."""
+    variants = [scored([0.1] * 4), scored([0.1, None, None, 0.2]), scored([None] * 4)]
+    assert curve_ends(distribution_plot(variants)) == pytest.approx([1.0, 0.5, 0.0], abs=1e-3)
+
+
+def test_the_bound_is_in_both_plots_where_there_is_one() -> None:
+    without, with_bound = scored([0.1, None]), scored([0.1, None], bound_m2=BOUND)
+    assert "bound" not in error_plot([without]) + distribution_plot([without])
+    # A ledge also for the frame that failed: the bound is the frame's.
+    (ledges,) = re.findall(r'<path class="bound" d="([^"]*)"', error_plot([with_bound]))
+    assert ledges.count("h") == 2
+    assert distribution_plot([with_bound]).count('<line class="bound"') == 1
+
+
+def test_the_axis_holds_errors_and_bounds_and_no_more_labels_than_fit() -> None:
+    assert Decades.of([scored([0.03, 0.5])]) == Decades(-2, 0)
+    assert Decades.of([scored([0.03, 0.5], bound_m2=BOUND)]) == Decades(-3, 0)
+    assert Decades.of([scored([0.0, None])]) == Decades(-6, -5)
+    assert Decades.of([scored([None])]) == Decades(-3, 0)
+    assert Decades.of([]) == Decades(-3, 0)
+    assert len(Decades(-6, 100).labelled_m()) <= 13
+
+
+@pytest.mark.parametrize(("frames", "step"), [(1, 1), (12, 1), (13, 2), (200, 20), (601, 100)])
+def test_frames_are_numbered_in_round_steps(frames: int, step: int) -> None:
+    svg = error_plot([scored([None] * frames)])
+    numbers = [int(n) for n in re.findall(r'text-anchor="middle">(\d+)</text>', svg)]
+    assert numbers == list(range(0, frames, step))
+
+
+def test_odd_scores_make_a_page_too(tmp_path: Path) -> None:
+    """No variant, no frame, nothing answered, one perfect frame, an error beyond all bounds."""
+    for variants in (
+        [],
+        [scored([])],
+        [scored([None])],
+        [scored([0.0])],
+        [scored([1e99, None]), scored([0.1, 0.1], "y")],
+    ):
+        html = page([(tmp_path, scores_of(variants))])
+        assert "nan" not in html
+        assert html.count("<table>") == html.count("</table>")
+
+
+def test_the_page_pairs_each_variant_with_the_best_and_says_which(tmp_path: Path) -> None:
+    variants = [scored([0.2, 0.3], "far"), scored([0.1, None], "half"), scored([0.1, 0.1], "near:by=all")]
+    html = page([(tmp_path, scores_of(variants))])
+    assert "Frame by frame against near:by=all" in html
+    (table,) = re.findall(r"Frame by frame.*?<tbody>(.*?)</tbody>", html, flags=re.DOTALL)
+    assert table.count("<tr>") == 2
+    assert "near:" not in table
+
+
+def test_the_table_of_bounds_is_there_only_where_something_is_in_it(tmp_path: Path) -> None:
+    title = "The bound, and what the variants say of themselves"
+    assert title not in page([(tmp_path, scores_of([scored([0.1, 0.2])]))])
+    assert title in page([(tmp_path, scores_of([scored([0.1, 0.2], bound_m2=BOUND)]))])

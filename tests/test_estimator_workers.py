@@ -1,0 +1,41 @@
+"""Several processes give what one gives."""
+
+from pathlib import Path
+
+import pytest
+from estimator_synthetic import small_dataset
+
+from estimator.batch import estimate_dataset
+from estimator.dataset import read_dataset
+from estimator.errors import InputError
+from estimator.estimates import EstimateRow
+from estimator.variants import VARIANTS
+from estimator.workers import estimate_with_workers
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = small_dataset(tmp_path_factory.mktemp("workers"))
+    (folder / "frames/000001.exr").unlink()  # one frame that cannot be read
+    return folder
+
+
+def without_times(rows: dict[str, tuple[EstimateRow, ...]]) -> dict[str, list[str]]:
+    """To the last bit: a float's text in JSON reads back as the same float."""
+    return {name: [row.model_dump_json(exclude={"time_s"}) for row in of_variant] for name, of_variant in rows.items()}
+
+
+@pytest.mark.parametrize("workers", [1, 2, 7])
+def test_any_number_of_workers_gives_the_same_answers_in_order(folder: Path, workers: int) -> None:
+    dataset = read_dataset(folder)
+    alone = estimate_dataset(dataset, list(VARIANTS.values()), on_frame=lambda: None)
+    done: list[None] = []
+    shared = estimate_with_workers(dataset, list(VARIANTS), workers, on_frame=lambda: done.append(None))
+    assert without_times(shared) == without_times(alone)
+    assert [row.frame for row in shared["pnp"]] == [0, 1, 2]
+    assert len(done) == 3
+
+
+def test_an_unknown_name_is_refused_before_a_process_starts(folder: Path) -> None:
+    with pytest.raises(InputError, match="variant best: unknown"):
+        estimate_with_workers(read_dataset(folder), ["best"], 2, on_frame=lambda: None)
