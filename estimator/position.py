@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from estimator.errors import EstimationFailure
+from estimator.ranging import COMMON_HEIGHT_M
 
 Floats = NDArray[np.float64]
 
@@ -24,7 +25,7 @@ def position_from_ranges(leds_m: Floats, ranges_m: Floats) -> Floats:
     by least squares and z from the spheres themselves, `z = z_L - sqrt(mean(d^2 - rho^2))`.
     Raises EstimationFailure for fewer than three LEDs, LEDs on one line, and a mean below zero.
     """
-    _check_pattern(leds_m, needed=3, flat=True)
+    _check_ceiling(leds_m, needed=3)
     planar = leds_m[:, :2]
     centre = planar.mean(axis=0)
     offsets = planar - centre
@@ -51,7 +52,7 @@ def position_by_shifted_leds(leds_m: Floats, ranges_m: Floats) -> Floats:
     mean of the spheres are taken, by least squares. The "vector estimation" to follow is not described.
     Raises EstimationFailure for fewer than four LEDs and LEDs on one line.
     """
-    _check_pattern(leds_m, needed=4, flat=True)
+    _check_ceiling(leds_m, needed=4)
     shifted = leds_m.copy()
     shifted[:, 2] += SHIFT_M * (np.arange(len(leds_m)) / (len(leds_m) - 1)) ** 2
     centre = shifted.mean(axis=0)
@@ -67,7 +68,7 @@ def position_by_range_fit(leds_m: Floats, ranges_m: Floats) -> Floats:
     Levenberg-Marquardt from below the LEDs' centre, at the mean range. LEDs may be at different heights. Raises
     EstimationFailure for fewer than three LEDs, LEDs on one line, and where the fit ends above the lowest LED.
     """
-    _check_pattern(leds_m, needed=3, flat=True)
+    check_pattern(leds_m, needed=3)
     start = leds_m.mean(axis=0) - [0.0, 0.0, float(np.abs(ranges_m).mean())]
 
     def residuals(position_m: Floats) -> Floats:
@@ -90,7 +91,7 @@ def position_from_pixels(leds_m: Floats, pixels: Floats, K: Floats) -> Floats:
     Levenberg-Marquardt. Of those with every LED in front of the camera and above it, the one that projects best.
     Raises EstimationFailure for fewer than four LEDs, LEDs on one line, and where no candidate is left.
     """
-    _check_pattern(leds_m, needed=4, flat=False)
+    check_pattern(leds_m, needed=4)
     centre_m = leds_m.mean(axis=0)
     model = np.ascontiguousarray(leds_m - centre_m)
     # OpenCV knows no skew, so K is taken out here; this also makes its pixel convention no matter.
@@ -128,11 +129,17 @@ def _candidates(model: Floats, image: Floats, method: int) -> list[tuple[Floats,
     return poses
 
 
-def _check_pattern(leds_m: Floats, needed: int, flat: bool) -> None:
-    """Refuse LEDs that do not fix a position: too few, or all on one line (looking at x and y alone where `flat`)."""
+def check_pattern(leds_m: Floats, needed: int) -> None:
+    """Refuse LEDs (n, 3) that do not fix a position: fewer than `needed`, or all on one line."""
     if len(leds_m) < needed:
         raise EstimationFailure("position", f"LEDs identified: {len(leds_m)}, needed: {needed}")
-    points = leds_m[:, :2] if flat else leds_m
-    length, width = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[:2]
+    length, width = np.linalg.svd(leds_m - leds_m.mean(axis=0), compute_uv=False)[:2]
     if width <= NARROWEST_PATTERN * length:
         raise EstimationFailure("position", "the LEDs are on one line")
+
+
+def _check_ceiling(leds_m: Floats, needed: int) -> None:
+    """Refuse LEDs that do not fix a position by Eq. 4 without its z column, which needs them at one height too."""
+    check_pattern(leds_m * [1.0, 1.0, 0.0], needed)
+    if np.ptp(leds_m[:, 2]) > COMMON_HEIGHT_M:
+        raise EstimationFailure("position", "the LEDs are not at a common height")

@@ -3,10 +3,14 @@
 from estimator.dataset import DeviceFrame
 from estimator.errors import InputError
 from estimator.huynh2016 import HUYNH2016, HUYNH2016_AS_PRINTED, huynh2016_with
+from estimator.kim import KIM
+from estimator.nakazawa2013 import NAKAZAWA2013
 from estimator.pipeline import Estimate, Variant
 from estimator.position import position_from_pixels
+from estimator.rahman2011 import RAHMAN2011
 from estimator.sighting import centroids_px, led_positions_m, sightings
 from estimator.undistort import pinhole_pixels
+from estimator.yoshino2008 import YOSHINO2008
 
 
 def pnp(frame: DeviceFrame) -> Estimate:
@@ -21,6 +25,10 @@ VARIANTS = {
     for variant in (
         HUYNH2016,
         HUYNH2016_AS_PRINTED,
+        YOSHINO2008,
+        NAKAZAWA2013,
+        RAHMAN2011,
+        KIM,
         Variant("pnp", "perspective-n-point (SQPNP, IPPE, Levenberg-Marquardt) on raw centroids, no gravity", pnp),
     )
 }
