@@ -29,14 +29,18 @@ FEWEST_LEDS = 2
 
 def kim(frame: DeviceFrame) -> Estimate:
     """Position from vectors by disparity, of cameras that look straight up. May fail by name."""
-    if np.degrees(np.abs(tilt_from_gravity(frame.accelerometer_m_s2)).max()) > MOST_TILT_DEG:
-        raise EstimationFailure("level", "the camera is tilted, and the method takes it to be parallel to the ceiling")
     seen, vectors_m = led_vectors(frame)
     ranges_m = {s.led.id: float(d) for s, d in zip(seen, np.linalg.norm(vectors_m, axis=1), strict=True)}
     try:
+        _check_level(frame.accelerometer_m_s2)
         return Estimate(position_from_vectors(led_positions_m(seen), vectors_m), ranges_m)
     except EstimationFailure as failure:
         raise EstimationFailure(failure.stage, failure.why, ranges_m) from None
+
+
+def _check_level(accelerometer_m_s2: tuple[float, float, float]) -> None:
+    if np.degrees(np.abs(tilt_from_gravity(accelerometer_m_s2)).max()) > MOST_TILT_DEG:
+        raise EstimationFailure("level", "the camera is tilted, and the method takes it to be parallel to the ceiling")
 
 
 def position_from_vectors(leds_m: Floats, vectors_m: Floats) -> Floats:
