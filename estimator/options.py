@@ -18,12 +18,12 @@ def read_options(name: str, stages: Mapping[str, Sequence[str]]) -> dict[str, st
     for part in name.partition(":")[2].split(","):
         stage, equals, value = part.partition("=")
         if not equals:
-            raise InputError(f"--variant {name}: {part!r} is not stage=value; stages: {', '.join(stages)}")
+            raise InputError(f"variant {name}: {part!r} is not stage=value; stages: {', '.join(stages)}")
         if stage not in stages:
-            raise InputError(f"--variant {name}: unknown stage {stage!r}; allowed: {', '.join(stages)}")
+            raise InputError(f"variant {name}: unknown stage {stage!r}; allowed: {', '.join(stages)}")
         if value not in stages[stage]:
-            raise InputError(f"--variant {name}: {stage}={value!r} is unknown; allowed: {', '.join(stages[stage])}")
+            raise InputError(f"variant {name}: {stage}={value!r} is unknown; allowed: {', '.join(stages[stage])}")
         if stage in chosen:
-            raise InputError(f"--variant {name}: {stage} is chosen twice")
+            raise InputError(f"variant {name}: {stage} is chosen twice")
         chosen[stage] = value
     return chosen

@@ -42,7 +42,7 @@ def variant_named(name: str) -> Variant:
     if colon and base in STAGED:
         return STAGED[base](name)
     if colon and base in VARIANTS:
-        raise InputError(f"--variant {name}: {base} has no stages to choose; those that have: {', '.join(STAGED)}")
+        raise InputError(f"variant {name}: {base} has no stages to choose; those that have: {', '.join(STAGED)}")
     if name not in VARIANTS:
-        raise InputError(f"--variant {name}: unknown; allowed: {', '.join(VARIANTS)}")
+        raise InputError(f"variant {name}: unknown; allowed: {', '.join(VARIANTS)}")
     return VARIANTS[name]

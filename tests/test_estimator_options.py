@@ -19,15 +19,15 @@ def test_stages_are_read_in_any_order() -> None:
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("paint:", "--variant paint:: '' is not stage=value; stages: hue, shade"),
-        ("paint:hue", "--variant paint:hue: 'hue' is not stage=value; stages: hue, shade"),
-        ("paint:hue=red,", "--variant paint:hue=red,: '' is not stage=value; stages: hue, shade"),
-        ("paint:tone=red", "--variant paint:tone=red: unknown stage 'tone'; allowed: hue, shade"),
-        ("paint:hue=", "--variant paint:hue=: hue='' is unknown; allowed: red, blue"),
-        ("paint:hue=dark", "--variant paint:hue=dark: hue='dark' is unknown; allowed: red, blue"),
-        ("paint:hue=red=blue", "--variant paint:hue=red=blue: hue='red=blue' is unknown; allowed: red, blue"),
-        ("paint:hue=../../red", "--variant paint:hue=../../red: hue='../../red' is unknown; allowed: red, blue"),
-        ("paint:hue=red,hue=red", "--variant paint:hue=red,hue=red: hue is chosen twice"),
+        ("paint:", "variant paint:: '' is not stage=value; stages: hue, shade"),
+        ("paint:hue", "variant paint:hue: 'hue' is not stage=value; stages: hue, shade"),
+        ("paint:hue=red,", "variant paint:hue=red,: '' is not stage=value; stages: hue, shade"),
+        ("paint:tone=red", "variant paint:tone=red: unknown stage 'tone'; allowed: hue, shade"),
+        ("paint:hue=", "variant paint:hue=: hue='' is unknown; allowed: red, blue"),
+        ("paint:hue=dark", "variant paint:hue=dark: hue='dark' is unknown; allowed: red, blue"),
+        ("paint:hue=red=blue", "variant paint:hue=red=blue: hue='red=blue' is unknown; allowed: red, blue"),
+        ("paint:hue=../../red", "variant paint:hue=../../red: hue='../../red' is unknown; allowed: red, blue"),
+        ("paint:hue=red,hue=red", "variant paint:hue=red,hue=red: hue is chosen twice"),
     ],
 )
 def test_what_is_wrong_is_named(name: str, message: str) -> None:
@@ -64,9 +64,9 @@ def test_all_choices_are_file_names() -> None:
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("best", f"--variant best: unknown; allowed: {', '.join(VARIANTS)}"),
-        ("best:spot=centroid", f"--variant best:spot=centroid: unknown; allowed: {', '.join(VARIANTS)}"),
-        ("pnp:spot=centroid", "--variant pnp:spot=centroid: pnp has no stages to choose; those that have: huynh2016"),
+        ("best", f"variant best: unknown; allowed: {', '.join(VARIANTS)}"),
+        ("best:spot=centroid", f"variant best:spot=centroid: unknown; allowed: {', '.join(VARIANTS)}"),
+        ("pnp:spot=centroid", "variant pnp:spot=centroid: pnp has no stages to choose; those that have: huynh2016"),
     ],
 )
 def test_names_there_are_none_of(name: str, message: str) -> None:
