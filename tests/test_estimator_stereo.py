@@ -37,7 +37,7 @@ def images(view: View) -> tuple[Array, Array]:
 
 @pytest.mark.parametrize("yaw_deg", [0.0, 35.0, -170.0])
 def test_level_cameras_are_found_exactly(yaw_deg: float) -> None:
-    view = view_of((3, 2, 3.45), 2.5, yaw_deg=yaw_deg)
+    view = view_of((3.1, 1.8, 3.45), 2.5, yaw_deg=yaw_deg)
     # 1e-16 of rounding over the disparity of 0.04; times (distance / pattern)^2 = 40 for the ranges.
     np.testing.assert_allclose(rahman(*images(view)), view.position_m, atol=1e-11)
     np.testing.assert_allclose(kim(*images(view)), view.position_m, atol=1e-11)
@@ -74,7 +74,7 @@ def test_the_error_is_what_the_noise_predicts(method: Callable[[Array, Array], A
 
     Its mean over n draws has a standard error of sqrt(6 / n). Second order: noise over disparity, 1e-4.
     """
-    view = view_of((3, 2, 3.45), 2.5, yaw_deg=20)
+    view = view_of((3.1, 1.8, 3.45), 2.5, yaw_deg=20)
     exact = np.concatenate(images(view)).ravel()
 
     def position(flat: Array) -> Array:
