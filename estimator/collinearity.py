@@ -29,8 +29,8 @@ START_STEP_DEG = 7.5
 START_REACH_DEG = 75.0
 MOST_STARTS = 4
 MOST_STEPS = 50
-# Of an angle in radians, and of a length in units of the distance.
-TOLERANCE = 1e-11
+# A step this small, in radians and of the distance, is the last: the next would be its square, or noise times it.
+TOLERANCE = 1e-9
 # Directions closer to the axis than this have the slopes of the axis itself, to 1e-12.
 ON_AXIS = 1e-6
 # A levelled ray that rises less would meet the ceiling some ten room heights away.
@@ -97,7 +97,8 @@ def gauss_newton(leds_m: Floats, image: Floats, projection: Projection, start: P
     for _ in range(MOST_STEPS):
         seen = (leds_m - position_m) @ R_cam_world.T
         expected, slopes = image_of(seen, projection)
-        if not np.isfinite(expected).all() or (projection == "perspective" and (seen[:, 2] <= 0).any()):
+        imaged = np.isfinite(expected).all() and np.isfinite(slopes).all()
+        if not imaged or (projection == "perspective" and (seen[:, 2] <= 0).any()):
             return None
         # A small turn w after R moves p_cam by w x p_cam: no angles, and so no gimbal lock.
         turned = np.cross(np.eye(3)[None], seen[:, None])
