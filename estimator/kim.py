@@ -22,7 +22,7 @@ from estimator.stereo import led_vectors
 
 Floats = NDArray[np.float64]
 
-# A tilt of 5 deg moves the answer by 0.09 of the depth: 0.2 m and more, and it is not the method's fault.
+# A tilt of 5 deg moves the answer by 0.09 of the depth, 0.2 m below a ceiling: no answer any more.
 MOST_TILT_DEG = 5.0
 FEWEST_LEDS = 2
 
