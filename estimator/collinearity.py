@@ -45,7 +45,7 @@ def position_by_collinearity(leds_m: Floats, image: Floats, projection: Projecti
     smallest sum of squares. Raises EstimationFailure for fewer than four LEDs, LEDs on one line, and where none is
     left.
     """
-    check_pattern(leds_m, needed=FEWEST_LEDS)
+    check_pattern(leds_m, needed=FEWEST_LEDS, flat=False)
     best_error, best = np.inf, None
     for start in starts(leds_m, _directions(image, projection)):
         pose = gauss_newton(leds_m, image, projection, start)

@@ -68,7 +68,7 @@ def position_by_range_fit(leds_m: Floats, ranges_m: Floats) -> Floats:
     Levenberg-Marquardt from below the LEDs' centre, at the mean range. LEDs may be at different heights. Raises
     EstimationFailure for fewer than three LEDs, LEDs on one line, and where the fit ends above the lowest LED.
     """
-    check_pattern(leds_m, needed=3)
+    check_pattern(leds_m, needed=3, flat=False)
     start = leds_m.mean(axis=0) - [0.0, 0.0, float(np.abs(ranges_m).mean())]
 
     def residuals(position_m: Floats) -> Floats:
@@ -91,7 +91,7 @@ def position_from_pixels(leds_m: Floats, pixels: Floats, K: Floats) -> Floats:
     Levenberg-Marquardt. Of those with every LED in front of the camera and above it, the one that projects best.
     Raises EstimationFailure for fewer than four LEDs, LEDs on one line, and where no candidate is left.
     """
-    check_pattern(leds_m, needed=4)
+    check_pattern(leds_m, needed=4, flat=False)
     centre_m = leds_m.mean(axis=0)
     model = np.ascontiguousarray(leds_m - centre_m)
     # OpenCV knows no skew, so K is taken out here; this also makes its pixel convention no matter.
@@ -129,17 +129,18 @@ def _candidates(model: Floats, image: Floats, method: int) -> list[tuple[Floats,
     return poses
 
 
-def check_pattern(leds_m: Floats, needed: int) -> None:
-    """Refuse LEDs (n, 3) that do not fix a position: fewer than `needed`, or all on one line."""
+def check_pattern(leds_m: Floats, needed: int, flat: bool) -> None:
+    """Refuse LEDs that do not fix a position: too few, or all on one line (looking at x and y alone where `flat`)."""
     if len(leds_m) < needed:
         raise EstimationFailure("position", f"LEDs identified: {len(leds_m)}, needed: {needed}")
-    length, width = np.linalg.svd(leds_m - leds_m.mean(axis=0), compute_uv=False)[:2]
+    points = leds_m[:, :2] if flat else leds_m
+    length, width = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[:2]
     if width <= NARROWEST_PATTERN * length:
         raise EstimationFailure("position", "the LEDs are on one line")
 
 
 def _check_ceiling(leds_m: Floats, needed: int) -> None:
     """Refuse LEDs that do not fix a position by Eq. 4 without its z column, which needs them at one height too."""
-    check_pattern(leds_m * [1.0, 1.0, 0.0], needed)
+    check_pattern(leds_m, needed, flat=True)
     if np.ptp(leds_m[:, 2]) > COMMON_HEIGHT_M:
         raise EstimationFailure("position", "the LEDs are not at a common height")
