@@ -3,13 +3,17 @@
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
 
 from estimator.errors import EstimationFailure
+from estimator.ranging import COMMON_HEIGHT_M
 
 Floats = NDArray[np.float64]
 
 # Width over length of the LEDs' pattern. Below this a position across the line is all noise; Table 1's LEDs have 0.083.
 NARROWEST_PATTERN = 0.01
+# Rahman's "small value" by which LEDs are moved in z; theirs is not known. Well above what rounding does to a range.
+SHIFT_M = 0.01
 # Depth over length: from here on the planar solver starts from a wrong model.
 FLATTEST_PATTERN = 1e-3
 
@@ -21,7 +25,7 @@ def position_from_ranges(leds_m: Floats, ranges_m: Floats) -> Floats:
     by least squares and z from the spheres themselves, `z = z_L - sqrt(mean(d^2 - rho^2))`.
     Raises EstimationFailure for fewer than three LEDs, LEDs on one line, and a mean below zero.
     """
-    _check_pattern(leds_m, needed=3, flat=True)
+    _check_ceiling(leds_m, needed=3)
     planar = leds_m[:, :2]
     centre = planar.mean(axis=0)
     offsets = planar - centre
@@ -35,6 +39,51 @@ def position_from_ranges(leds_m: Floats, ranges_m: Floats) -> Floats:
     return np.array([*(centre + solution), leds_m[:, 2].mean() - np.sqrt(height_m2)])
 
 
+def position_by_shifted_leds(leds_m: Floats, ranges_m: Floats) -> Floats:
+    """The position that Eq. 4 gives once LEDs are moved slightly in z so that it has a z column, (3,) metres.
+
+    The trick of Rahman, Haque & Kim 2011 that Huynh & Yoo 2016 adopt (section 2.1), and it finds no height. The ranges
+    stay those to the true LEDs, at height h, while the spheres are put around LEDs at h + e_i. Their differences are
+    then solved by `(x, y, h)`, wherever the camera is, but for terms of the size of the e_i: z comes out at the
+    ceiling. Noise in d^2 goes into z divided by 2 e_i, and from there into x and y.
+
+    Filled in: the LEDs' shifts, `SHIFT_M (k / (n - 1))^2` for the k-th of n. They must not go linearly with x and y, or
+    the columns would still depend on each other; alternating signs do on a square of four. All differences from the
+    mean of the spheres are taken, by least squares. The "vector estimation" to follow is not described.
+    Raises EstimationFailure for fewer than four LEDs and LEDs on one line.
+    """
+    _check_ceiling(leds_m, needed=4)
+    shifted = leds_m.copy()
+    shifted[:, 2] += SHIFT_M * (np.arange(len(leds_m)) / (len(leds_m) - 1)) ** 2
+    centre = shifted.mean(axis=0)
+    offsets = shifted - centre
+    right = (offsets**2).sum(axis=1) - ranges_m**2
+    solution, *_ = np.linalg.lstsq(2 * offsets, right - right.mean(), rcond=None)
+    return np.asarray(centre + solution)
+
+
+def position_by_range_fit(leds_m: Floats, ranges_m: Floats) -> Floats:
+    """The position below the LEDs whose distances to them come nearest to the ranges (n,) in squares, (3,) metres.
+
+    Levenberg-Marquardt from below the LEDs' centre, at the mean range. LEDs may be at different heights. Raises
+    EstimationFailure for fewer than three LEDs, LEDs on one line, and where the fit ends above the lowest LED.
+    """
+    check_pattern(leds_m, needed=3, flat=False)
+    start = leds_m.mean(axis=0) - [0.0, 0.0, float(np.abs(ranges_m).mean())]
+
+    def residuals(position_m: Floats) -> Floats:
+        return np.asarray(np.linalg.norm(position_m - leds_m, axis=1) - ranges_m)
+
+    def slopes(position_m: Floats) -> Floats:
+        towards = position_m - leds_m
+        return np.asarray(towards / np.linalg.norm(towards, axis=1, keepdims=True))
+
+    fit = least_squares(residuals, start, jac=slopes, method="lm", xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    if not fit.x[2] < leds_m[:, 2].min():
+        raise EstimationFailure("position", "no position below the LEDs fits the ranges")
+    return np.asarray(fit.x, dtype=np.float64)
+
+
 def position_from_pixels(leds_m: Floats, pixels: Floats, K: Floats) -> Floats:
     """The camera's position, (3,) metres, from LEDs (n, 3) and their pixels (n, 2), without any reading of gravity.
 
@@ -42,7 +91,7 @@ def position_from_pixels(leds_m: Floats, pixels: Floats, K: Floats) -> Floats:
     Levenberg-Marquardt. Of those with every LED in front of the camera and above it, the one that projects best.
     Raises EstimationFailure for fewer than four LEDs, LEDs on one line, and where no candidate is left.
     """
-    _check_pattern(leds_m, needed=4, flat=False)
+    check_pattern(leds_m, needed=4, flat=False)
     centre_m = leds_m.mean(axis=0)
     model = np.ascontiguousarray(leds_m - centre_m)
     # OpenCV knows no skew, so K is taken out here; this also makes its pixel convention no matter.
@@ -80,7 +129,7 @@ def _candidates(model: Floats, image: Floats, method: int) -> list[tuple[Floats,
     return poses
 
 
-def _check_pattern(leds_m: Floats, needed: int, flat: bool) -> None:
+def check_pattern(leds_m: Floats, needed: int, flat: bool) -> None:
     """Refuse LEDs that do not fix a position: too few, or all on one line (looking at x and y alone where `flat`)."""
     if len(leds_m) < needed:
         raise EstimationFailure("position", f"LEDs identified: {len(leds_m)}, needed: {needed}")
@@ -88,3 +137,10 @@ def _check_pattern(leds_m: Floats, needed: int, flat: bool) -> None:
     length, width = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[:2]
     if width <= NARROWEST_PATTERN * length:
         raise EstimationFailure("position", "the LEDs are on one line")
+
+
+def _check_ceiling(leds_m: Floats, needed: int) -> None:
+    """Refuse LEDs that do not fix a position by Eq. 4 without its z column, which needs them at one height too."""
+    check_pattern(leds_m, needed, flat=True)
+    if np.ptp(leds_m[:, 2]) > COMMON_HEIGHT_M:
+        raise EstimationFailure("position", "the LEDs are not at a common height")

@@ -29,6 +29,13 @@ def rotation(tilt_x: float, tilt_y: float) -> NDArray[np.float64]:
     return np.array([[cy, 0, -sy], [sx * sy, cx, sx * cy], [cx * sy, -sx, cx * cy]])
 
 
+def printed_eq6(tilt_x: float, tilt_y: float) -> NDArray[np.float64]:
+    """Eq. 6 as printed, (3, 3), at zeta = 0: two of its elements lack a factor, and it is no rotation once tilted."""
+    cx, sx = np.cos(tilt_x), np.sin(tilt_x)
+    cy, sy = np.cos(tilt_y), np.sin(tilt_y)
+    return np.array([[cy, 0, -sy], [sx * sy, cx, sx], [0, -sx, cx * cy]])
+
+
 def levelling_homography(K: NDArray[np.float64], R_cam_world: NDArray[np.float64]) -> NDArray[np.float64]:
     """`K R^T K^-1`, (3, 3): takes pixels to those of a level camera at the same place (Eq. 10 without translation)."""
     return np.asarray(K @ R_cam_world.T @ np.linalg.inv(K))

@@ -2,11 +2,15 @@
 
 from estimator.dataset import DeviceFrame
 from estimator.errors import InputError
-from estimator.huynh2016 import huynh2016, huynh2016_as_printed
+from estimator.huynh2016 import HUYNH2016, HUYNH2016_AS_PRINTED, huynh2016_with
+from estimator.kim import KIM
+from estimator.nakazawa2013 import NAKAZAWA2013
 from estimator.pipeline import Estimate, Variant
 from estimator.position import position_from_pixels
+from estimator.rahman2011 import RAHMAN2011
 from estimator.sighting import centroids_px, led_positions_m, sightings
 from estimator.undistort import pinhole_pixels
+from estimator.yoshino2008 import YOSHINO2008
 
 
 def pnp(frame: DeviceFrame) -> Estimate:
@@ -19,23 +23,26 @@ def pnp(frame: DeviceFrame) -> Estimate:
 VARIANTS = {
     variant.name: variant
     for variant in (
-        Variant(
-            "huynh2016",
-            "Huynh & Yoo 2016, corrected: denoise, centroids, level by gravity, ranges from pairs, trilateration",
-            huynh2016,
-        ),
-        Variant(
-            "huynh2016-as-printed",
-            "Huynh & Yoo 2016 as printed: brightest pixels, Eq. 3 with its extra cosines",
-            huynh2016_as_printed,
-        ),
+        HUYNH2016,
+        HUYNH2016_AS_PRINTED,
+        YOSHINO2008,
+        NAKAZAWA2013,
+        RAHMAN2011,
+        KIM,
         Variant("pnp", "perspective-n-point (SQPNP, IPPE, Levenberg-Marquardt) on raw centroids, no gravity", pnp),
     )
 }
+STAGED = {"huynh2016": huynh2016_with}
+"""Pipelines whose stages can be chosen after a colon, by name: from the whole text to the variant."""
 
 
 def variant_named(name: str) -> Variant:
-    """The pipeline of this name; raises InputError for one there is none of."""
+    """The variant of this name, or of `NAME:stage=value,...` (estimator/options.py); raises InputError."""
+    base, colon, _ = name.partition(":")
+    if colon and base in STAGED:
+        return STAGED[base](name)
+    if colon and base in VARIANTS:
+        raise InputError(f"variant {name}: {base} has no stages to choose; those that have: {', '.join(STAGED)}")
     if name not in VARIANTS:
         raise InputError(f"variant {name}: unknown; allowed: {', '.join(VARIANTS)}")
     return VARIANTS[name]

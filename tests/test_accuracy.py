@@ -11,7 +11,7 @@ from estimator.dataset import Dataset, read_dataset, read_frame
 from estimator.position import position_from_ranges
 from estimator.ranging import law_of_sines, led_ranges
 from estimator.rectify import level, rotation, tilt_from_gravity
-from estimator.variants import VARIANTS
+from estimator.variants import VARIANTS, variant_named
 from vlcrender.camera import Camera
 from vlcrender.generate import generate
 from vlcrender.recipe import load_plan
@@ -102,7 +102,7 @@ def test_the_printed_equation_3_does_not_find_the_camera(ideal: Path) -> None:
     dataset = read_dataset(ideal)
     frame = read_frame(dataset, dataset.frames[0])
     with pytest.raises(Exception, match="too short to reach"):
-        VARIANTS["huynh2016-as-printed"].estimate(frame)
+        variant_named("huynh2016:ranges=printed").estimate(frame)
 
 
 def test_fov_of_the_default_camera_is_the_papers_sensor_and_lens() -> None:

@@ -5,7 +5,13 @@ import pytest
 from estimator_synthetic import Array, grid, view_of
 
 from estimator.errors import EstimationFailure
-from estimator.position import position_from_pixels, position_from_ranges
+from estimator.position import (
+    SHIFT_M,
+    position_by_range_fit,
+    position_by_shifted_leds,
+    position_from_pixels,
+    position_from_ranges,
+)
 
 TABLE_1 = np.array([[0.5, 1.5, 3.5], [0.3, 1.9, 3.5], [0.8, 1.2, 3.5], [0.9, 1.1, 3.5]])
 TRIANGLE = np.array([[0.0, 0, 4], [3.0, 0, 4], [0, 3.0, 4]])
@@ -43,6 +49,63 @@ def test_two_leds_are_refused() -> None:
 def test_ranges_too_short_are_refused() -> None:
     with pytest.raises(EstimationFailure, match=r"position: .*too short"):
         position_from_ranges(TRIANGLE, np.array([1.0, 1.0, 1.0]))
+
+
+def test_leds_at_different_heights_are_refused_where_z_comes_from_the_spheres() -> None:
+    leds = TABLE_1 + np.array([[0, 0, 0.0], [0, 0, 0.002], [0, 0, 0], [0, 0, 0]])
+    for method in (position_from_ranges, position_by_shifted_leds):
+        with pytest.raises(EstimationFailure, match="position: the LEDs are not at a common height"):
+            method(leds, ranges_from(leds, np.array([0.6, 1.4, 0.0])))
+
+
+@pytest.mark.parametrize("leds", [TABLE_1, TRIANGLE, grid(5, 4, 0.14, (3, 2, 2.7))], ids=["table 1", "three", "grid"])
+@pytest.mark.parametrize("position", [(0.6, 1.4, 0.0), (2.0, 5.0, 1.0), (-3.0, 0.5, 2.0)])
+def test_the_range_fit_agrees(leds: Array, position: tuple[float, float, float]) -> None:
+    """Least squares stand still where rounding does: 1e-15 of 5 m over Table 1's narrowness of 0.065 m, at 6 m."""
+    found = position_by_range_fit(leds, ranges_from(leds, np.array(position)))
+    np.testing.assert_allclose(found, position, atol=1e-9)
+
+
+def test_the_range_fit_takes_leds_at_different_heights() -> None:
+    leds = grid(3, 3, 0.4, (3, 2, 2.7)) + np.random.default_rng(1).uniform(0, 0.3, (9, 3))
+    found = position_by_range_fit(leds, ranges_from(leds, np.array([2.5, 2.2, 0.4])))
+    np.testing.assert_allclose(found, [2.5, 2.2, 0.4], atol=1e-10)
+
+
+def test_the_range_fit_minimises_the_squares_of_the_ranges() -> None:
+    """At the minimum every direction leads up: by half the curvature, n = 9 LEDs, times the step squared, or less."""
+    leds = grid(3, 3, 0.5, (3, 2, 2.7))
+    ranges = ranges_from(leds, np.array([2.5, 2.2, 0.4])) + np.random.default_rng(2).normal(0, 0.01, 9)
+    found = position_by_range_fit(leds, ranges)
+
+    def cost(position: Array) -> float:
+        return float(((ranges_from(leds, position) - ranges) ** 2).sum())
+
+    for step in 1e-3 * np.concatenate([np.eye(3), -np.eye(3)]):
+        assert cost(found + step) > cost(found)
+
+
+@pytest.mark.parametrize("leds", [TABLE_1, grid(5, 4, 0.14, (3, 2, 3.5)), grid(2, 2, 0.3, (3, 2, 3.5))])
+@pytest.mark.parametrize("position", [(0.6, 1.4, 0.0), (2.0, 3.0, 1.0), (2.5, 0.5, 2.0)])
+def test_shifted_leds_find_no_height(leds: Array, position: tuple[float, float, float]) -> None:
+    """Exact ranges, and the answer is at the LEDs' 3.5 m wherever the camera is; x and y are right.
+
+    What the shifts e_i leave is the best fit of e_i^2 / 2 by x, y and e_i. By e_i alone it needs at most SHIFT_M, and
+    that in x and y at most SHIFT_M^2 over the pattern's width, 0.065 m for Table 1's.
+    """
+    found = position_by_shifted_leds(leds, ranges_from(leds, np.array(position)))
+    assert abs(found[2] - 3.5) < 2 * SHIFT_M
+    np.testing.assert_allclose(found[:2], position[:2], atol=2 * SHIFT_M**2 / 0.065)
+
+
+def test_shifted_leds_and_range_fits_refuse_what_fixes_nothing() -> None:
+    with pytest.raises(EstimationFailure, match="position: LEDs identified: 3, needed: 4"):
+        position_by_shifted_leds(TRIANGLE, np.array([4.0, 5, 5]))
+    with pytest.raises(EstimationFailure, match="position: LEDs identified: 2, needed: 3"):
+        position_by_range_fit(TRIANGLE[:2], np.array([4.0, 5]))
+    line = TABLE_1[[0, 2, 3]]
+    with pytest.raises(EstimationFailure, match="position: the LEDs are on one line"):
+        position_by_range_fit(line, ranges_from(line, np.array([0.6, 1.4, 0.0])))
 
 
 @pytest.mark.parametrize("yaw_deg", [0.0, 130.0])

@@ -5,7 +5,7 @@ import pytest
 from estimator_synthetic import GRAVITY_M_S2, View, grid, view_of
 
 from estimator.errors import EstimationFailure
-from estimator.rectify import level, levelling_homography, rotation, tilt_from_gravity
+from estimator.rectify import level, levelling_homography, printed_eq6, rotation, tilt_from_gravity
 
 K = np.array([[1000.0, 0, 200], [0, 1000.0, 150], [0, 0, 1]])
 
@@ -29,6 +29,15 @@ def test_tilt_comes_back_from_gravity_whatever_the_yaw(tilt_x_deg: float, tilt_y
 def test_the_rotation_is_the_formats_product() -> None:
     view = View(400, 300, 1500.0, (0, 0, 0), 33, -47)
     np.testing.assert_allclose(rotation(np.radians(33), np.radians(-47)), view.R_cam_world, atol=1e-15)
+
+
+def test_the_printed_eq_6_is_right_for_tilt_x_alone() -> None:
+    """Its element (2, 3) lacks cos(xi); (3, 1) is 0, with sin(zeta) as a factor that should be sin(xi) cos(zeta)."""
+    np.testing.assert_allclose(printed_eq6(0.5, 0.0), rotation(0.5, 0.0), atol=1e-15)
+    wrong = printed_eq6(0.5, 0.3) - rotation(0.5, 0.3)
+    assert wrong[1, 2] == pytest.approx(np.sin(0.5) * (1 - np.cos(0.3)))
+    assert wrong[2, 0] == pytest.approx(-np.cos(0.5) * np.sin(0.3))
+    assert np.count_nonzero(np.abs(wrong) > 1e-15) == 2
 
 
 def test_raising_tilt_x_moves_a_lamp_overhead_down_and_tilt_y_moves_it_left() -> None:
