@@ -4,6 +4,7 @@ One ray through each pixel's centre, and a grid of rays in each pixel where two 
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -44,7 +45,7 @@ class Background:
         origin = mi.Point3f(*_opaque(np.array([pose.position_m]))[0])
         hit = self.room.look(origin, direction, self._values[rates])
         value = relative_illumination(camera, u, v, dr, hit.value)
-        return Hit(value, hit.surface, hit.distance_m)
+        return replace(hit, value=value)
 
     def images(
         self, camera: Camera, pose: Pose, frames: Sequence[Window], rates: tuple[float, float]

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from vlcrender.backend import dr, mi
 from vlcrender.geometry import Mesh
+from vlcrender.glass import pane_reflectance
 from vlcrender.irradiance import Light
 from vlcrender.scene import Pane
 
@@ -22,12 +23,14 @@ Array = NDArray[np.float64]
 class Hit:
     """Dr.Jit arrays, one entry a ray: light seen, number of the surface met, and the distance to it in metres.
 
-    `surface` counts surfaces, then furniture, then panes, then nothing.
+    `surface` counts surfaces, then furniture, then panes, then nothing. `path_m` is the way to what a pane shows, and
+    `distance_m` where the ray meets none.
     """
 
     value: Any
     surface: Any
     distance_m: Any
+    path_m: Any
 
 
 class Room:
@@ -40,11 +43,8 @@ class Room:
         self._panes = panes
         vertices, faces, owners = [mesh.vertices_m], [mesh.faces], [mesh.owners]
         for number, pane in enumerate(panes):
-            corners = [
-                pane.corner_m + a * pane.edge_u_m + b * pane.edge_v_m for a, b in ((0, 0), (1, 0), (1, 1), (0, 1))
-            ]
             first = len(mesh.vertices_m) + 4 * number
-            vertices.append(np.stack(corners))
+            vertices.append(pane.corners_m)
             faces.append(np.array([[0, 1, 2], [0, 2, 3]]) + first)
             owners.append(np.full(2, self.first_pane + number))
         all_faces = np.concatenate(faces)
@@ -59,8 +59,7 @@ class Room:
         normals = np.zeros((self.nothing + 1, 3))
         indices = np.ones(self.nothing + 1)
         for number, pane in enumerate(panes):
-            normal = np.cross(pane.edge_u_m, pane.edge_v_m)
-            normals[self.first_pane + number] = normal / np.linalg.norm(normal)
+            normals[self.first_pane + number] = pane.normal
             indices[self.first_pane + number] = pane.refractive_index
         self._pane_normal = mi.Vector3f(*normals.T.astype(np.float32))
         self._pane_index = mi.Float(indices.astype(np.float32))
@@ -76,16 +75,18 @@ class Room:
     def look(self, origin: Any, direction: Any, values: Any, coherent: bool = True) -> Hit:
         """Cast rays (Dr.Jit points and unit directions, world)."""
         value, surface, distance = self._meet(origin, direction, values, coherent, mi.Bool(True))
+        path = distance
         if self._panes:
             on_pane = (surface >= self.first_pane) & (surface < self.nothing)
             normal = dr.gather(mi.Vector3f, self._pane_normal, surface)
             cosine = dr.abs(dr.dot(direction, normal))
             onward = direction - 2 * dr.dot(direction, normal) * normal
             start = dr.fma(direction, distance, origin) + normal * 1e-5
-            second, _, _ = self._meet(start, onward, values, False, on_pane)
+            second, _, beyond = self._meet(start, onward, values, False, on_pane)
             reflectance = pane_reflectance(cosine, dr.gather(mi.Float, self._pane_index, surface), dr.sqrt)
             value = dr.select(on_pane, dr.lerp(value, second, reflectance), value)
-        return Hit(value, surface, distance)
+            path = dr.select(on_pane, distance + beyond, distance)
+        return Hit(value, surface, distance, path)
 
     def _meet(self, origin: Any, direction: Any, values: Any, coherent: bool, active: Any) -> tuple[Any, Any, Any]:
         hit = self._scene.ray_intersect_preliminary(mi.Ray3f(origin, direction), coherent=coherent, active=active)
@@ -95,15 +96,3 @@ class Room:
         at = [dr.gather(mi.Float, values, dr.gather(mi.UInt32, c, triangle, valid), valid) for c in self._corners]
         value = dr.fma(b2, at[2] - at[0], dr.fma(b1, at[1] - at[0], at[0]))
         return dr.select(valid, value, 0.0), dr.gather(mi.UInt32, self._owners, triangle), dr.select(valid, hit.t, 1e9)
-
-
-def pane_reflectance(cosine: Any, index: Any, sqrt: Any) -> Any:
-    """Reflectance of a thin pane: Fresnel's F for unpolarised light at both faces, 2 F / (1 + F).
-
-    `cosine` is that of the angle of incidence; NumPy or Dr.Jit arrays, with their square root.
-    """
-    inside = sqrt(1.0 - (1.0 - cosine * cosine) / (index * index))
-    s = (cosine - index * inside) / (cosine + index * inside)
-    p = (inside - index * cosine) / (inside + index * cosine)
-    face = (s * s + p * p) / 2.0
-    return 2.0 * face / (1.0 + face)

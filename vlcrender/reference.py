@@ -60,7 +60,7 @@ def reference_cd_m2(
     return stack.mean(axis=0), stack.var(axis=0, ddof=1) / BATCHES
 
 
-class _FirstSurface(mi.SamplingIntegrator):  # type: ignore[misc]
+class _FirstSurface(mi.SamplingIntegrator):
     """What an even illuminance makes of the first diffuse surface that a ray meets, panes followed."""
 
     def __init__(self, illuminance_lux: float) -> None:
@@ -75,7 +75,8 @@ class _FirstSurface(mi.SamplingIntegrator):  # type: ignore[misc]
 
 @dr.syntax
 def _look(scene: Any, sampler: Any, ray: Any, active: Any) -> Any:
-    reflectance, met, panes = mi.Float(0.0), mi.Bool(False), mi.UInt32(0)
+    met, panes = mi.Bool(False), mi.UInt32(0)
+    reflectance: Any = mi.Float(0.0)
     while active:
         si = scene.ray_intersect(ray, active)
         bsdf = si.bsdf()

@@ -18,13 +18,13 @@ from vlcrender.backend import dr, exact_math, mi
 from vlcrender.background import Background, sub_pixels
 from vlcrender.camera import Camera, Pose, project, rays_world
 from vlcrender.errors import InputError
+from vlcrender.glass import pane_reflectance
 from vlcrender.irradiance import Light, bake
 from vlcrender.led_image import image_of_led, leds_that_may_be_seen
 from vlcrender.led_shape import Disc, Rectangle
 from vlcrender.lens import blur, blur_kernel, relative_illumination
 from vlcrender.photometry import Silicon, electron_rate_per_cd_m2
-from vlcrender.raycast import pane_reflectance
-from vlcrender.scene import Pane, Scene
+from vlcrender.scene import Scene
 from vlcrender.view import Image, LedPatch, Reflection, View, ViewPart
 from vlcrender.windows import LedWindows, Window, led_windows
 
@@ -173,11 +173,10 @@ class Renderer:
             backgrounds, surfaces = self._background.images(camera, place, wide, rates)
             self._hide_behind_leds(wide, backgrounds, seen, rates)
             totals = backgrounds if totals is None else [t + b for t, b in zip(totals, backgrounds, strict=True)]
-            for number, pane in enumerate(self.scene.panes):
+            for number in range(len(self.scene.panes)):
                 label = self._background.room.first_pane + number
-                shown = [s == label for s in surfaces]
-                if any(s.any() for s in shown):
-                    reflections += self._reflections(camera, place, pane, wide, shown, rates[0] / len(places))
+                if any((s == label).any() for s in surfaces):
+                    reflections += self._reflections(camera, place, number, wide, rates[0] / len(places))
         assert totals is not None  # there is at least one place
         kernel = _typical(kernels)
         means = []
@@ -268,7 +267,7 @@ class Renderer:
             coverage = image.coverage
             seen = 1.0
             if self._may_hide:
-                clear = self._clear_share(camera, pose, float(leds.centers_m[i, 2]), window, coverage > 0)
+                clear = self._clear_share(camera, pose, pose, None, float(leds.centers_m[i, 2]), window, coverage > 0)
                 seen = float((coverage * clear).sum() / coverage.sum())
                 coverage = coverage * clear
             if seen > 0:
@@ -277,9 +276,19 @@ class Renderer:
                 yield int(i), _Lit(window, coverage, weight, seen * image.visible_fraction, seen * imaged)
 
     def _clear_share(
-        self, camera: Camera, pose: Pose, height_m: float, window: Window, lit: NDArray[np.bool_]
+        self,
+        camera: Camera,
+        pose: Pose,
+        seen_from: Pose,
+        pane: int | None,
+        height_m: float,
+        window: Window,
+        lit: NDArray[np.bool_],
     ) -> Array:
-        """Share of each lit pixel from which nothing hides the plane of an LED at this height, (rows, columns)."""
+        """Share of each lit pixel from which nothing hides the plane of an LED at this height, (rows, columns).
+
+        `seen_from` is the camera's own pose, or its mirror image in the pane of that number, which has to be met.
+        """
         rows, columns = np.nonzero(lit)
         clear = np.ones(lit.shape)
         with exact_math():
@@ -287,38 +296,41 @@ class Renderer:
                 mi.Float((columns + window.column + 0.5).astype(np.float32)),
                 mi.Float((rows + window.row + 0.5).astype(np.float32)),
             )
-            reached = self._reaches(camera, pose, height_m, u, v)
+            reached = self._reaches(camera, pose, seen_from, pane, height_m, u, v)
             clear[rows, columns] = reached
             if 0 < reached.sum() < len(reached):  # an edge crosses the LED
                 u, v = sub_pixels(rows + window.row, columns + window.column)
-                clear[rows, columns] = self._reaches(camera, pose, height_m, u, v).reshape(len(rows), -1).mean(axis=1)
+                each = self._reaches(camera, pose, seen_from, pane, height_m, u, v)
+                clear[rows, columns] = each.reshape(len(rows), -1).mean(axis=1)
         return clear
 
-    def _reaches(self, camera: Camera, pose: Pose, height_m: float, u: "mi.Float", v: "mi.Float") -> Array:
-        """1 where the ray of a pixel position gets to this height, 0 where something is in its way."""
-        hit = self._background.look(camera, pose, u, v)
-        pixels = np.stack([u.numpy(), v.numpy()], axis=-1).astype(np.float64)
-        rays = rays_world(camera, pose, pixels)
-        to_plane = (height_m - pose.position_m[2]) / rays[:, 2] * np.sqrt((rays**2).sum(axis=1))
-        dr.eval(hit.distance_m)
-        reached: Array = (hit.distance_m.numpy() > to_plane * (1 - SAME_PLACE)).astype(np.float64)
-        return reached
-
-    def _reflections(
+    def _reaches(
         self,
         camera: Camera,
         pose: Pose,
-        pane: Pane,
-        frames: Sequence[Window],
-        shown: Sequence[NDArray[np.bool_]],
-        lamp: float,
+        seen_from: Pose,
+        pane: int | None,
+        height_m: float,
+        u: "mi.Float",
+        v: "mi.Float",
+    ) -> Array:
+        """1 where the ray of a pixel position gets to this height, 0 where something is in its way."""
+        hit = self._background.look(camera, pose, u, v)
+        way_m = hit.distance_m if pane is None else dr.select(hit.surface == pane, hit.path_m, 0.0)
+        pixels = np.stack([u.numpy(), v.numpy()], axis=-1).astype(np.float64)
+        rays = rays_world(camera, seen_from, pixels)
+        to_plane = (height_m - pose.position_m[2]) / rays[:, 2] * np.sqrt((rays**2).sum(axis=1))
+        dr.eval(way_m)
+        reached: Array = (way_m.numpy() > to_plane * (1 - SAME_PLACE)).astype(np.float64)
+        return reached
+
+    def _reflections(
+        self, camera: Camera, pose: Pose, number: int, frames: Sequence[Window], lamp: float
     ) -> list[Reflection]:
-        """LEDs in a pane. `shown` says in which pixels of each window the pane is seen."""
-        leds = self.scene.leds
-        normal = np.cross(pane.edge_u_m, pane.edge_v_m)
-        normal = normal / np.linalg.norm(normal)
-        mirror = np.eye(3) - 2 * np.outer(normal, normal)
-        behind = np.array(pose.position_m) - 2 * float(normal @ (np.array(pose.position_m) - pane.corner_m)) * normal
+        """LEDs in a pane, as far as it reaches and nothing stands in the way to it or from it."""
+        leds, pane = self.scene.leds, self.scene.panes[number]
+        mirror = np.eye(3) - 2 * np.outer(pane.normal, pane.normal)
+        behind = pane.mirrored(np.array(pose.position_m))
         mirrored = MirroredPose(
             (float(behind[0]), float(behind[1]), float(behind[2])),
             pose.tilt_x_deg,
@@ -326,25 +338,30 @@ class Renderer:
             pose.yaw_deg,
             tuple(map(tuple, mirror.tolist())),
         )
+        label = self._background.room.first_pane + number
         found = []
         for i in leds_that_may_be_seen(camera, mirrored, leds.centers_m, leds.reaches_m):
             image = image_of_led(camera, mirrored, leds.centers_m[i], self._shapes[i])
             if image is None:
                 continue
             window = Window(image.row, image.column, *image.coverage.shape)
+            if not any(frame.overlaps(window) for frame in frames):
+                continue
+            height_m = float(leds.centers_m[i, 2])
+            clear = self._clear_share(camera, pose, mirrored, label, height_m, window, image.coverage > 0)
             centers = _centers(window)
             rays = rays_world(camera, mirrored, centers)
-            cosine = np.abs(_along(rays, normal)) / np.sqrt((rays**2).sum(axis=-1))
+            cosine = np.abs(_along(rays, pane.normal)) / np.sqrt((rays**2).sum(axis=-1))
             weight = relative_illumination(camera, centers[..., 0], centers[..., 1])
             weight = weight * pane_reflectance(cosine, pane.refractive_index, np.sqrt)
-            lit = _Lit(window, image.coverage, weight, 1.0, 1.0)
+            lit = _Lit(window, image.coverage * clear, weight, 1.0, 1.0)
             light = (
-                lamp * leds.luminances_cd_m2[i] * image.coverage * weight * self._pattern(camera, mirrored, int(i), lit)
+                lamp * leds.luminances_cd_m2[i] * lit.coverage * weight * self._pattern(camera, mirrored, int(i), lit)
             )
-            for frame, inside in zip(frames, shown, strict=True):
+            for frame in frames:
                 if frame.overlaps(window):
                     both = frame.common(window)
-                    part = light[window.slices(both)] * inside[frame.slices(both)]
+                    part = light[window.slices(both)]
                     if part.any():
                         found.append(Reflection(int(leds.ids[i]), both.row, both.column, part.astype(np.float32)))
         return found

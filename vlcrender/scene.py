@@ -48,6 +48,27 @@ class Pane:
         shares = ((0, 0), (1, 0), (1, 1), (0, 1))
         return np.stack([self.corner_m + a * self.edge_u_m + b * self.edge_v_m for a, b in shares])
 
+    @property
+    def normal(self) -> NDArray[np.float64]:
+        """Unit vector into the room."""
+        normal: NDArray[np.float64] = np.cross(self.edge_u_m, self.edge_v_m)
+        return normal / float(np.linalg.norm(normal))
+
+    def mirrored(self, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Mirror images (..., 3) of points (..., 3) in the pane's plane."""
+        height = ((points_m - self.corner_m) * self.normal).sum(axis=-1, keepdims=True)
+        images: NDArray[np.float64] = points_m - 2 * height * self.normal
+        return images
+
+    def holds(self, points_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Whether points (..., 3) of its plane are within the pane, (...,)."""
+        from_corner = points_m - self.corner_m
+        inside = np.ones(points_m.shape[:-1], dtype=bool)
+        for edge in (self.edge_u_m, self.edge_v_m):
+            share = (from_corner * edge).sum(axis=-1) / float(edge @ edge)
+            inside &= (share >= 0) & (share <= 1)
+        return inside
+
 
 @dataclass(frozen=True)
 class Leds:
