@@ -31,19 +31,37 @@ class Background:
 
     def __init__(self, scene: Scene, light: Light) -> None:
         """Prepare a scene with its baked light."""
-        self.room = Room(light.mesh, scene.panes)
+        self.room = Room(light.mesh, scene.panes, scene.surfaces)
         self._light = light
         self._values: dict[tuple[float, float], Any] = {}
 
-    def look(self, camera: Camera, pose: Pose, u: Any, v: Any, rates: tuple[float, float] = (0.0, 0.0)) -> Hit:
-        """What pixel positions (u, v) see, Dr.Jit arrays. The lens's relative illumination is in the value."""
+    def look(
+        self,
+        camera: Camera,
+        pose: Pose,
+        u: Any,
+        v: Any,
+        rates: tuple[float, float] = (0.0, 0.0),
+        size_px: float = 1.0,
+    ) -> Hit:
+        """What squares of `size_px` about the pixel positions (u, v) see, Dr.Jit arrays.
+
+        The lens's relative illumination is in the value.
+        """
         if rates not in self._values:
             self._values[rates] = self.room.values(self._light, *rates)
-        x, y, z = ray_of_pixel(camera, u, v, dr)
         to_world = _opaque(pose.rotation.T)
-        direction = dr.normalize(mi.Vector3f(*(row[0] * x + row[1] * y + row[2] * z for row in to_world)))
+
+        def ray(u: Any, v: Any) -> Any:
+            x, y, z = ray_of_pixel(camera, u, v, dr)
+            return dr.normalize(mi.Vector3f(*(row[0] * x + row[1] * y + row[2] * z for row in to_world)))
+
+        spread = None
+        if self.room.textures is not None:
+            half = size_px / 2
+            spread = ray(u + half, v) - ray(u - half, v), ray(u, v + half) - ray(u, v - half)
         origin = mi.Point3f(*_opaque(np.array([pose.position_m]))[0])
-        hit = self.room.look(origin, direction, self._values[rates])
+        hit = self.room.look(origin, ray(u, v), self._values[rates], spread=spread)
         value = relative_illumination(camera, u, v, dr, hit.value)
         return replace(hit, value=value)
 
@@ -71,7 +89,12 @@ class Background:
             columns = np.concatenate([c + frame.column for (_, c), frame in zip(pixels, frames, strict=True)])
             if len(rows):
                 u, v = sub_pixels(rows, columns)
-                means = self.look(camera, pose, u, v, rates).value.numpy().reshape(len(rows), -1).mean(axis=1)
+                means = (
+                    self.look(camera, pose, u, v, rates, 1 / EDGE_GRID)
+                    .value.numpy()
+                    .reshape(len(rows), -1)
+                    .mean(axis=1)
+                )
                 parts = np.split(means, np.cumsum([len(r) for r, _ in pixels])[:-1])
                 for image, pixel, mean in zip(images, pixels, parts, strict=True):
                     image[pixel] = mean

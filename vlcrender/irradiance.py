@@ -299,7 +299,7 @@ def _compute(scene: Scene, mesh: Mesh, progress: Progress) -> tuple[Array, Array
 
 
 def _key(scene: Scene, mesh: Mesh) -> str:
-    """Hash of all that the light depends on: geometry, reflectances, LEDs, windows and the number of paths."""
+    """Hash of all that the light depends on: geometry, reflectances, textures, LEDs, windows, number of paths."""
     digest = hashlib.sha256(f"light {CACHE_VERSION} {mi.__version__} {scene.settings.bake.paths}".encode())
     leds = scene.leds
     arrays = [mesh.vertices_m, mesh.probes_m, mesh.normals, mesh.albedo, mesh.faces]
@@ -307,6 +307,9 @@ def _key(scene: Scene, mesh: Mesh) -> str:
     for array in arrays:
         digest.update(np.ascontiguousarray(array).tobytes())
     digest.update(repr(list(map(_pane_key, scene.panes))).encode())
+    for surface in scene.surfaces:
+        if surface.texture is not None:
+            digest.update(np.ascontiguousarray(surface.texture.reflectances).tobytes())
     return digest.hexdigest()[:32]
 
 

@@ -18,6 +18,7 @@ from vlcrender.errors import InputError
 from vlcrender.furniture import furniture_meshes
 from vlcrender.irradiance import BEHIND_M, pane_bsdf, room_shape
 from vlcrender.scene import Scene, Surface
+from vlcrender.texture import Texture
 
 Array = NDArray[np.float64]
 
@@ -149,9 +150,10 @@ def scene_dict(scene: Scene, camera: Camera, pose: Pose) -> dict[str, object]:
     number = 0
     for surface in scene.surfaces:
         for corner, edge_u, edge_v in _without_holes(surface):
-            tree[f"surface{number}"] = _shape(
-                "rectangle", _frame(corner, edge_u, edge_v), _diffuse(surface.reflectance), 0.0
-            )
+            skin = _diffuse(surface.reflectance)
+            if surface.texture is not None:
+                skin["reflectance"] = _bitmap(surface.texture, corner, edge_u, edge_v)
+            tree[f"surface{number}"] = _shape("rectangle", _frame(corner, edge_u, edge_v), skin, 0.0)
             number += 1
     for i, mesh in enumerate(furniture_meshes(scene, 0)):
         tree[f"furniture{i}"] = room_shape(mesh, np.zeros(len(mesh.vertices_m)))
@@ -198,6 +200,20 @@ def _frame(corner: Array, edge_u: Array, edge_v: Array) -> Array:
     frame[:3, 2] = normal / np.linalg.norm(normal)
     frame[:3, 3] = corner + (edge_u + edge_v) / 2
     return frame
+
+
+def _bitmap(texture: Texture, corner: Array, edge_u: Array, edge_v: Array) -> dict[str, object]:
+    """A texture on Mitsuba's rectangle, whose (u, v) run along its edges; (0, 0) to (1, 1) is the image."""
+    size = np.array(texture.reflectances.shape[::-1])
+    start, along_u, along_v = (texture.at_px(corner + edge) / size for edge in (np.zeros(3), edge_u, edge_v))
+    to_uv = np.eye(3)
+    to_uv[:2] = np.stack([along_u - start, along_v - start, start], axis=1)
+    return {
+        "type": "bitmap",
+        "bitmap": mi.Bitmap(texture.reflectances[:, :, None].astype(np.float32)),
+        "raw": True,
+        "to_uv": mi.ScalarTransform3f(to_uv.tolist()),
+    }
 
 
 def _diffuse(reflectance: float) -> dict[str, object]:

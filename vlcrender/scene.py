@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlcrender.errors import InputError
-from vlcrender.scene_settings import PanelGrid, PanelLeds, Room, SceneSettings
+from vlcrender.scene_settings import PanelGrid, PanelLeds, Room, SceneSettings, TextureEntry
 from vlcrender.settings import check, read_toml
 from vlcrender.streams import stream
+from vlcrender.texture import Texture, read_reflectances
 
 TOUCH_M = 1e-9
 """Rounding allowance where an LED or panel touches a wall or another LED."""
@@ -27,8 +28,10 @@ class Surface:
     edge_u_m: NDArray[np.float64]
     edge_v_m: NDArray[np.float64]
     reflectance: float
+    """The mean, where there is a texture."""
     holes: tuple[tuple[float, float, float, float], ...] = ()
     """(a0, b0, a1, b1) of what is cut out: panels on a ceiling, windows in a wall."""
+    texture: Texture | None = None
 
 
 @dataclass(frozen=True)
@@ -108,7 +111,7 @@ class Scene:
     panes: tuple[Pane, ...]
     leds: Leds
     folder: Path
-    """Where furniture files are looked up."""
+    """Where furniture and textures are looked up."""
 
     @property
     def name(self) -> str:
@@ -127,13 +130,14 @@ def load_scene(path: Path) -> Scene:
 
 
 def build_scene(settings: SceneSettings, source: str, folder: Path = Path()) -> Scene:
-    """Lay out surfaces and LEDs; furniture files are below `folder`.
+    """Lay out surfaces and LEDs; files of furniture and textures are below `folder`.
 
-    Raises InputError, which starts with `source`, where something is outside the room, overlaps or is missing.
+    Raises InputError, which starts with `source`, where something is outside the room, overlaps, is missing or, of a
+    texture, cannot be used.
     """
     leds = _leds(settings, source)
     panes = _panes(settings, source)
-    surfaces = _room_surfaces(settings.room, settings.panels, panes)
+    surfaces = _room_surfaces(settings.room, settings.panels, panes, folder, source)
     for index, grid in enumerate(settings.panels):
         surfaces += _panel_surfaces(grid, np.array(settings.room.size_m), f"{source}: panels[{index}]")
     for index, piece in enumerate(settings.furniture):
@@ -237,18 +241,57 @@ def _check_leds(leds: Leds, origins: list[str], room_m: NDArray[np.float64], sou
             )
 
 
-def _room_surfaces(room: Room, panels: tuple[PanelGrid, ...], panes: tuple[Pane, ...]) -> list[Surface]:
+def _room_surfaces(
+    room: Room, panels: tuple[PanelGrid, ...], panes: tuple[Pane, ...], folder: Path, source: str
+) -> list[Surface]:
     o = np.zeros(3)
     x, y, z = (np.diag(room.size_m)[i] for i in range(3))
-    r = room.reflectance
+    skins = {name: _skin(room, name, folder, source) for name in ("floor", "ceiling", "walls")}
+    floor, ceiling = (_hung(skins[name], corner, x, y) for name, corner in (("floor", o), ("ceiling", z)))
     surfaces = [
-        Surface("floor", o, x, y, r.floor),
-        Surface("ceiling", z, y, x, r.ceiling, _panels_on_ceiling(room, panels)),
+        Surface("floor", o, x, y, skins["floor"].reflectance, texture=floor),
+        Surface("ceiling", z, y, x, skins["ceiling"].reflectance, _panels_on_ceiling(room, panels), ceiling),
     ]
     for name, (corner, edge_u, edge_v) in _walls(room).items():
         holes = tuple(_hole(pane, corner, edge_u, edge_v) for pane in panes if pane.name.startswith(f"window {name} "))
-        surfaces.append(Surface(f"wall {name}", corner, edge_u, edge_v, r.walls, holes))
+        along = y if name.startswith("x") else x
+        texture = _hung(skins["walls"], corner + z, along, -z)
+        surfaces.append(Surface(f"wall {name}", corner, edge_u, edge_v, skins["walls"].reflectance, holes, texture))
     return surfaces
+
+
+@dataclass(frozen=True)
+class _Skin:
+    """What a surface looks like: its (mean) reflectance, and an image with the size of its tile where it has one."""
+
+    reflectance: float
+    image: NDArray[np.float64] | None = None
+    tile_m: tuple[float, float] = (1.0, 1.0)
+
+
+def _skin(room: Room, name: str, folder: Path, source: str) -> _Skin:
+    reflectance: float | None = getattr(room.reflectance, name)
+    entry: TextureEntry | None = getattr(room.texture, name)
+    if entry is None:
+        if reflectance is None:
+            raise InputError(f"{source}: key room.reflectance.{name} is missing, and there is no room.texture.{name}")
+        return _Skin(reflectance)
+    if reflectance is not None:
+        raise InputError(
+            f"{source}: room.reflectance.{name} = {reflectance}: room.texture.{name} says it already; leave one out"
+        )
+    image = read_reflectances(folder / entry.file, f"{source}: room.texture.{name}.file = {entry.file!r}")
+    return _Skin(float(image.mean()), image, entry.tile_m)
+
+
+def _hung(
+    skin: _Skin, corner: NDArray[np.float64], across: NDArray[np.float64], down: NDArray[np.float64]
+) -> Texture | None:
+    """The skin's image with its first pixel in a corner and its sides along two edges."""
+    if skin.image is None:
+        return None
+    width, height = (side * edge / np.linalg.norm(edge) for side, edge in zip(skin.tile_m, (across, down), strict=True))
+    return Texture(skin.image, corner, width, height)
 
 
 def _walls(room: Room) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]]:

@@ -17,18 +17,39 @@ Spectrum = Literal["LED-B1", "LED-B2", "LED-B3", "LED-B4", "LED-B5", "LED-BH1", 
 
 
 class RoomReflectances(Settings):
-    """Diffuse reflectance (albedo) of the room's surfaces, 0 to 1."""
+    """Diffuse reflectance (albedo) of the room's surfaces, 0 to 1; none where a texture gives it."""
 
-    floor: Reflectance
-    ceiling: Reflectance
-    walls: Reflectance
+    floor: Reflectance | None = None
+    ceiling: Reflectance | None = None
+    walls: Reflectance | None = None
+
+
+class TextureEntry(Settings):
+    """An image whose grey values are a surface's reflectances, repeated tile by tile."""
+
+    file: Annotated[str, Field(pattern=r"\.png$")]
+    """Grey PNG of 8 or 16 bits, from the scene's folder; read linearly: 0 is black, the largest value reflects all."""
+    tile_m: tuple[Length, Length]
+    """What the image covers, across and down."""
+
+
+class RoomTextures(Settings):
+    """Images on the room's surfaces. Floor and ceiling: across is along x, down along y, from the origin.
+
+    Walls: across is along x or y from its smallest value, down is down from the ceiling.
+    """
+
+    floor: TextureEntry | None = None
+    ceiling: TextureEntry | None = None
+    walls: TextureEntry | None = None
 
 
 class Room(Settings):
-    """A box with one corner at the origin."""
+    """A box with one corner at the origin. Each surface has either a reflectance or a texture."""
 
     size_m: tuple[Length, Length, Length]
     reflectance: RoomReflectances
+    texture: RoomTextures = RoomTextures()
 
 
 class Ambient(Settings):
@@ -98,7 +119,7 @@ class Window(Settings):
 
 
 class Furniture(Settings):
-    """A mesh that occludes and reflects."""
+    """A closed mesh that occludes and reflects; it is lit where its corners run counter-clockwise."""
 
     file: Annotated[str, Field(pattern=r"\.(ply|obj|xml)$")]
     """PLY or OBJ, or Mitsuba XML with mesh shapes; from the scene's folder. Metres, z up."""
