@@ -78,11 +78,11 @@ def brute_force(texture: Texture, camera: Camera, pose: Pose, grid: int) -> np.n
 @pytest.mark.parametrize(
     "pose", [Pose((1.4, 1.5, 0.3)), Pose((1.4, 1.6, 0.3), yaw_deg=45.0), Pose((1.2, 1.3, 1.6), 40.0, 0.0, 70.0)]
 )
-@pytest.mark.parametrize("pitch_um", [1.2, 12.0, 36.0, 120.0], ids=["magnified", "alike", "3 to 1", "10 to 1"])
+@pytest.mark.parametrize("pitch_um", [1.2, 36.0, 120.0, 400.0], ids=["magnified", "alike", "3 to 1", "10 to 1"])
 def test_a_view_of_a_texture_errs_by_less_than_a_hundredth_of_the_shot_noise(
     tmp_path: Path, pitch_um: float, pose: Pose
 ) -> None:
-    """Tiles of 0.6 m in 128 pixels of 4.7 mm, seen from 2.2 m in pixels of 0.15 to 15 mm.
+    """Tiles of 0.6 m in 128 pixels of 4.7 mm, seen from 2.2 m in pixels of 0.15 to 50 mm.
 
     The brightest LED of 16 000 cd/m2 holds 4 000 electrons, so the ceiling under 440 lux some 28 at a reflectance of
     0.8. The error's variance is its mean square over the image, and the shot noise's is the mean number of electrons.
