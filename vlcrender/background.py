@@ -131,15 +131,15 @@ def _opaque(matrix: NDArray[np.float64]) -> "list[list[mi.Float]]":
 
 def _edges(surfaces: NDArray[np.uint32], window: Window, sensor: Window) -> NDArray[np.bool_]:
     """Pixels of a window in which surfaces may meet, whose numbers at the pixel centres are given."""
-    edges = _differs_from_neighbour(surfaces)
+    edges = differs_from_neighbour(surfaces)
     if not sensor.holds(window) and sensor.overlaps(window):
         on_sensor = window.slices(window.common(sensor))  # as in a full frame, which has no neighbours beyond
-        edges[on_sensor] = _differs_from_neighbour(surfaces[on_sensor])
+        edges[on_sensor] = differs_from_neighbour(surfaces[on_sensor])
     return edges
 
 
-def _differs_from_neighbour(labels: NDArray[np.uint32]) -> NDArray[np.bool_]:
-    """Pixels of which one of the 8 neighbours shows another surface."""
+def differs_from_neighbour(labels: NDArray[Any]) -> NDArray[np.bool_]:
+    """Pixels (rows, columns) of which one of the 8 neighbours has another label."""
     differs = np.zeros(labels.shape, dtype=bool)
     for here, there in (
         (np.s_[:, 1:], np.s_[:, :-1]),

@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from vlcrender.scene import Surface
+from vlcrender.surfaces import Surface
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

@@ -25,8 +25,9 @@ from vlcrender.backend import dr, exact_math, mi
 from vlcrender.furniture import furniture_meshes
 from vlcrender.geometry import Mesh, join, mesh_of_surfaces
 from vlcrender.glass import pane_reflectance
-from vlcrender.scene import Pane, Scene
+from vlcrender.scene import Scene
 from vlcrender.sources import Sources, point_sources
+from vlcrender.surfaces import Pane
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -301,9 +302,9 @@ def _compute(scene: Scene, mesh: Mesh, progress: Progress) -> tuple[Array, Array
 def _key(scene: Scene, mesh: Mesh) -> str:
     """Hash of all that the light depends on: geometry, reflectances, textures, LEDs, windows, number of paths."""
     digest = hashlib.sha256(f"light {CACHE_VERSION} {mi.__version__} {scene.settings.bake.paths}".encode())
-    leds = scene.leds
+    sources = point_sources(scene.leds)
     arrays = [mesh.vertices_m, mesh.probes_m, mesh.normals, mesh.albedo, mesh.faces]
-    arrays += [leds.centers_m, leds.areas_m2, leds.luminances_cd_m2, leds.orders]
+    arrays += [scene.leds.centers_m, sources.centers_m, sources.intensities_cd, sources.orders]
     for array in arrays:
         digest.update(np.ascontiguousarray(array).tobytes())
     digest.update(repr(list(map(_pane_key, scene.panes))).encode())

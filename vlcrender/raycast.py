@@ -20,7 +20,7 @@ from vlcrender.backend import dr, mi
 from vlcrender.geometry import Mesh
 from vlcrender.glass import pane_reflectance
 from vlcrender.irradiance import Light
-from vlcrender.scene import Pane, Surface
+from vlcrender.surfaces import Pane, Surface
 
 Array = NDArray[np.float64]
 

@@ -17,7 +17,8 @@ from vlcrender.camera import Camera, Pose, mitsuba_to_world, ray_of_pixel
 from vlcrender.errors import InputError
 from vlcrender.furniture import furniture_meshes
 from vlcrender.irradiance import BEHIND_M, pane_bsdf, room_shape
-from vlcrender.scene import Scene, Surface
+from vlcrender.scene import Scene
+from vlcrender.surfaces import TOUCH_M, Surface
 from vlcrender.texture import Texture
 
 Array = NDArray[np.float64]
@@ -25,6 +26,8 @@ Array = NDArray[np.float64]
 BATCHES = 8
 LED_STANDOFF_M = 1e-5
 """LEDs are put this far below what they are mounted on, so that a ray meets the LED first."""
+SHEET_PIXELS = 16
+"""Pixels, linear in between, of a diffuser's image in the distance that LEDs are behind it."""
 MAX_DEPTH = 24
 MOST_PANES = 4
 """Panes met one after the other on the way to what is looked at."""
@@ -153,7 +156,11 @@ def scene_dict(scene: Scene, camera: Camera, pose: Pose) -> dict[str, object]:
             skin = _diffuse(surface.reflectance)
             if surface.texture is not None:
                 skin["reflectance"] = _bitmap(surface.texture, corner, edge_u, edge_v)
-            tree[f"surface{number}"] = _shape("rectangle", _frame(corner, edge_u, edge_v), skin, 0.0)
+            part = _shape("rectangle", _frame(corner, edge_u, edge_v), skin, 0.0)
+            glow = _sheet_cd_m2(scene, surface)
+            if glow is not None:
+                part["emitter"] = {"type": "area", "radiance": {"type": "bitmap", "bitmap": glow, "raw": True}}
+            tree[f"surface{number}"] = part
             number += 1
     for i, mesh in enumerate(furniture_meshes(scene, 0)):
         tree[f"furniture{i}"] = room_shape(mesh, np.zeros(len(mesh.vertices_m)))
@@ -166,6 +173,8 @@ def scene_dict(scene: Scene, camera: Camera, pose: Pose) -> dict[str, object]:
         tree[f"outside{i}"] = _shape("rectangle", behind, _diffuse(0.0), pane.luminance_cd_m2)
     leds, face = scene.leds, scene.settings.led_reflectance
     for i in range(len(leds)):
+        if leds.sheets[i] is not None:
+            continue  # its sheet shines
         radius = leds.radii_m[i]
         frame = np.diag([radius, -radius, -1.0, 1.0])  # faces down
         frame[:3, 3] = leds.centers_m[i] - [0, 0, LED_STANDOFF_M]
@@ -200,6 +209,31 @@ def _frame(corner: Array, edge_u: Array, edge_v: Array) -> Array:
     frame[:3, 2] = normal / np.linalg.norm(normal)
     frame[:3, 3] = corner + (edge_u + edge_v) / 2
     return frame
+
+
+def _sheet_cd_m2(scene: Scene, surface: Surface) -> "mi.Bitmap | None":
+    """What LEDs make of a panel's diffuser, rows along edge_v and columns along edge_u; None for other surfaces."""
+    low = surface.corner_m
+    high = low + surface.edge_u_m + surface.edge_v_m
+    lit = [
+        (sheet, scene.leds.luminances_cd_m2[i])
+        for i, sheet in enumerate(scene.leds.sheets)
+        if sheet is not None
+        and abs(low[2] - scene.leds.centers_m[i, 2]) + abs(high[2] - low[2]) < TOUCH_M
+        and np.allclose(sheet.opening_m, [*low[:2], *high[:2]], rtol=0, atol=TOUCH_M)
+    ]
+    if not lit:
+        return None
+    step_m = min(sheet.distance_m for sheet, _ in lit) / SHEET_PIXELS
+    columns, rows = (int(np.ceil(np.linalg.norm(edge) / step_m)) for edge in (surface.edge_u_m, surface.edge_v_m))
+    b, a = np.meshgrid((np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij")
+    at = low + a[..., None] * surface.edge_u_m + b[..., None] * surface.edge_v_m
+    total = np.zeros((rows, columns))
+    for sheet, luminance in lit:
+        x0, y0, x1, y1 = sheet.lit_m
+        within = (at[..., 0] >= x0) & (at[..., 0] <= x1) & (at[..., 1] >= y0) & (at[..., 1] <= y1)
+        total += luminance * within * sheet.luminance(at[..., 0], at[..., 1])
+    return mi.Bitmap(total[:, :, None].astype(np.float32))
 
 
 def _bitmap(texture: Texture, corner: Array, edge_u: Array, edge_v: Array) -> dict[str, object]:

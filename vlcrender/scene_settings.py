@@ -85,11 +85,29 @@ class PanelLeds(Settings):
     shape: Literal["disc", "square"] = "disc"
     radius_m: Length
     luminance_cd_m2: tuple[Luminance, Luminance]
-    """Each LED's luminance is drawn evenly between the two, once and for all, by `luminance_seed`."""
+    """Of the bare LED, also behind a diffuser; drawn evenly between the two, once and for all, by `luminance_seed`."""
     luminance_seed: Identity = 0
     half_power_deg: HalfPower = 60.0
     first_id: Identity
     """LED (row, column) of panel (row, column): ids go up along columns first, then rows, then panels likewise."""
+
+
+class PanelFrame(Settings):
+    """A rim around a panel's underside, which hides LEDs from aside."""
+
+    width_m: Length
+    """Of the rim, inwards from the panel's sides; LEDs are within what it leaves open."""
+    depth_m: Length
+    """How far the rim stands down below the underside."""
+    reflectance: Reflectance
+
+
+class PanelDiffuser(Settings):
+    """A translucent sheet in place of a panel's underside, which spreads what falls on it evenly (Lambert)."""
+
+    distance_m: Length
+    """How far behind the sheet the LEDs are: 3 of their radii at least, and not more than the panel is high."""
+    transmittance: Annotated[float, Field(gt=0, le=1)]
 
 
 class PanelGrid(Settings):
@@ -103,6 +121,9 @@ class PanelGrid(Settings):
     size_m: tuple[Length, Length, Length]
     """Along x, along y, and upwards from the underside."""
     reflectance: Reflectance
+    """Of sides and underside; of a diffuser, its own."""
+    frame: PanelFrame | None = None
+    diffuser: PanelDiffuser | None = None
     leds: PanelLeds
 
 
