@@ -247,18 +247,25 @@ class Renderer:
     def _pattern(self, camera: Camera, pose: Pose, i: int, window: Window) -> Array | float:
         """Luminance over that of the bare LED along its normal, in each pixel of the window.
 
-        Of a bare LED cos^(m - 1); of a sheet the mean over the pixel, of 2 x 2 places (Gauss and Legendre).
+        Of a bare LED cos^(m - 1); of a sheet the mean over the pixel, of 2 x 2 places (Gauss and Legendre) where a
+        pixel sees more than a part FINE of the LED's distance behind it.
         """
         sheet, order = self.scene.leds.sheets[i], float(self.scene.leds.orders[i])
         if sheet is not None:
-            height = self.scene.leds.centers_m[i, 2] - pose.position_m[2]
-            total = np.zeros((window.rows, window.columns))
-            for off in itertools.product((-GAUSS_PX, GAUSS_PX), repeat=2):
+            height = float(self.scene.leds.centers_m[i, 2] - pose.position_m[2])
+
+            def at(off: tuple[float, float]) -> tuple[Array, Array]:
                 rays = rays_world(camera, pose, _centers(window) + np.array(off))
                 reach = height / np.maximum(rays[..., 2], 1e-9)
-                x, y = (pose.position_m[axis] + reach * rays[..., axis] for axis in (0, 1))
-                total += sheet.luminance(x, y)
-            return total / 4
+                return pose.position_m[0] + reach * rays[..., 0], pose.position_m[1] + reach * rays[..., 1]
+
+            middle = at((0.0, 0.0))
+            steps = [np.abs(np.diff(place, axis=axis)).max(initial=0.0) for place in middle for axis in (0, 1)]
+            if max(steps) < FINE * sheet.distance_m and min(window.rows, window.columns) > 1:
+                return sheet.luminance(*middle)
+            nodes = list(itertools.product((-GAUSS_PX, GAUSS_PX), repeat=2))
+            mean: Array = sum((sheet.luminance(*at(off)) for off in nodes), np.zeros(middle[0].shape)) / len(nodes)
+            return mean
         if abs(order - 1.0) < 1e-12:
             return 1.0
         rays = rays_world(camera, pose, _centers(window))
@@ -387,6 +394,8 @@ class Renderer:
 OUTSIDE = 2.0
 """Label of pixels that an LED does not light, where others are 0 and 1."""
 GAUSS_PX = 0.5 / np.sqrt(3.0)
+FINE = 0.02
+"""Of a pixel that sees less the middle is the mean, to 2 (m + 3) * 0.02^2 / 24: 3e-4 for an order m of 5."""
 BLUR_MARGIN_PX = 500
 """How far beside the sensor LEDs may be whose blur reaches it."""
 DEPTH_STEP = 0.005
