@@ -40,12 +40,13 @@ def reference_cd_m2(
 
     No photometry: no cos^4, no aperture. A pinhole is Mitsuba's own perspective sensor; of other lenses rays are drawn
     here, evenly over the pixel and the pupil, and followed by Mitsuba. The variance comes from the scatter of BATCHES
-    images. Raises InputError for what it cannot do: a psf, and LEDs that are not Lambertian, since Mitsuba's area
+    images. Raises InputError for what it cannot do: a psf, and bare LEDs that are not Lambertian, since Mitsuba's area
     emitters are Lambertian or send along the normal alone.
     """
     if camera.psf != "none":
         raise InputError(f"camera.psf = {camera.psf!r}: the reference renderer has no diffraction; it has to be 'none'")
-    if not np.allclose(scene.leds.orders, 1.0):
+    bare = np.array([sheet is None for sheet in scene.leds.sheets])
+    if not np.allclose(scene.leds.orders[bare], 1.0):
         raise InputError("half_power_deg: the reference renderer's LEDs are Lambertian; it has to be 60")
     loaded = mi.load_dict(scene_dict(scene, camera, pose), optimize=False)
     followed = mi.load_dict({"type": "path", "max_depth": MAX_DEPTH, "rr_depth": 8})
