@@ -54,7 +54,7 @@ def main() -> None:
     expected = view.expected_electrons(EXPOSURE_S)
     whole = Window.of_sensor(camera)
     dn = expose(sensor, expected, "bench")
-    loaded = mi.load_dict(scene_dict(scene, camera, POSE, glow=False), optimize=False)
+    loaded = mi.load_dict(scene_dict(scene, camera, POSE), optimize=False)
     depth, path = mi.load_dict({"type": "depth"}), mi.load_dict({"type": "path", "max_depth": 8})
     with tempfile.TemporaryDirectory() as folder:
         exr, png = Path(folder) / "frame.exr", Path(folder) / "frame.png"

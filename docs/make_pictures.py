@@ -9,7 +9,7 @@ from vlcrender.camera import Camera, Pose, rays_world
 from vlcrender.motion import Motion, poses_during
 from vlcrender.render import Renderer
 from vlcrender.rig import mounted_cameras
-from vlcrender.scene import Scene, build_scene
+from vlcrender.scene import Scene, build_scene, load_scene
 from vlcrender.scene_settings import SceneSettings
 from vlcrender.settings import check, read_toml
 
@@ -20,15 +20,30 @@ NARROW = {"width_px": 800, "height_px": 600, "pixel_pitch_um": 6.0}
 WIDE = {**NARROW, "focal_length_mm": 3.0}
 FISH_EYE = {**NARROW, "focal_length_mm": 1.6, "projection": "equidistant"}
 
-TABLE_OBJ = """\
+WHITES = {"diffusers": 50.0}
+"""Luminance shown white, over the median of the picture, where it is not 12."""
+
+BOARD_OBJ = """\
 v -0.4 -0.25 0
 v 0.4 -0.25 0
 v 0.4 0.25 0
 v -0.4 0.25 0
-f 1 2 3
-f 1 3 4
-f 3 2 1
-f 4 3 1
+v -0.4 -0.25 0.02
+v 0.4 -0.25 0.02
+v 0.4 0.25 0.02
+v -0.4 0.25 0.02
+f 1 3 2
+f 1 4 3
+f 5 6 7
+f 5 7 8
+f 1 2 6
+f 1 6 5
+f 2 3 7
+f 2 7 6
+f 3 4 8
+f 3 8 7
+f 4 1 5
+f 4 5 8
 """
 
 
@@ -46,13 +61,15 @@ def main() -> None:
     lamps = read_toml(ROOT / "scenes/office.toml")["panels"]
     squares = [{**lamps[0], "leds": {**lamps[0]["leds"], "shape": "square", "half_power_deg": 30.0}}]
     OUT.mkdir(exist_ok=True)
-    table = OUT / "table.obj"
-    table.write_text(TABLE_OBJ)
+    mesh = OUT / "board.obj"
+    mesh.write_text(BOARD_OBJ)
     ray = rays_world(Camera(**NARROW), TILTED, np.array([600.0, 330.0]))
     place = np.array(TILTED.position_m) + ray * 1.6 / ray[2]
-    board = {"file": "table.obj", "position_m": place.tolist(), "yaw_deg": 30.0, "scale": 0.2, "reflectance": 0.2}
+    board = {"file": "board.obj", "position_m": place.tolist(), "yaw_deg": 30.0, "scale": 0.2, "reflectance": 0.2}
     furnished = Renderer(office(OUT, furniture=[board]))
-    table.unlink()
+    mesh.unlink()
+    meeting = Renderer(load_scene(ROOT / "scenes/meeting_room.toml"))
+    six_mm = Camera(**{**NARROW, "focal_length_mm": 6.0})
     main_camera = Camera(**NARROW)
     (mounted,) = mounted_cameras(main_camera, ())
     moving = Motion(angular_velocity_deg_s=(0.0, 400.0, 150.0))
@@ -77,13 +94,20 @@ def main() -> None:
         ),
         "vignetting, closed at 50 deg": (plain, Camera(**WIDE, vignetting_deg=50.0), TILTED, None),
         "false LEDs in a window": (glass, Camera(**WIDE), Pose((2.5, 3.5, 1.2), tilt_y_deg=-60.0), None),
+        "tiled ceiling, a frame hides LEDs": (
+            meeting,
+            six_mm,
+            Pose((1.6, 0.4, 2.2), tilt_x_deg=-70.0, yaw_deg=10.0),
+            None,
+        ),
+        "diffusers": (meeting, six_mm, Pose((2.1, 1.2, 1.4), tilt_x_deg=10.0, yaw_deg=10.0), None),
     }
-    figure = Figure(figsize=(15, 6.2), layout="constrained")
+    figure = Figure(figsize=(15, 7.4), layout="constrained")
     for axes, (title, (renderer, camera, pose, during)) in zip(
-        figure.subplots(2, 5).ravel(), shots.items(), strict=True
+        figure.subplots(3, 4).ravel(), shots.items(), strict=True
     ):
         image = renderer.view(camera, pose, during=during).expected_electrons(1.0)
-        image = image / np.quantile(image, 0.5) / 12
+        image = image / np.quantile(image, 0.5) / WHITES.get(title, 12.0)
         axes.imshow(np.clip(image, 0, 1) ** (1 / 2.2), cmap="gray", vmin=0, vmax=1)
         axes.set_title(title, fontsize=10)
         axes.set_axis_off()

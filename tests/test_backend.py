@@ -53,6 +53,46 @@ def test_a_path_that_is_no_llvm_is_one_line_and_exit_code_2(tmp_path: Path) -> N
     assert "17" in run.stderr
 
 
+CUDA_HERE = backend.dr.has_backend(backend.dr.JitBackend.CUDA)
+
+
+@pytest.mark.parametrize(
+    ("variant", "message"),
+    [
+        ("scalar_rgb", "VLCRENDER_VARIANT=scalar_rgb: allowed are llvm_ad_mono, cuda_ad_mono"),
+        pytest.param(
+            "cuda_ad_mono", "no CUDA device", marks=pytest.mark.skipif(CUDA_HERE, reason="there is a CUDA device")
+        ),
+    ],
+)
+def test_a_variant_that_cannot_be_used_is_one_line_and_exit_code_2(tmp_path: Path, variant: str, message: str) -> None:
+    command = [sys.executable, "-c", "import sys; sys.argv[0] = 'vlcrender'; from vlcrender.cli import main; main()"]
+    run = subprocess.run(
+        [*command, "show", "scenes/table1.toml", "--out", str(tmp_path / "x.png")],
+        env={**os.environ, "VLCRENDER_VARIANT": variant, "DRJIT_LIBLLVM_PATH": ""},
+        cwd=Path(__file__).parent.parent,
+        capture_output=True,
+        text=True,
+    )
+    assert run.returncode == 2
+    assert run.stderr.count("\n") == 1
+    assert message in run.stderr
+
+
+def test_llvm_is_not_looked_for_where_another_variant_is_chosen(tmp_path: Path) -> None:
+    """With an LLVM that cannot be loaded the refusal is CUDA's, or none where there is a CUDA device."""
+    code = "from vlcrender.errors import InputError\ntry:\n import vlcrender.backend as b; print(b.VARIANT)\n"
+    run = subprocess.run(
+        [sys.executable, "-c", code + "except InputError as e:\n print(e)"],
+        env={**os.environ, "VLCRENDER_VARIANT": "cuda_ad_mono", "DRJIT_LIBLLVM_PATH": str(tmp_path / "none.so")},
+        cwd=Path(__file__).parent.parent,
+        capture_output=True,
+        text=True,
+    )
+    assert "LLVM" not in run.stdout
+    assert "cuda_ad_mono" in run.stdout
+
+
 @pytest.mark.skipif(shutil.which("ldconfig") is None, reason="asks ldconfig which LLVMs the system has")
 def test_system_libraries_older_than_17_are_never_chosen() -> None:
     listing = subprocess.run(["ldconfig", "-p"], capture_output=True, text=True).stdout

@@ -8,10 +8,12 @@ import pytest
 from conftest import ROOT
 
 from vlcrender.geometry import Mesh, join, mesh_of_surfaces
+from vlcrender.glass import pane_reflectance
 from vlcrender.irradiance import bake, led_illuminance_lux, mitsuba_scene, path_traced_lux, room_mesh
 from vlcrender.scene import Leds, Scene, build_scene, load_scene
 from vlcrender.scene_settings import SceneSettings
 from vlcrender.settings import check, read_toml
+from vlcrender.sources import point_sources
 
 TABLE1 = read_toml(ROOT / "scenes/table1.toml")
 
@@ -31,7 +33,11 @@ def empty_room(mesh: Mesh) -> object:
 
 def lux_on_floor(leds: Leds, x: float, y: float, scene: Scene) -> float:
     mesh = room_mesh(scene)
-    return float(led_illuminance_lux(empty_room(mesh), np.array([[x, y, 0.0]]), np.array([[0.0, 0.0, 1.0]]), leds)[0])
+    return float(
+        led_illuminance_lux(
+            empty_room(mesh), np.array([[x, y, 0.0]]), np.array([[0.0, 0.0, 1.0]]), point_sources(leds)
+        )[0]
+    )
 
 
 def test_below_a_disc() -> None:
@@ -66,7 +72,7 @@ def test_intensity_falls_to_half_at_the_half_power_angle(half_power_deg: float) 
     direction = np.array([np.sin(angle), 0.0, -np.cos(angle)])
     points = np.array([[3.5, 3.5, 3.5 - 1.0], [3.5, 3.5, 3.5] + direction])
     normals = np.array([[0.0, 0.0, 1.0], -direction])
-    straight, aside = led_illuminance_lux(empty_room(room_mesh(scene)), points, normals, scene.leds)
+    straight, aside = led_illuminance_lux(empty_room(room_mesh(scene)), points, normals, point_sources(scene.leds))
     assert aside / straight == pytest.approx(0.5, rel=1e-6)
 
 
@@ -75,7 +81,7 @@ def test_all_light_of_the_leds_falls_on_the_room(half_power_deg: float) -> None:
     """Flux of an LED of order m: 2 pi I_0 / (m + 1). The corners' trapezoidal sum misses little at 0.1 m."""
     scene = scene_of(led=[lamp(half_power_deg=half_power_deg)])
     mesh = mesh_of_surfaces(scene.surfaces, 0.1)
-    lux = led_illuminance_lux(empty_room(mesh), mesh.probes_m, mesh.normals, scene.leds)
+    lux = led_illuminance_lux(empty_room(mesh), mesh.probes_m, mesh.normals, point_sources(scene.leds))
     order = scene.leds.orders[0]
     flux = 2 * np.pi * 10000 * np.pi * 0.01**2 / (order + 1)
     # second-order rule on 0.1 m texels of a pattern some 3.5 m wide: (0.1 / 3.5)^2 = 8e-4, and the corners' inset
@@ -139,7 +145,7 @@ def test_furniture_casts_a_shadow_and_reflects(tmp_path: Path) -> None:
     blockers = empty_room(mesh)
     # the shadow on the floor ends at 0.5 * 3.5 / 2.75 = 0.636 m from the middle
     points = np.array([[3.5, 3.5, 0.0], [3.5 + 0.62, 3.5, 0.0], [3.5 + 0.66, 3.5, 0.0], [3.5, 3.6, 0.75]])
-    lux = led_illuminance_lux(blockers, points, np.tile([0.0, 0.0, 1.0], (4, 1)), scene.leds)
+    lux = led_illuminance_lux(blockers, points, np.tile([0.0, 0.0, 1.0], (4, 1)), point_sources(scene.leds))
     assert lux[:2].tolist() == [0.0, 0.0]
     alone = scene_of(led=[lamp()])
     assert lux[2] == pytest.approx(lux_on_floor(alone.leds, 4.16, 3.5, alone))
@@ -172,6 +178,38 @@ def test_a_window_lights_the_room_as_its_form_factor_says(tmp_path: Path) -> Non
     through = np.pi * 2000 * expected * (1 - 2 * face / (1 + face))
     ambient = scene.settings.ambient.illuminance_lux
     assert abs(light.surround_lux[point] - ambient - through) < 5 * light.sigma_lux[point] + 2e-3 * through
+
+
+MIRROR = {"wall": "x=0", "corner_m": [3.0, 0.5], "size_m": [1.0, 2.5], "luminance_cd_m2": 0.0}
+
+
+@pytest.mark.parametrize(("y", "mirrored"), [(3.5, True), (3.1, True), (1.9, False), (5.1, False)])
+def test_a_pane_mirrors_an_led_onto_what_its_mirror_image_sees_through_it(y: float, mirrored: bool) -> None:
+    """LED at x = 2, its image at x = -2; the point at x = 2 sees it half way, at (y + 3.5) / 2, in the pane or not."""
+    scene = scene_of(led=[lamp(position_m=[2.0, 3.5, 3.5])], window=[MIRROR])
+    blockers, sources = empty_room(room_mesh(scene)), point_sources(scene.leds)
+    point, up = np.array([[2.0, y, 0.0]]), np.array([[0.0, 0.0, 1.0]])
+    straight = led_illuminance_lux(blockers, point, up, sources)[0]
+    by_pane = led_illuminance_lux(blockers, point, up, sources, scene.panes)[0] - straight
+    d2 = 4.0**2 + (y - 3.5) ** 2 + 3.5**2
+    lux = 10000 * np.pi * 0.01**2 * (3.5**2 / d2) / d2 * pane_reflectance(4.0 / np.sqrt(d2), 1.52, np.sqrt)
+    # shadow rays start 0.1 mm off: no matter where the ray is not within that of the pane's border
+    assert by_pane == pytest.approx(lux if mirrored else 0.0, rel=1e-9, abs=1e-12)
+
+
+@pytest.mark.parametrize("x", [0.5, 1.5])
+def test_a_board_takes_the_mirrored_light_before_and_behind_the_pane(tmp_path: Path, x: float) -> None:
+    """The way is 3.5 m down over 4 m across: at z = 1.3 from the point (2, 3.5, 0) to the pane, at 2.2 from it on."""
+    for z, covers in ((3.5 * (2 - x) / 4, True), (3.5 * (2 + x) / 4, True), (0.1, False)):
+        corners = [(x - 0.1, 3.4), (x + 0.1, 3.4), (x + 0.1, 3.6), (x - 0.1, 3.6)]
+        (tmp_path / "b.obj").write_text("".join(f"v {a} {b} {z}\n" for a, b in corners) + "f 1 2 3\nf 1 3 4\n")
+        scene = scene_of(
+            tmp_path, led=[lamp(position_m=[2.0, 3.5, 3.5])], window=[MIRROR], furniture=[{"file": "b.obj"}]
+        )
+        blockers, sources = empty_room(room_mesh(scene)), point_sources(scene.leds)
+        arguments = blockers, np.array([[2.0, 3.5, 0.0]]), np.array([[0.0, 0.0, 1.0]]), sources
+        by_pane = led_illuminance_lux(*arguments, scene.panes)[0] - led_illuminance_lux(*arguments)[0]
+        assert (by_pane == 0) == covers
 
 
 def test_the_bake_is_kept_and_taken_again(tmp_path: Path) -> None:

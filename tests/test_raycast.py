@@ -7,9 +7,9 @@ import pytest
 from conftest import ROOT
 
 from vlcrender.camera import Camera, Pose, project
+from vlcrender.glass import pane_reflectance
 from vlcrender.lens import relative_illumination
 from vlcrender.photometry import Silicon, electron_rate_per_cd_m2
-from vlcrender.raycast import pane_reflectance
 from vlcrender.render import Renderer
 from vlcrender.scene import Scene, build_scene
 from vlcrender.scene_settings import SceneSettings
@@ -89,6 +89,27 @@ def test_a_board_hides_as_much_of_an_led_as_it_covers(tmp_path: Path, edge_x: fl
     else:
         # 8 x 8 rays a pixel over an edge 30 px long: 1/16 px of 30 px across; and 1 cm of parallax in 3 m
         assert seen[0].visible_fraction == pytest.approx(share, abs=0.01)
+
+
+@pytest.mark.parametrize(("edge_x", "share"), [(-0.06, 0.0), (0.0, 0.5), (0.06, 1.0)])
+def test_a_board_between_pane_and_led_hides_as_much_of_the_false_image(
+    tmp_path: Path, edge_x: float, share: float
+) -> None:
+    """A board just below the LED, out of the direct ray's way but in the mirrored one's: it covers x > 3 + edge_x.
+
+    The mirrored ray comes from the wall x = 0, 2.5 m up over 5 m across, and passes 1 cm below the LED's plane 2 cm
+    nearer to the wall than where it meets it.
+    """
+    corners = [(3.0 + edge_x, 3.0), (4.0, 3.0), (4.0, 4.0), (3.0 + edge_x, 4.0)]
+    text = "".join(f"v {x} {y} 0\n" for x, y in corners) + "f 1 3 2\nf 1 4 3\n"
+    (tmp_path / "board.obj").write_text(text)
+    piece = {"file": "board.obj", "position_m": [-0.02, 0.0, 3.49]}
+    pose = Pose((2.0, 3.4, 1.0), tilt_y_deg=-60.0)
+    scenes = room(tmp_path, window=[PANE], furniture=[piece]), room(window=[PANE])
+    hidden, free = (Renderer(scene).view(WIDE, pose).parts[0].reflections for scene in scenes)
+    light = sum(r.electrons_per_s.sum(dtype=float) for r in hidden)
+    # 64 rays a pixel of an image 9 px wide, and a disc seen under perspective: a few parts of a thousand
+    assert light / free[0].electrons_per_s.sum(dtype=float) == pytest.approx(share, abs=0.02)
 
 
 def test_a_lambertian_order_dims_the_led_aside() -> None:

@@ -211,6 +211,23 @@ def test_a_camera_outside_the_room_is_refused(renderer: Renderer, position: tupl
         renderer.view(Camera(), Pose(position))
 
 
+def test_a_fish_eye_is_sharp_at_its_focus_distance_whatever_the_depth(table1: Scene) -> None:
+    """LED 2 stands 60 deg off the axis, 2 m away, at a depth of 1 m: focused at 2 m it is sharp, at 1 m it is not."""
+    pose = Pose((LED_2[0] + 2.0 * np.sin(np.radians(60)), LED_2[1], 3.5 - 1.0))
+    lens = {"width_px": 3300, "height_px": 100, "pixel_pitch_um": 2.0, "focal_length_mm": 3.0, "f_number": 0.5}
+    fish_eye = Camera(**lens, projection="equidistant")
+    renderer = Renderer(table1)
+    sharp, at_2_m, at_1_m = (
+        next(p for p in renderer.view(camera, pose).patches if p.led_id == 2).electrons_per_s
+        for camera in (fish_eye, *(fish_eye.model_copy(update={"focus_distance_m": m}) for m in (2.0, 1.0)))
+    )
+    # Focused at 2 m the sensor is 0.15 % farther from the lens: the image is that much larger, 0.02 px, which may bring
+    # it into one more row or column. Focused at 1 m a point is a disc of 6 mm * 3 mm * (1/1 - 1/2) / 2 um = 4.5 px.
+    assert np.abs(np.subtract(at_2_m.shape, sharp.shape)).max() <= 1
+    assert at_2_m.max() == pytest.approx(sharp.max(), rel=5e-3)
+    assert np.subtract(at_1_m.shape, sharp.shape).min() >= 4
+
+
 def test_the_reference_has_no_diffraction(table1: Scene) -> None:
     with pytest.raises(InputError, match="psf"):
         reference_cd_m2(table1, Camera(psf="diffraction"), Pose((1, 1, 1)), 8)

@@ -218,3 +218,10 @@ def test_no_damage_to_a_scene_file_is_a_traceback(tmp_path: Path, data: st.DataO
 
 def test_the_shipped_files_are_toml_with_units_in_their_keys() -> None:
     assert tomllib.loads(OFFICE)["room"]["size_m"] == [7.0, 7.0, 3.5]
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "scenes").glob("*.toml")), ids=lambda path: path.stem)
+def test_every_shipped_scene_can_be_laid_out(path: Path) -> None:
+    scene = load_scene(path)
+    assert len(scene.leds) == len(scene.leds.sheets)
+    assert all(0 < surface.reflectance < 1 for surface in scene.surfaces)

@@ -2,6 +2,10 @@
 
 Dr.Jit 1.5 needs LLVM 17 or newer. With an older one trivial kernels pass and real ones end the process, so the version
 is checked here. Everything else imports `mi` and `dr` from this module.
+
+The environment variable VLCRENDER_VARIANT may choose CUDA. Its kernels round in other places and its rays are cast by
+OptiX, not Embree: results differ from LLVM's in the last bits, so a dataset is the same bit for bit only where one
+variant made all of it. No figure in this project was measured on a GPU.
 """
 
 import ctypes
@@ -13,8 +17,8 @@ from pathlib import Path
 
 from vlcrender.errors import InputError
 
-VARIANT = "llvm_ad_mono"
-"""Monochromatic: numbers pass through unchanged, so that a film holds cd/m2."""
+VARIANTS = ("llvm_ad_mono", "cuda_ad_mono")
+"""The first is taken where nothing is said. Monochromatic: numbers pass unchanged, so that a film holds cd/m2."""
 OLDEST_LLVM = 17
 SYSTEM_FOLDERS = ("/usr/lib", "/usr/lib64", "/usr/local/lib", "/opt/homebrew/opt/llvm/lib", "/usr/local/opt/llvm/lib")
 
@@ -70,11 +74,26 @@ def find_llvm() -> Path:
     )
 
 
-os.environ["DRJIT_LIBLLVM_PATH"] = str(find_llvm())
+def chosen_variant() -> str:
+    """What VLCRENDER_VARIANT says, or the first of VARIANTS. Raises InputError for any other."""
+    variant = os.environ.get("VLCRENDER_VARIANT") or VARIANTS[0]
+    if variant not in VARIANTS:
+        raise InputError(f"VLCRENDER_VARIANT={variant}: allowed are {', '.join(VARIANTS)}")
+    return variant
+
+
+VARIANT = chosen_variant()
+if VARIANT.startswith("llvm"):
+    os.environ["DRJIT_LIBLLVM_PATH"] = str(find_llvm())
 
 import drjit as dr  # noqa: E402  the path has to be set first
 import mitsuba as mi  # noqa: E402
 
+if VARIANT.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
+    raise InputError(
+        f"VLCRENDER_VARIANT={VARIANT}: no CUDA device and driver that Dr.Jit can use are found; "
+        f"unset it to render on the processor"
+    )
 mi.set_variant(VARIANT)
 
 

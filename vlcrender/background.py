@@ -4,6 +4,7 @@ One ray through each pixel's centre, and a grid of rays in each pixel where two 
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -30,21 +31,39 @@ class Background:
 
     def __init__(self, scene: Scene, light: Light) -> None:
         """Prepare a scene with its baked light."""
-        self.room = Room(light.mesh, scene.panes)
+        self.room = Room(light.mesh, scene.panes, scene.surfaces)
         self._light = light
         self._values: dict[tuple[float, float], Any] = {}
 
-    def look(self, camera: Camera, pose: Pose, u: Any, v: Any, rates: tuple[float, float] = (0.0, 0.0)) -> Hit:
-        """What pixel positions (u, v) see, Dr.Jit arrays. The lens's relative illumination is in the value."""
+    def look(
+        self,
+        camera: Camera,
+        pose: Pose,
+        u: Any,
+        v: Any,
+        rates: tuple[float, float] = (0.0, 0.0),
+        size_px: float = 1.0,
+    ) -> Hit:
+        """What squares of `size_px` about the pixel positions (u, v) see, Dr.Jit arrays.
+
+        The lens's relative illumination is in the value.
+        """
         if rates not in self._values:
             self._values[rates] = self.room.values(self._light, *rates)
-        x, y, z = ray_of_pixel(camera, u, v, dr)
         to_world = _opaque(pose.rotation.T)
-        direction = dr.normalize(mi.Vector3f(*(row[0] * x + row[1] * y + row[2] * z for row in to_world)))
+
+        def ray(u: Any, v: Any) -> Any:
+            x, y, z = ray_of_pixel(camera, u, v, dr)
+            return dr.normalize(mi.Vector3f(*(row[0] * x + row[1] * y + row[2] * z for row in to_world)))
+
+        spread = None
+        if self.room.textures is not None:
+            half = size_px / 2
+            spread = ray(u + half, v) - ray(u - half, v), ray(u, v + half) - ray(u, v - half)
         origin = mi.Point3f(*_opaque(np.array([pose.position_m]))[0])
-        hit = self.room.look(origin, direction, self._values[rates])
+        hit = self.room.look(origin, ray(u, v), self._values[rates], spread=spread)
         value = relative_illumination(camera, u, v, dr, hit.value)
-        return Hit(value, hit.surface, hit.distance_m)
+        return replace(hit, value=value)
 
     def images(
         self, camera: Camera, pose: Pose, frames: Sequence[Window], rates: tuple[float, float]
@@ -70,7 +89,12 @@ class Background:
             columns = np.concatenate([c + frame.column for (_, c), frame in zip(pixels, frames, strict=True)])
             if len(rows):
                 u, v = sub_pixels(rows, columns)
-                means = self.look(camera, pose, u, v, rates).value.numpy().reshape(len(rows), -1).mean(axis=1)
+                means = (
+                    self.look(camera, pose, u, v, rates, 1 / EDGE_GRID)
+                    .value.numpy()
+                    .reshape(len(rows), -1)
+                    .mean(axis=1)
+                )
                 parts = np.split(means, np.cumsum([len(r) for r, _ in pixels])[:-1])
                 for image, pixel, mean in zip(images, pixels, parts, strict=True):
                     image[pixel] = mean
@@ -107,15 +131,15 @@ def _opaque(matrix: NDArray[np.float64]) -> "list[list[mi.Float]]":
 
 def _edges(surfaces: NDArray[np.uint32], window: Window, sensor: Window) -> NDArray[np.bool_]:
     """Pixels of a window in which surfaces may meet, whose numbers at the pixel centres are given."""
-    edges = _differs_from_neighbour(surfaces)
+    edges = differs_from_neighbour(surfaces)
     if not sensor.holds(window) and sensor.overlaps(window):
         on_sensor = window.slices(window.common(sensor))  # as in a full frame, which has no neighbours beyond
-        edges[on_sensor] = _differs_from_neighbour(surfaces[on_sensor])
+        edges[on_sensor] = differs_from_neighbour(surfaces[on_sensor])
     return edges
 
 
-def _differs_from_neighbour(labels: NDArray[np.uint32]) -> NDArray[np.bool_]:
-    """Pixels of which one of the 8 neighbours shows another surface."""
+def differs_from_neighbour(labels: NDArray[Any]) -> NDArray[np.bool_]:
+    """Pixels (rows, columns) of which one of the 8 neighbours has another label."""
     differs = np.zeros(labels.shape, dtype=bool)
     for here, there in (
         (np.s_[:, 1:], np.s_[:, :-1]),

@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from vlcrender.scene import Surface
+from vlcrender.surfaces import Surface
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -24,7 +24,8 @@ INWARD = 0.02
 class Mesh:
     """Triangles with what each corner needs to be lit.
 
-    vertices_m, probes_m (where the light is computed) and normals: (corners, 3); albedo: (corners,);
+    vertices_m, probes_m (where the light is computed) and normals: (corners, 3); albedo: (corners,), of a texture its
+    mean around each;
     faces: (triangles, 3); owners: (triangles,), the number of the surface each belongs to.
     """
 
@@ -98,10 +99,29 @@ def _mesh_of_surface(surface: Surface, texel_m: float, number: int) -> Mesh:
         vertices_m=vertices,
         probes_m=probes_inward(vertices, faces, centers),
         normals=np.tile(normal / np.linalg.norm(normal), (len(vertices), 1)),
-        albedo=np.full(len(vertices), surface.reflectance),
+        albedo=_albedo(surface, a, b)[used],
         faces=faces,
         owners=np.full(len(faces), number),
     )
+
+
+def _albedo(surface: Surface, a: Array, b: Array) -> Array:
+    """Of each corner of the grid a x b: the texture's mean half way to its neighbours, so that the light balances."""
+    count = len(a) * len(b)
+    if surface.texture is None:
+        return np.full(count, surface.reflectance)
+    low, high = (
+        np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(count, 2)
+        for sides in zip(_half_way(a), _half_way(b), strict=True)
+    )
+    edges = np.stack([surface.edge_u_m, surface.edge_v_m])
+    return surface.texture.means(surface.corner_m + low @ edges, surface.corner_m + high @ edges)
+
+
+def _half_way(at: Array) -> tuple[Array, Array]:
+    """From where to where each of some sorted places reaches: half way to the next one."""
+    middle = (at[:-1] + at[1:]) / 2
+    return np.append(at[:1], middle), np.append(middle, at[-1:])
 
 
 def _cuts(at: Array, length_m: float, texel_m: float) -> Array:

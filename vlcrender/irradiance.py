@@ -1,10 +1,10 @@
 """The room's light, baked once: illuminance at every corner of the room's mesh, in lux.
 
-Three parts add up. Light straight from the LEDs is a sum over all of them, each a small source of its Lambertian order,
-with a shadow ray each: no noise. Light that was reflected at least once, and light from windows, is found by
-tracing paths with Mitsuba through a room whose surfaces glow with what the LEDs make of them: Monte Carlo, with an
-error that is kept. The surrounding light (`ambient`) falls on every surface alike and is defined to hold its own
-reflections.
+Three parts add up. Light straight from the LEDs, and what a pane mirrors of it, is a sum over all of them, each a small
+source of its Lambertian order, with a shadow ray each: no noise. Light that a surface reflected at least once, and
+light from windows, is found by tracing paths with Mitsuba through a room whose surfaces glow with what the LEDs make of
+them: Monte Carlo, with an error that is kept. The surrounding light (`ambient`) falls on every surface alike and is
+defined to hold its own reflections.
 
 In a diffuse room radiance does not depend on the view, so a view then costs one ray a pixel. The result is kept under
 a hash of the scene and of all that went into it.
@@ -24,12 +24,15 @@ from numpy.typing import NDArray
 from vlcrender.backend import dr, exact_math, mi
 from vlcrender.furniture import furniture_meshes
 from vlcrender.geometry import Mesh, join, mesh_of_surfaces
-from vlcrender.scene import Leds, Pane, Scene
+from vlcrender.glass import pane_reflectance
+from vlcrender.scene import Scene
+from vlcrender.sources import Sources, point_sources
+from vlcrender.surfaces import Pane
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
-CACHE_VERSION = 2
+CACHE_VERSION = 3
 BATCHES = 8
 MAX_DEPTH = 64
 """Bounces followed; roulette ends nearly all paths long before."""
@@ -92,35 +95,60 @@ def default_cache() -> Path:
     return Path(chosen) if chosen else Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "vlcrender"
 
 
-def led_illuminance_lux(blockers: Any, points_m: Array, normals: Array, leds: Leds) -> Array:
-    """Illuminance straight from the LEDs on surface points (n, 3) with unit normals, (n,).
+def led_illuminance_lux(
+    blockers: Any, points_m: Array, normals: Array, sources: Sources, panes: tuple[Pane, ...] = ()
+) -> Array:
+    """Illuminance straight from the LEDs, and by way of one pane, on surface points (n, 3) with unit normals, (n,).
 
-    E = sum of L A cos^m(theta_led) cos(theta_surface) / d^2 over the LEDs that the point sees: an LED is small against
-    its distance, and the relative error is (radius / distance)^2.
+    E = sum of I cos^m(theta_source) cos(theta_surface) / d^2 over the sources that the point sees. A pane shows each
+    source's mirror image, dimmed by Fresnel's law, where nothing stands between point, pane and source. Light that
+    panes mirror more than once is left out.
     """
-    areas = leds.areas_m2
     total = np.zeros(len(points_m))
-    each = max(1, RAYS_AT_ONCE // len(leds))
+    each = max(1, RAYS_AT_ONCE // len(sources))
     for start in range(0, len(points_m), each):
         here = slice(start, start + each)
-        towards = leds.centers_m[None] - points_m[here, None]
-        distance = np.maximum(np.linalg.norm(towards, axis=2), 1e-9)  # an LED's own face
-        cos_led = np.maximum(towards[..., 2] / distance, 0.0)
-        cos_surface = np.maximum((towards * normals[here, None]).sum(axis=2) / distance, 0.0)
-        intensity = leds.luminances_cd_m2 * areas * cos_led**leds.orders
-        lux = intensity * cos_surface / distance**2
-        lit = np.flatnonzero(lux.ravel() > 0)
-        if not len(lit):
-            continue  # Dr.Jit has no empty arrays
-        seen = np.zeros(lux.size, dtype=bool)
-        origins = np.repeat(points_m[here] + OFFSET_M * normals[here], len(leds), axis=0)[lit]
-        targets = np.broadcast_to(leds.centers_m - [0, 0, OFFSET_M], (len(towards), len(leds), 3)).reshape(-1, 3)[lit]
-        seen[lit] = ~_blocked(blockers, origins, targets)
-        total[here] = (lux * seen.reshape(lux.shape)).sum(axis=1)
+        origins = points_m[here] + OFFSET_M * normals[here]
+        lux = _unshadowed_lux(points_m[here], normals[here], sources, sources.centers_m)
+        point, source = np.nonzero(lux > 0)
+        seen = ~_blocked(blockers, origins[point], sources.centers_m[source] - [0, 0, OFFSET_M])
+        np.add.at(total[here], point, lux[point, source] * seen)
+        for pane in panes:
+            images_m = pane.mirrored(sources.centers_m)
+            lux = _unshadowed_lux(points_m[here], normals[here], sources, images_m)
+            towards = images_m[None] - points_m[here, None]
+            slope = (towards * pane.normal).sum(axis=2)
+            height = ((points_m[here] - pane.corner_m) * pane.normal).sum(axis=1)
+            point, source = np.nonzero((lux > 0) & (slope < 0) & (height[:, None] > OFFSET_M))
+            share = height[point] / -slope[point, source]
+            on_pane = points_m[here][point] + share[:, None] * towards[point, source]
+            within = pane.holds(on_pane)
+            point, source, on_pane = point[within], source[within], on_pane[within]
+            before = on_pane + OFFSET_M * pane.normal
+            seen = ~_blocked(blockers, origins[point], before)
+            seen &= ~_blocked(blockers, before, sources.centers_m[source] - [0, 0, OFFSET_M])
+            cosine = -slope[point, source] / np.linalg.norm(towards[point, source], axis=1)
+            dimmed = lux[point, source] * pane_reflectance(cosine, pane.refractive_index, np.sqrt)
+            np.add.at(total[here], point, dimmed * seen)
     return total
 
 
+def _unshadowed_lux(points_m: Array, normals: Array, sources: Sources, centers_m: Array) -> Array:
+    """What each source, seen at `centers_m`, sends to each point where nothing is in the way, (points, sources).
+
+    Sources face down, and their mirror images in upright panes do too.
+    """
+    towards = centers_m[None] - points_m[:, None]
+    distance = np.maximum(np.linalg.norm(towards, axis=2), 1e-9)  # an LED's own face
+    cos_source = np.maximum(towards[..., 2] / distance, 0.0)
+    cos_surface = np.maximum((towards * normals[:, None]).sum(axis=2) / distance, 0.0)
+    lux: Array = sources.intensities_cd * cos_source**sources.orders * cos_surface / distance**2
+    return lux
+
+
 def _blocked(blockers: Any, origins_m: Array, targets_m: Array) -> NDArray[np.bool_]:
+    if not len(origins_m):
+        return np.zeros(0, dtype=bool)  # Dr.Jit has no empty arrays
     span = targets_m - origins_m
     length = np.linalg.norm(span, axis=1, keepdims=True)
     with exact_math():
@@ -214,9 +242,8 @@ def pane_shape(pane: Pane) -> "mi.Mesh":
 
 def outside_shape(pane: Pane) -> "mi.Mesh":
     """What is seen through a pane: black where it does not glow, just behind it and a little larger."""
-    normal = np.cross(pane.edge_u_m, pane.edge_v_m)
     middle = pane.corners_m.mean(axis=0)
-    corners = middle + (1 + BEHIND_M) * (pane.corners_m - middle) - BEHIND_M * normal / np.linalg.norm(normal)
+    corners = middle + (1 + BEHIND_M) * (pane.corners_m - middle) - BEHIND_M * pane.normal
     black = {"type": "diffuse", "reflectance": 0.0}
     return _shape(f"outside {pane.name}", corners, PANE_FACES, black, np.full(4, pane.luminance_cd_m2))
 
@@ -257,7 +284,7 @@ def _compute(scene: Scene, mesh: Mesh, progress: Progress) -> tuple[Array, Array
     dark = np.zeros(len(mesh.vertices_m))
     progress("light from the LEDs", 0.0)
     blockers = mitsuba_scene(mesh, dark, (), panes_glow=False)
-    direct = led_illuminance_lux(blockers, points, normals, leds)
+    direct = led_illuminance_lux(blockers, points, normals, point_sources(leds), scene.panes)
     progress("light from the LEDs", 1.0)
     paths = scene.settings.bake.paths
     lit = mitsuba_scene(mesh, mesh.albedo * direct[: len(dark)] / np.pi, scene.panes, panes_glow=False)
@@ -273,14 +300,17 @@ def _compute(scene: Scene, mesh: Mesh, progress: Progress) -> tuple[Array, Array
 
 
 def _key(scene: Scene, mesh: Mesh) -> str:
-    """Hash of all that the light depends on: geometry, reflectances, LEDs, windows and the number of paths."""
+    """Hash of all that the light depends on: geometry, reflectances, textures, LEDs, windows, number of paths."""
     digest = hashlib.sha256(f"light {CACHE_VERSION} {mi.__version__} {scene.settings.bake.paths}".encode())
-    leds = scene.leds
+    sources = point_sources(scene.leds)
     arrays = [mesh.vertices_m, mesh.probes_m, mesh.normals, mesh.albedo, mesh.faces]
-    arrays += [leds.centers_m, leds.areas_m2, leds.luminances_cd_m2, leds.orders]
+    arrays += [scene.leds.centers_m, sources.centers_m, sources.intensities_cd, sources.orders]
     for array in arrays:
         digest.update(np.ascontiguousarray(array).tobytes())
     digest.update(repr(list(map(_pane_key, scene.panes))).encode())
+    for surface in scene.surfaces:
+        if surface.texture is not None:
+            digest.update(np.ascontiguousarray(surface.texture.reflectances).tobytes())
     return digest.hexdigest()[:32]
 
 

@@ -2,11 +2,13 @@
 
 The room behind comes from `background`. LEDs lie on top, each a window with its exact pixel coverage (`led_image`). An
 LED's face hides what is behind it and reflects the room's light: that is part of the background; its own light is a
-patch of its own, so that image = background + sum over LEDs of gain * patch, for any exposure and modulation. An LED
-seen by way of a window pane is a patch too: the image that the camera's mirror image has of it. At last the lens
-spreads each of them by what it does at their depth.
+patch of its own, so that image = background + sum over LEDs of gain * patch, for any exposure and modulation. Of an LED
+behind a diffuser the patch is what it lights of the sheet, which is a surface of the room like others. An LED seen by
+way of a window pane is a patch too: the image that the camera's mirror image has of it. At last the lens spreads each
+of them by what it does at their depth.
 """
 
+import itertools
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,16 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlcrender.backend import dr, exact_math, mi
-from vlcrender.background import Background, sub_pixels
+from vlcrender.background import Background, differs_from_neighbour, sub_pixels
 from vlcrender.camera import Camera, Pose, project, rays_world
 from vlcrender.errors import InputError
+from vlcrender.glass import pane_reflectance
 from vlcrender.irradiance import Light, bake
 from vlcrender.led_image import image_of_led, leds_that_may_be_seen
 from vlcrender.led_shape import Disc, Rectangle
 from vlcrender.lens import blur, blur_kernel, relative_illumination
 from vlcrender.photometry import Detector, Silicon, electron_rate_per_cd_m2
-from vlcrender.raycast import pane_reflectance
-from vlcrender.scene import Pane, Scene
+from vlcrender.scene import Leds, Scene
 from vlcrender.view import Image, LedPatch, Reflection, View, ViewPart
 from vlcrender.windows import LedWindows, Window, led_windows
 
@@ -53,11 +55,15 @@ class MirroredPose(Pose):
 
 @dataclass(frozen=True)
 class _Lit:
-    """An LED's image at one pose: coverage, and what its luminance is worth in each pixel of the window."""
+    """An LED's image at one pose: coverage, and what a luminance is worth in each pixel of the window.
+
+    `pattern` is the luminance in each pixel over the LED's own along its normal.
+    """
 
     window: Window
     coverage: Array
     weight: Array
+    pattern: Array | float
     visible_fraction: float
     imaged_fraction: float
 
@@ -71,15 +77,15 @@ class Renderer:
         self.detector = detector or Silicon()
         self._light = light or bake(scene)
         self._background = Background(scene, self._light)
-        self._shapes = [
-            Rectangle((2 * float(r), 2 * float(r))) if square else Disc(float(r))
-            for r, square in zip(scene.leds.radii_m, scene.leds.squares, strict=True)
-        ]
-        undersides_m = [grid.first_center_m[2] for grid in scene.settings.panels]
-        # What may stand between camera and LED: furniture, and panels that hang lower than an LED.
-        self._may_hide = bool(scene.settings.furniture) or min(undersides_m, default=np.inf) < scene.leds.centers_m[
-            :, 2
-        ].max() * (1 - SAME_PLACE)
+        self._faces = [_face(scene.leds, i) for i in range(len(scene.leds))]
+        panels = scene.settings.panels
+        undersides_m = [grid.first_center_m[2] for grid in panels]
+        # What may stand between camera and LED: furniture, frames, and panels that hang lower than an LED.
+        self._may_hide = (
+            bool(scene.settings.furniture)
+            or any(grid.frame is not None for grid in panels)
+            or min(undersides_m, default=np.inf) < scene.leds.centers_m[:, 2].max() * (1 - SAME_PLACE)
+        )
 
     def view(
         self, camera: Camera, pose: Pose, windows: LedWindows | None = None, during: Sequence[Pose] | None = None
@@ -177,11 +183,10 @@ class Renderer:
             backgrounds, surfaces = self._background.images(camera, place, wide, rates)
             self._hide_behind_leds(wide, backgrounds, seen, rates)
             totals = backgrounds if totals is None else [t + b for t, b in zip(totals, backgrounds, strict=True)]
-            for number, pane in enumerate(self.scene.panes):
+            for number in range(len(self.scene.panes)):
                 label = self._background.room.first_pane + number
-                shown = [s == label for s in surfaces]
-                if any(s.any() for s in shown):
-                    reflections += self._reflections(camera, place, pane, wide, shown, rates[0] / len(places))
+                if any((s == label).any() for s in surfaces):
+                    reflections += self._reflections(camera, place, number, wide, rates[0] / len(places))
         assert totals is not None  # there is at least one place
         kernel = _typical(kernels)
         means = []
@@ -198,6 +203,8 @@ class Renderer:
         corners = len(self._light.mesh.vertices_m)
         faces = rates[0] * self._light.led_cd_m2()[corners:] + rates[1] * self._light.surround_cd_m2()[corners:]
         for i, image in images.items():
+            if self.scene.leds.sheets[i] is not None:
+                continue  # a diffuser is one of the room's surfaces
             for frame, background in zip(frames, backgrounds, strict=True):
                 if frame.overlaps(image.window):
                     both = frame.common(image.window)
@@ -226,11 +233,7 @@ class Renderer:
             seen = [of_pose[i] for of_pose in images if i in of_pose]
             for image in seen:
                 light[around[i].slices(image.window)] += (
-                    lamp
-                    * leds.luminances_cd_m2[i]
-                    * image.coverage
-                    * image.weight
-                    * self._pattern(camera, pose, i, image)
+                    lamp * leds.luminances_cd_m2[i] * image.coverage * image.weight * image.pattern
                 )
             spread = blur(light / len(images), kernels[i])[around[i].grown(_radius(kernels[i])).slices(window)]
             patches.append(
@@ -246,12 +249,31 @@ class Renderer:
             )
         return tuple(patches)
 
-    def _pattern(self, camera: Camera, pose: Pose, i: int, image: _Lit) -> Array | float:
-        """Luminance over that along the normal, cos^(m - 1), in each pixel of the window."""
-        order = float(self.scene.leds.orders[i])
+    def _pattern(self, camera: Camera, pose: Pose, i: int, window: Window) -> Array | float:
+        """Luminance over that of the bare LED along its normal, in each pixel of the window.
+
+        Of a bare LED cos^(m - 1); of a sheet the mean over the pixel, of 2 x 2 places (Gauss and Legendre) where a
+        pixel sees more than a part FINE of the LED's distance behind it.
+        """
+        sheet, order = self.scene.leds.sheets[i], float(self.scene.leds.orders[i])
+        if sheet is not None:
+            height = float(self.scene.leds.centers_m[i, 2] - pose.position_m[2])
+
+            def at(off: tuple[float, float]) -> tuple[Array, Array]:
+                rays = rays_world(camera, pose, _centers(window) + np.array(off))
+                reach = height / np.maximum(rays[..., 2], 1e-9)
+                return pose.position_m[0] + reach * rays[..., 0], pose.position_m[1] + reach * rays[..., 1]
+
+            middle = at((0.0, 0.0))
+            steps = [np.abs(np.diff(place, axis=axis)).max(initial=0.0) for place in middle for axis in (0, 1)]
+            if max(steps) < FINE * sheet.distance_m and min(window.rows, window.columns) > 1:
+                return sheet.luminance(*middle)
+            nodes = list(itertools.product((-GAUSS_PX, GAUSS_PX), repeat=2))
+            mean: Array = sum((sheet.luminance(*at(off)) for off in nodes), np.zeros(middle[0].shape)) / len(nodes)
+            return mean
         if abs(order - 1.0) < 1e-12:
             return 1.0
-        rays = rays_world(camera, pose, _centers(image.window))
+        rays = rays_world(camera, pose, _centers(window))
         cosine = np.maximum(rays[..., 2] / np.sqrt((rays**2).sum(axis=-1)), 0.0)
         pattern: Array = cosine ** (order - 1.0)
         return pattern
@@ -264,7 +286,8 @@ class Renderer:
         overscan = windows is not None and windows.overscan
         reach = _overscan_px(camera) if overscan else spread
         for i in leds_that_may_be_seen(camera, pose, leds.centers_m, leds.reaches_m, reach):
-            image = image_of_led(camera, pose, leds.centers_m[i], self._shapes[i], reach)
+            center_m, shape = self._faces[i]
+            image = image_of_led(camera, pose, center_m, shape, reach)
             if image is None:
                 continue
             window = Window(image.row, image.column, *image.coverage.shape)
@@ -273,18 +296,29 @@ class Renderer:
             coverage = image.coverage
             seen = 1.0
             if self._may_hide:
-                clear = self._clear_share(camera, pose, float(leds.centers_m[i, 2]), window, coverage > 0)
+                clear = self._clear_share(camera, pose, pose, None, float(leds.centers_m[i, 2]), window, coverage > 0)
                 seen = float((coverage * clear).sum() / coverage.sum())
                 coverage = coverage * clear
             if seen > 0:
                 imaged = 1.0 if overscan else image.visible_fraction
                 weight = relative_illumination(camera, *np.moveaxis(_centers(window), -1, 0))
-                yield int(i), _Lit(window, coverage, weight, seen * image.visible_fraction, seen * imaged)
+                pattern = self._pattern(camera, pose, int(i), window)
+                yield int(i), _Lit(window, coverage, weight, pattern, seen * image.visible_fraction, seen * imaged)
 
     def _clear_share(
-        self, camera: Camera, pose: Pose, height_m: float, window: Window, lit: NDArray[np.bool_]
+        self,
+        camera: Camera,
+        pose: Pose,
+        seen_from: Pose,
+        pane: int | None,
+        height_m: float,
+        window: Window,
+        lit: NDArray[np.bool_],
     ) -> Array:
-        """Share of each lit pixel from which nothing hides the plane of an LED at this height, (rows, columns)."""
+        """Share of each lit pixel from which nothing hides the plane of an LED at this height, (rows, columns).
+
+        `seen_from` is the camera's own pose, or its mirror image in the pane of that number, which has to be met.
+        """
         rows, columns = np.nonzero(lit)
         clear = np.ones(lit.shape)
         with exact_math():
@@ -292,38 +326,41 @@ class Renderer:
                 mi.Float((columns + window.column + 0.5).astype(np.float32)),
                 mi.Float((rows + window.row + 0.5).astype(np.float32)),
             )
-            reached = self._reaches(camera, pose, height_m, u, v)
-            clear[rows, columns] = reached
-            if 0 < reached.sum() < len(reached):  # an edge crosses the LED
+            clear[rows, columns] = self._reaches(camera, pose, seen_from, pane, height_m, u, v)
+            rows, columns = np.nonzero(lit & differs_from_neighbour(np.where(lit, clear, OUTSIDE)))
+            if 0 < clear[lit].sum() < lit.sum():  # an edge crosses the LED
                 u, v = sub_pixels(rows + window.row, columns + window.column)
-                clear[rows, columns] = self._reaches(camera, pose, height_m, u, v).reshape(len(rows), -1).mean(axis=1)
+                each = self._reaches(camera, pose, seen_from, pane, height_m, u, v)
+                clear[rows, columns] = each.reshape(len(rows), -1).mean(axis=1)
         return clear
 
-    def _reaches(self, camera: Camera, pose: Pose, height_m: float, u: "mi.Float", v: "mi.Float") -> Array:
-        """1 where the ray of a pixel position gets to this height, 0 where something is in its way."""
-        hit = self._background.look(camera, pose, u, v)
-        pixels = np.stack([u.numpy(), v.numpy()], axis=-1).astype(np.float64)
-        rays = rays_world(camera, pose, pixels)
-        to_plane = (height_m - pose.position_m[2]) / rays[:, 2] * np.sqrt((rays**2).sum(axis=1))
-        dr.eval(hit.distance_m)
-        reached: Array = (hit.distance_m.numpy() > to_plane * (1 - SAME_PLACE)).astype(np.float64)
-        return reached
-
-    def _reflections(
+    def _reaches(
         self,
         camera: Camera,
         pose: Pose,
-        pane: Pane,
-        frames: Sequence[Window],
-        shown: Sequence[NDArray[np.bool_]],
-        lamp: float,
+        seen_from: Pose,
+        pane: int | None,
+        height_m: float,
+        u: "mi.Float",
+        v: "mi.Float",
+    ) -> Array:
+        """1 where the ray of a pixel position gets to this height, 0 where something is in its way."""
+        hit = self._background.look(camera, pose, u, v)
+        way_m = hit.distance_m if pane is None else dr.select(hit.surface == pane, hit.path_m, 0.0)
+        pixels = np.stack([u.numpy(), v.numpy()], axis=-1).astype(np.float64)
+        rays = rays_world(camera, seen_from, pixels)
+        to_plane = (height_m - pose.position_m[2]) / rays[:, 2] * np.sqrt((rays**2).sum(axis=1))
+        dr.eval(way_m)
+        reached: Array = (way_m.numpy() > to_plane * (1 - SAME_PLACE)).astype(np.float64)
+        return reached
+
+    def _reflections(
+        self, camera: Camera, pose: Pose, number: int, frames: Sequence[Window], lamp: float
     ) -> list[Reflection]:
-        """LEDs in a pane. `shown` says in which pixels of each window the pane is seen."""
-        leds = self.scene.leds
-        normal = np.cross(pane.edge_u_m, pane.edge_v_m)
-        normal = normal / np.linalg.norm(normal)
-        mirror = np.eye(3) - 2 * np.outer(normal, normal)
-        behind = np.array(pose.position_m) - 2 * float(normal @ (np.array(pose.position_m) - pane.corner_m)) * normal
+        """LEDs in a pane, as far as it reaches and nothing stands in the way to it or from it."""
+        leds, pane = self.scene.leds, self.scene.panes[number]
+        mirror = np.eye(3) - 2 * np.outer(pane.normal, pane.normal)
+        behind = pane.mirrored(np.array(pose.position_m))
         mirrored = MirroredPose(
             (float(behind[0]), float(behind[1]), float(behind[2])),
             pose.tilt_x_deg,
@@ -331,34 +368,53 @@ class Renderer:
             pose.yaw_deg,
             tuple(map(tuple, mirror.tolist())),
         )
+        label = self._background.room.first_pane + number
         found = []
         for i in leds_that_may_be_seen(camera, mirrored, leds.centers_m, leds.reaches_m):
-            image = image_of_led(camera, mirrored, leds.centers_m[i], self._shapes[i])
+            center_m, shape = self._faces[i]
+            image = image_of_led(camera, mirrored, center_m, shape)
             if image is None:
                 continue
             window = Window(image.row, image.column, *image.coverage.shape)
+            if not any(frame.overlaps(window) for frame in frames):
+                continue
+            height_m = float(leds.centers_m[i, 2])
+            clear = self._clear_share(camera, pose, mirrored, label, height_m, window, image.coverage > 0)
             centers = _centers(window)
             rays = rays_world(camera, mirrored, centers)
-            cosine = np.abs(_along(rays, normal)) / np.sqrt((rays**2).sum(axis=-1))
+            cosine = np.abs(_along(rays, pane.normal)) / np.sqrt((rays**2).sum(axis=-1))
             weight = relative_illumination(camera, centers[..., 0], centers[..., 1])
             weight = weight * pane_reflectance(cosine, pane.refractive_index, np.sqrt)
-            lit = _Lit(window, image.coverage, weight, 1.0, 1.0)
-            light = (
-                lamp * leds.luminances_cd_m2[i] * image.coverage * weight * self._pattern(camera, mirrored, int(i), lit)
-            )
-            for frame, inside in zip(frames, shown, strict=True):
+            pattern = self._pattern(camera, mirrored, int(i), window)
+            light = lamp * leds.luminances_cd_m2[i] * image.coverage * clear * weight * pattern
+            for frame in frames:
                 if frame.overlaps(window):
                     both = frame.common(window)
-                    part = light[window.slices(both)] * inside[frame.slices(both)]
+                    part = light[window.slices(both)]
                     if part.any():
                         found.append(Reflection(int(leds.ids[i]), both.row, both.column, part.astype(np.float32)))
         return found
 
 
+OUTSIDE = 2.0
+"""Label of pixels that an LED does not light, where others are 0 and 1."""
+GAUSS_PX = 0.5 / np.sqrt(3.0)
+FINE = 0.02
+"""Of a pixel that sees less the middle is the mean, to 2 (m + 3) * 0.02^2 / 24: 3e-4 for an order m of 5."""
 BLUR_MARGIN_PX = 500
 """How far beside the sensor LEDs may be whose blur reaches it."""
 DEPTH_STEP = 0.005
 """Depths that differ by less than this part share a kernel: 0.2 px of a defocus disc of 35."""
+
+
+def _face(leds: Leds, i: int) -> tuple[Array, Disc | Rectangle]:
+    """Centre and shape of what is seen to shine: the LED's face, or what it lights of a sheet."""
+    sheet, radius = leds.sheets[i], float(leds.radii_m[i])
+    if sheet is not None:
+        x0, y0, x1, y1 = sheet.lit_m
+        center: Array = np.array([(x0 + x1) / 2, (y0 + y1) / 2, leds.centers_m[i, 2]])
+        return center, Rectangle((x1 - x0, y1 - y0))
+    return leds.centers_m[i], Rectangle((2 * radius, 2 * radius)) if leds.squares[i] else Disc(radius)
 
 
 def _along(vectors: Array, direction: Array) -> Array:

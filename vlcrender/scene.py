@@ -3,50 +3,27 @@
 World: metres, right-handed, z up, origin at a floor corner.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vlcrender.diffuser import NEAREST_RADII, Sheet
 from vlcrender.errors import InputError
-from vlcrender.scene_settings import PanelGrid, PanelLeds, Room, SceneSettings
+from vlcrender.scene_settings import PanelDiffuser, PanelGrid, PanelLeds, SceneSettings
 from vlcrender.settings import check, read_toml
 from vlcrender.streams import stream
-
-TOUCH_M = 1e-9
-"""Rounding allowance where an LED or panel touches a wall or another LED."""
-
-
-@dataclass(frozen=True)
-class Surface:
-    """A diffuse rectangle: corner + a * edge_u + b * edge_v with a, b in [0, 1]; seen from edge_u x edge_v."""
-
-    name: str
-    corner_m: NDArray[np.float64]
-    edge_u_m: NDArray[np.float64]
-    edge_v_m: NDArray[np.float64]
-    reflectance: float
-    holes: tuple[tuple[float, float, float, float], ...] = ()
-    """(a0, b0, a1, b1) of what is cut out: panels on a ceiling, windows in a wall."""
-
-
-@dataclass(frozen=True)
-class Pane:
-    """A window pane: the rectangle corner + a * edge_u + b * edge_v, seen from edge_u x edge_v."""
-
-    name: str
-    corner_m: NDArray[np.float64]
-    edge_u_m: NDArray[np.float64]
-    edge_v_m: NDArray[np.float64]
-    luminance_cd_m2: float
-    refractive_index: float
-
-    @property
-    def corners_m(self) -> NDArray[np.float64]:
-        """The four corners in order around, shape (4, 3)."""
-        shares = ((0, 0), (1, 0), (1, 1), (0, 1))
-        return np.stack([self.corner_m + a * self.edge_u_m + b * self.edge_v_m for a, b in shares])
+from vlcrender.surfaces import (
+    TOUCH_M,
+    Pane,
+    Surface,
+    panel_centers_m,
+    panel_opening_m,
+    panel_surfaces,
+    panes_of,
+    room_surfaces,
+)
 
 
 @dataclass(frozen=True)
@@ -55,6 +32,7 @@ class Leds:
 
     ids: NDArray[np.int64]
     centers_m: NDArray[np.float64]
+    """Of the face; where an LED is behind a diffuser, straight below it on the sheet, where it is brightest."""
     radii_m: NDArray[np.float64]
     luminances_cd_m2: NDArray[np.float64]
     orders: NDArray[np.float64]
@@ -62,6 +40,9 @@ class Leds:
 
     squares: NDArray[np.bool_]
     """Where True the LED is a square of half side `radii_m`, sides along x and y."""
+
+    sheets: tuple[Sheet | None, ...]
+    """What each lights of a diffuser, which is seen in place of its face."""
 
     def __len__(self) -> int:
         """Count the LEDs."""
@@ -74,8 +55,14 @@ class Leds:
 
     @property
     def reaches_m(self) -> NDArray[np.float64]:
-        """From each centre to the face's farthest point: a square's corner, a disc's rim."""
-        return np.where(self.squares, np.sqrt(2.0), 1.0) * self.radii_m
+        """From each centre to the farthest point seen to shine: a square's corner, a disc's rim, lit corner."""
+        reaches = np.where(self.squares, np.sqrt(2.0), 1.0) * self.radii_m
+        for i, sheet in enumerate(self.sheets):
+            if sheet is not None:
+                x0, y0, x1, y1 = sheet.lit_m
+                x, y = sheet.foot_m
+                reaches[i] = np.hypot(max(x - x0, x1 - x), max(y - y0, y1 - y))
+        return reaches
 
 
 @dataclass(frozen=True)
@@ -87,7 +74,7 @@ class Scene:
     panes: tuple[Pane, ...]
     leds: Leds
     folder: Path
-    """Where furniture files are looked up."""
+    """Where furniture and textures are looked up."""
 
     @property
     def name(self) -> str:
@@ -106,29 +93,22 @@ def load_scene(path: Path) -> Scene:
 
 
 def build_scene(settings: SceneSettings, source: str, folder: Path = Path()) -> Scene:
-    """Lay out surfaces and LEDs; furniture files are below `folder`.
+    """Lay out surfaces and LEDs; files of furniture and textures are below `folder`.
 
-    Raises InputError, which starts with `source`, where something is outside the room, overlaps or is missing.
+    Raises InputError, which starts with `source`, where something is outside the room, overlaps, is missing or, of a
+    texture, cannot be used.
     """
     leds = _leds(settings, source)
-    panes = _panes(settings, source)
-    surfaces = _room_surfaces(settings.room, settings.panels, panes)
+    panes = panes_of(settings, source)
+    surfaces = room_surfaces(settings.room, settings.panels, panes, folder, source)
     for index, grid in enumerate(settings.panels):
-        surfaces += _panel_surfaces(grid, np.array(settings.room.size_m), f"{source}: panels[{index}]")
+        surfaces += panel_surfaces(grid, np.array(settings.room.size_m), f"{source}: panels[{index}]")
     for index, piece in enumerate(settings.furniture):
         if not (folder / piece.file).is_file():
             raise InputError(
                 f"{source}: furniture[{index}].file = {piece.file!r}: no such file from the scene's folder"
             )
     return Scene(settings, tuple(surfaces), panes, leds, folder)
-
-
-def panel_centers_m(grid: PanelGrid) -> NDArray[np.float64]:
-    """Centres of the undersides, shape (rows * columns, 3), columns (x) fastest."""
-    x = grid.first_center_m[0] + grid.pitch_m[0] * np.arange(grid.columns)
-    y = grid.first_center_m[1] + grid.pitch_m[1] * np.arange(grid.rows)
-    yy, xx = np.meshgrid(y, x, indexing="ij")
-    return np.stack([xx.ravel(), yy.ravel(), np.full(xx.size, grid.first_center_m[2])], axis=1)
 
 
 def _leds(settings: SceneSettings, source: str) -> Leds:
@@ -139,6 +119,7 @@ def _leds(settings: SceneSettings, source: str) -> Leds:
     half_powers: list[float] = []
     shapes: list[str] = []
     origins: list[str] = []
+    behind: list[tuple[PanelDiffuser, tuple[float, float, float, float]] | None] = []
     for index, entry in enumerate(settings.led):
         ids.append(entry.id)
         centers.append(np.array(entry.position_m))
@@ -147,6 +128,7 @@ def _leds(settings: SceneSettings, source: str) -> Leds:
         half_powers.append(entry.half_power_deg)
         shapes.append(entry.shape)
         origins.append(f"led[{index}]")
+        behind.append(None)
     for index, grid in enumerate(settings.panels):
         array = grid.leds
         _check_led_array(array, grid, f"{source}: panels[{index}]")
@@ -163,6 +145,9 @@ def _leds(settings: SceneSettings, source: str) -> Leds:
         half_powers += [array.half_power_deg] * len(positions)
         shapes += [array.shape] * len(positions)
         origins += [f"panels[{index}].leds"] * len(positions)
+        for center in panel_centers_m(grid).tolist():
+            diffuser = None if grid.diffuser is None else (grid.diffuser, panel_opening_m(grid, center[0], center[1]))
+            behind += [diffuser] * len(offsets)
     if not ids:
         raise InputError(f"{source}: has no LED; add [[led]] or [[panels]]")
     order = np.argsort(ids, kind="stable")
@@ -173,18 +158,42 @@ def _leds(settings: SceneSettings, source: str) -> Leds:
         np.array(luminances)[order],
         -np.log(2) / np.log(np.cos(np.radians(half_powers)))[order],
         np.array([shape == "square" for shape in shapes])[order],
+        (None,) * len(ids),
     )
+    sheets = [
+        None
+        if of_led is None
+        else Sheet(
+            (float(leds.centers_m[i, 0]), float(leds.centers_m[i, 1])),
+            of_led[0].distance_m,
+            of_led[0].transmittance,
+            float(leds.areas_m2[i]),
+            float(leds.orders[i]),
+            of_led[1],
+        )
+        for i, of_led in enumerate(behind[number] for number in order)
+    ]
+    leds = replace(leds, sheets=tuple(sheets))
     _check_leds(leds, [origins[i] for i in order], np.array(settings.room.size_m), source)
     return leds
 
 
 def _check_led_array(array: PanelLeds, grid: PanelGrid, where: str) -> None:
+    rim = 0.0 if grid.frame is None else grid.frame.width_m
     for axis, name, count in ((0, "columns", array.columns), (1, "rows", array.rows)):
         extent = (count - 1) * array.pitch_m[axis] + 2 * array.radius_m
-        if extent > grid.size_m[axis] + TOUCH_M:
+        if extent > grid.size_m[axis] - 2 * rim + TOUCH_M:
+            within = "" if grid.frame is None else f", and its frame leaves {grid.size_m[axis] - 2 * rim:.4g} m"
             raise InputError(
                 f"{where}.leds: {count} {name} at {array.pitch_m[axis]} m and radius {array.radius_m} m span "
-                f"{extent:.4g} m; the panel is {grid.size_m[axis]} m"
+                f"{extent:.4g} m; the panel is {grid.size_m[axis]} m{within}"
+            )
+    if grid.diffuser is not None:
+        least, most = NEAREST_RADII * array.radius_m, grid.size_m[2]
+        if not least - TOUCH_M <= grid.diffuser.distance_m <= most + TOUCH_M:
+            raise InputError(
+                f"{where}.diffuser.distance_m = {grid.diffuser.distance_m}: has to be from {least:.4g} m, "
+                f"{NEAREST_RADII:g} radii of the LEDs, to {most:.4g} m, the panel's height"
             )
     if array.luminance_cd_m2[0] > array.luminance_cd_m2[1]:
         raise InputError(f"{where}.leds.luminance_cd_m2 = {list(array.luminance_cd_m2)}: the lower value comes first")
@@ -214,121 +223,3 @@ def _check_leds(leds: Leds, origins: list[str], room_m: NDArray[np.float64], sou
                 f"{source}: {origins[other]}: LEDs {leds.ids[i]} and {leds.ids[other]} overlap: centres "
                 f"{apart[close[0]]:.4g} m apart, radii {leds.radii_m[i]} and {leds.radii_m[other]} m"
             )
-
-
-def _room_surfaces(room: Room, panels: tuple[PanelGrid, ...], panes: tuple[Pane, ...]) -> list[Surface]:
-    o = np.zeros(3)
-    x, y, z = (np.diag(room.size_m)[i] for i in range(3))
-    r = room.reflectance
-    surfaces = [
-        Surface("floor", o, x, y, r.floor),
-        Surface("ceiling", z, y, x, r.ceiling, _panels_on_ceiling(room, panels)),
-    ]
-    for name, (corner, edge_u, edge_v) in _walls(room).items():
-        holes = tuple(_hole(pane, corner, edge_u, edge_v) for pane in panes if pane.name.startswith(f"window {name} "))
-        surfaces.append(Surface(f"wall {name}", corner, edge_u, edge_v, r.walls, holes))
-    return surfaces
-
-
-def _walls(room: Room) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]]:
-    """Corner and edges of each wall; edge_u x edge_v points into the room."""
-    o = np.zeros(3)
-    x, y, z = (np.diag(room.size_m)[i] for i in range(3))
-    return {"x=0": (o, y, z), "x=max": (x, z, y), "y=0": (o, z, x), "y=max": (y, x, z)}
-
-
-def _panels_on_ceiling(room: Room, panels: tuple[PanelGrid, ...]) -> tuple[tuple[float, float, float, float], ...]:
-    """Parts of the ceiling that panels touch, in its (a, b) = (y, x) shares."""
-    width, depth, height = room.size_m
-    holes = []
-    for grid in panels:
-        if abs(grid.first_center_m[2] + grid.size_m[2] - height) > TOUCH_M:
-            continue
-        half_x, half_y = grid.size_m[0] / 2, grid.size_m[1] / 2
-        for x, y, _ in panel_centers_m(grid).tolist():
-            holes.append(((y - half_y) / depth, (x - half_x) / width, (y + half_y) / depth, (x + half_x) / width))
-    return tuple(holes)
-
-
-def _hole(
-    pane: Pane, corner: NDArray[np.float64], edge_u: NDArray[np.float64], edge_v: NDArray[np.float64]
-) -> tuple[float, float, float, float]:
-    low = pane.corner_m - corner
-    high = low + pane.edge_u_m + pane.edge_v_m
-    along = [(float(p @ edge_u / (edge_u @ edge_u)), float(p @ edge_v / (edge_v @ edge_v))) for p in (low, high)]
-    (a0, b0), (a1, b1) = along
-    return a0, b0, a1, b1
-
-
-def _panes(settings: SceneSettings, source: str) -> tuple[Pane, ...]:
-    panes: list[Pane] = []
-    taken: list[tuple[str, tuple[NDArray[np.float64], NDArray[np.float64]]]] = []
-    for index, window in enumerate(settings.window):
-        where = f"{source}: window[{index}]"
-        corner, edge_u, edge_v = _walls(settings.room)[window.wall]
-        along = 1 if window.wall.startswith("x") else 0
-        low = corner.copy()
-        low[along] = window.corner_m[0]
-        low[2] = window.corner_m[1]
-        high = low.copy()
-        high[along] += window.size_m[0]
-        high[2] += window.size_m[1]
-        if (high > np.array(settings.room.size_m) + TOUCH_M).any():
-            raise InputError(
-                f"{where}: from {low.round(4).tolist()} to {high.round(4).tolist()} m does not fit "
-                f"into the room of {list(settings.room.size_m)} m"
-            )
-        if any(wall == window.wall and _overlap(low, high, *extent, along) for wall, extent in taken):
-            raise InputError(f"{where}: overlaps another window in wall {window.wall}")
-        taken.append((window.wall, (low, high)))
-        span = high - low
-        panes.append(
-            Pane(
-                name=f"window {window.wall} {index}",
-                corner_m=low,
-                edge_u_m=np.where(edge_u != 0, span, 0.0),
-                edge_v_m=np.where(edge_v != 0, span, 0.0),
-                luminance_cd_m2=window.luminance_cd_m2,
-                refractive_index=window.refractive_index,
-            )
-        )
-    return tuple(panes)
-
-
-def _overlap(
-    low: NDArray[np.float64],
-    high: NDArray[np.float64],
-    other_low: NDArray[np.float64],
-    other_high: NDArray[np.float64],
-    along: int,
-) -> bool:
-    axes = [along, 2]
-    return bool((low[axes] < other_high[axes] - TOUCH_M).all() and (high[axes] > other_low[axes] + TOUCH_M).all())
-
-
-def _panel_surfaces(grid: PanelGrid, room_m: NDArray[np.float64], where: str) -> list[Surface]:
-    size = np.array(grid.size_m)
-    for axis, name, count in ((0, "columns", grid.columns), (1, "rows", grid.rows)):
-        if count > 1 and grid.pitch_m[axis] < size[axis] - TOUCH_M:
-            raise InputError(
-                f"{where}.pitch_m: {name} {grid.pitch_m[axis]} m apart overlap; panels are {size[axis]} m wide"
-            )
-    surfaces: list[Surface] = []
-    for number, center in enumerate(panel_centers_m(grid)):
-        low = center - [size[0] / 2, size[1] / 2, 0.0]
-        high = center + [size[0] / 2, size[1] / 2, size[2]]
-        if (low < -TOUCH_M).any() or (high > room_m + TOUCH_M).any():
-            raise InputError(
-                f"{where}: panel {number} from {low.round(4).tolist()} to {high.round(4).tolist()} m "
-                f"is not inside the room of {room_m.tolist()} m"
-            )
-        x, y, z = (np.diag(size)[i] for i in range(3))
-        name = f"panel {number}"
-        surfaces += [
-            Surface(f"{name} underside", low, y, x, grid.reflectance),
-            Surface(f"{name} side x-", low, z, y, grid.reflectance),
-            Surface(f"{name} side x+", low + x, y, z, grid.reflectance),
-            Surface(f"{name} side y-", low, x, z, grid.reflectance),
-            Surface(f"{name} side y+", low + y, z, x, grid.reflectance),
-        ]
-    return surfaces

@@ -17,18 +17,39 @@ Spectrum = Literal["LED-B1", "LED-B2", "LED-B3", "LED-B4", "LED-B5", "LED-BH1", 
 
 
 class RoomReflectances(Settings):
-    """Diffuse reflectance (albedo) of the room's surfaces, 0 to 1."""
+    """Diffuse reflectance (albedo) of the room's surfaces, 0 to 1; none where a texture gives it."""
 
-    floor: Reflectance
-    ceiling: Reflectance
-    walls: Reflectance
+    floor: Reflectance | None = None
+    ceiling: Reflectance | None = None
+    walls: Reflectance | None = None
+
+
+class TextureEntry(Settings):
+    """An image whose grey values are a surface's reflectances, repeated tile by tile."""
+
+    file: Annotated[str, Field(pattern=r"\.png$")]
+    """Grey PNG of 8 or 16 bits, from the scene's folder; read linearly: 0 is black, the largest value reflects all."""
+    tile_m: tuple[Length, Length]
+    """What the image covers, across and down."""
+
+
+class RoomTextures(Settings):
+    """Images on the room's surfaces. Floor and ceiling: across is along x, down along y, from the origin.
+
+    Walls: across is along x or y from its smallest value, down is down from the ceiling.
+    """
+
+    floor: TextureEntry | None = None
+    ceiling: TextureEntry | None = None
+    walls: TextureEntry | None = None
 
 
 class Room(Settings):
-    """A box with one corner at the origin."""
+    """A box with one corner at the origin. Each surface has either a reflectance or a texture."""
 
     size_m: tuple[Length, Length, Length]
     reflectance: RoomReflectances
+    texture: RoomTextures = RoomTextures()
 
 
 class Ambient(Settings):
@@ -64,11 +85,29 @@ class PanelLeds(Settings):
     shape: Literal["disc", "square"] = "disc"
     radius_m: Length
     luminance_cd_m2: tuple[Luminance, Luminance]
-    """Each LED's luminance is drawn evenly between the two, once and for all, by `luminance_seed`."""
+    """Of the bare LED, also behind a diffuser; drawn evenly between the two, once and for all, by `luminance_seed`."""
     luminance_seed: Identity = 0
     half_power_deg: HalfPower = 60.0
     first_id: Identity
     """LED (row, column) of panel (row, column): ids go up along columns first, then rows, then panels likewise."""
+
+
+class PanelFrame(Settings):
+    """A rim around a panel's underside, which hides LEDs from aside."""
+
+    width_m: Length
+    """Of the rim, inwards from the panel's sides; LEDs are within what it leaves open."""
+    depth_m: Length
+    """How far the rim stands down below the underside."""
+    reflectance: Reflectance
+
+
+class PanelDiffuser(Settings):
+    """A translucent sheet in place of a panel's underside, which spreads what falls on it evenly (Lambert)."""
+
+    distance_m: Length
+    """How far behind the sheet the LEDs are: 3 of their radii at least, and not more than the panel is high."""
+    transmittance: Annotated[float, Field(gt=0, le=1)]
 
 
 class PanelGrid(Settings):
@@ -82,6 +121,9 @@ class PanelGrid(Settings):
     size_m: tuple[Length, Length, Length]
     """Along x, along y, and upwards from the underside."""
     reflectance: Reflectance
+    """Of sides and underside; of a diffuser, its own."""
+    frame: PanelFrame | None = None
+    diffuser: PanelDiffuser | None = None
     leds: PanelLeds
 
 
@@ -98,7 +140,7 @@ class Window(Settings):
 
 
 class Furniture(Settings):
-    """A mesh that occludes and reflects."""
+    """A closed mesh that occludes and reflects; it is lit where its corners run counter-clockwise."""
 
     file: Annotated[str, Field(pattern=r"\.(ply|obj|xml)$")]
     """PLY or OBJ, or Mitsuba XML with mesh shapes; from the scene's folder. Metres, z up."""
