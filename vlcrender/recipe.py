@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 
 from vlcrender.camera import Camera
 from vlcrender.errors import InputError
-from vlcrender.inertial import Accelerometer
+from vlcrender.inertial import Accelerometer, TiltError
 from vlcrender.motion import Motion
 from vlcrender.poses import AimedPoses, Poses
 from vlcrender.rig import MAIN, Mounted, RigCamera, mounted_cameras
@@ -36,7 +36,7 @@ class Recipe(Settings):
     """Whether the noise-free images are written too."""
     camera: Camera = Camera()
     sensor: Sensor = Sensor()
-    accelerometer: Accelerometer = Accelerometer()
+    accelerometer: Accelerometer = TiltError()
     poses: Poses
     windows: LedWindows | None = None
     """What is read out of the sensor; all of it where not given."""
