@@ -19,9 +19,10 @@ from estimator.dataset import read_dataset
 from estimator.errors import InputError
 from estimator.estimates import write_estimates
 from estimator.files import write_atomically
+from estimator.pipeline import Variant
 from estimator.report import page
 from estimator.score import TABLE_HEADERS, Scores, read_or_score, score_dataset, table_cells
-from estimator.variants import VARIANTS, Variant
+from estimator.variants import VARIANTS
 
 INTERNAL_ERROR = 1
 USER_ERROR = 2

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pydantic import Field, Strict, ValidationError, field_validator, model_validator
 
 from estimator.errors import InputError
-from estimator.tables import Number, Positive, Row, Triple, first_line, first_problem, read_rows
+from estimator.tables import NotNegative, Number, Positive, Row, Triple, first_line, first_problem, read_rows
 
 INT64_MAX = 2**63 - 1
 MOST_PIXELS = 16
@@ -26,6 +26,7 @@ SPOT_TYPE = pa.struct([("led", pa.int64()), ("u_px", pa.float64()), ("v_px", pa.
 FRAME_COLUMNS = {
     "frame": pa.int64(),
     "shot": pa.int64(),
+    "pose": pa.int64(),
     "file": pa.string(),
     "sha256": pa.string(),
     "camera": pa.string(),
@@ -58,6 +59,10 @@ class Camera(Row):
     f_number: Positive
     projection: Literal["perspective", "equidistant"]
     distortion: Distortion | None
+    focus_distance_m: Positive | Literal["infinity"] | None
+    psf: Literal["none", "diffraction", "measured"]
+    psf_wavelength_nm: Positive
+    psf_kernel: tuple[tuple[Number, ...], ...] | None
     R_cam_rig: tuple[Triple, Triple, Triple]
     offset_m: Triple
 
@@ -80,13 +85,24 @@ class Camera(Row):
 
 
 class Sensor(Row):
-    """How electrons became digital numbers: `dn = round(min(e, full_well_e) / gain_e_per_dn) + black_level_dn`."""
+    """How electrons became digital numbers: `dn = round(min(e, full_well_e) / gain_e_per_dn) + black_level_dn`.
+
+    What is not shot noise is given by standard deviations, as the sensor's data sheet has them.
+    """
 
     bits: int = Field(ge=1, le=32)
     gain_e_per_dn: Positive
     full_well_e: Positive
     black_level_dn: float = Field(ge=0, le=2**32)
-    noise: Literal["shot", "none"]
+    noise: Literal["shot", "none", "full"]
+    prnu: NotNegative
+    dark_current_e_s: NotNegative
+    dsnu_e: NotNegative
+    read_noise_e: NotNegative
+    adc_noise_dn: NotNegative
+    row_offset_e: NotNegative
+    column_offset_e: NotNegative
+    mosaic: str
 
     def largest_dn(self) -> float:
         """The digital number of a pixel that holds all it can: the full well's, or the converter's last."""
@@ -94,11 +110,12 @@ class Sensor(Row):
 
 
 class Led(Row):
-    """What an LED sends of itself: its identity, its centre in the world and its radius, metres."""
+    """What an LED sends of itself: identity, centre in the world, and its radius or half side, metres."""
 
     id: LedId
     position_m: Annotated[tuple[Place, Place, Place], Strict(False)]
     radius_m: Positive
+    shape: Literal["disc", "square"]
 
 
 class DecodedSpot(Row):
@@ -114,6 +131,7 @@ class FrameRecord(Row):
 
     frame: int = Field(ge=0)
     shot: int = Field(ge=0)
+    pose: int = Field(ge=0)
     file: str
     sha256: str = Field(pattern="^[0-9a-fA-F]{64}$")
     camera: str
@@ -139,7 +157,7 @@ class _Description(Row):
     """dataset.json without `provenance`: with the seed in it, the truth could be computed."""
 
     format: Literal["vlcrender-dataset"]
-    version: Literal[2]
+    version: Literal[3]
     name: str
     frame_count: int = Field(ge=0, le=INT64_MAX)
     cameras: dict[str, Camera]
@@ -187,8 +205,13 @@ class DeviceFrame:
     camera: Camera
     sensor: Sensor
     accelerometer_m_s2: tuple[float, float, float]
+    accelerometer_error_deg: float
+    """Standard deviation of the tilt that the accelerometer shows, on each axis."""
+    exposure_s: float
     spots: tuple[DecodedSpot, ...]
     leds: dict[int, Led]
+    mates: "tuple[DeviceFrame, ...]" = ()
+    """What the rig's other cameras took at the same time; theirs are left empty."""
 
     def electrons(self, part: Part) -> NDArray[np.float32]:
         """A part in electrons above the black level, (rows, columns)."""
@@ -260,7 +283,16 @@ def read_frame(dataset: Dataset, record: FrameRecord) -> DeviceFrame:
     largest = max(part.image_dn.max() for part in parts)
     if largest > ceiling:
         raise InputError(f"{record.file}: digital number {largest}, but {dataset.sensor.bits} bits end at {ceiling}")
-    return DeviceFrame(parts, camera, dataset.sensor, record.accelerometer_m_s2, record.spots, dataset.leds)
+    return DeviceFrame(
+        parts,
+        camera,
+        dataset.sensor,
+        record.accelerometer_m_s2,
+        dataset.accelerometer_error_deg,
+        record.exposure_s,
+        record.spots,
+        dataset.leds,
+    )
 
 
 def _read_exr(folder: Path, record: FrameRecord, camera: Camera) -> tuple[Part, ...]:

@@ -19,6 +19,8 @@ COLUMNS = {
     "status": pa.string(),
     "reason": pa.string(),
     "position_m": pa.list_(pa.float64()),
+    "covariance_m2": pa.list_(pa.float64()),
+    "ambiguous": pa.bool_(),
     "ranges": pa.list_(pa.struct([("led", pa.int64()), ("range_m", pa.float64())])),
     "time_s": pa.float64(),
 }
@@ -32,7 +34,10 @@ class LedRange(Row):
 
 
 class EstimateRow(Row):
-    """One frame's answer: a world position in metres, or `failed` and a reason `stage: what went wrong`."""
+    """One frame's answer: a world position in metres, or `failed` and a reason `stage: what went wrong`.
+
+    `covariance_m2` is of the position, row by row, where the variant says how sure it is.
+    """
 
     frame: int = Field(ge=0)
     status: Literal["ok", "failed"]
@@ -40,6 +45,8 @@ class EstimateRow(Row):
     position_m: Triple | None
     ranges: Annotated[tuple[LedRange, ...], Strict(False)]
     time_s: float = Field(ge=0, le=1e9)
+    covariance_m2: Annotated[tuple[Number, ...], Strict(False), Field(min_length=9, max_length=9)] | None = None
+    ambiguous: bool = False
 
     @model_validator(mode="after")
     def _status_fits(self) -> "EstimateRow":

@@ -21,6 +21,7 @@ class Row(BaseModel):
 LARGEST = 1e100
 Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 Positive = Annotated[float, Field(gt=0, le=LARGEST)]
+NotNegative = Annotated[float, Field(ge=0, le=LARGEST)]
 # Arrow hands over lists; only the container is converted, the numbers in it stay strict.
 Triple = Annotated[tuple[Number, Number, Number], Strict(False)]
 

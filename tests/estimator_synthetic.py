@@ -134,6 +134,7 @@ FRAMES_SCHEMA = pa.schema(
     [
         ("frame", pa.int64()),
         ("shot", pa.int64()),
+        ("pose", pa.int64()),
         ("file", pa.string()),
         ("sha256", pa.string()),
         ("camera", pa.string()),
@@ -153,6 +154,7 @@ TRUTH_SCHEMA = pa.schema(
         ("tilt_y_deg", pa.float64()),
         ("yaw_deg", pa.float64()),
         ("leds", pa.list_(TRUTH_LED)),
+        ("bound_m2", pa.list_(pa.float64(), 9)),
     ]
 )
 
@@ -183,6 +185,7 @@ def write_dataset(
             {
                 "frame": index,
                 "shot": index,
+                "pose": index,
                 "file": file,
                 "sha256": write_exr(folder / file, image),
                 "camera": "main",
@@ -217,7 +220,7 @@ def description(view: View, frame_count: int, leds_m: Array, radius_m: float) ->
     pitch_um = 18000 / view.focal_px
     return {
         "format": "vlcrender-dataset",
-        "version": 2,
+        "version": 3,
         "name": "synthetic <&>",
         "frame_count": frame_count,
         "cameras": {
@@ -231,14 +234,23 @@ def description(view: View, frame_count: int, leds_m: Array, radius_m: float) ->
                 "f_number": 2.0,
                 "projection": "perspective",
                 "distortion": None,
+                "focus_distance_m": None,
+                "psf": "none",
+                "psf_wavelength_nm": 550.0,
+                "psf_kernel": None,
                 "R_cam_rig": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
                 "offset_m": [0.0, 0.0, 0.0],
             }
         },
-        "sensor": {"bits": 16, "gain_e_per_dn": 1.0, "full_well_e": 60000, "black_level_dn": 0, "noise": "shot"},
+        "sensor": {
+            **{"bits": 16, "gain_e_per_dn": 1.0, "full_well_e": 60000, "black_level_dn": 0, "noise": "shot"},
+            **{"prnu": 0.0, "dark_current_e_s": 0.0, "dsnu_e": 0.0, "read_noise_e": 0.0, "adc_noise_dn": 0.0},
+            **{"row_offset_e": 0.0, "column_offset_e": 0.0, "mosaic": "none"},
+        },
         "accelerometer": {"error_deg": 0.0},
         "led_map": [
-            {"id": 10 + k, "position_m": led.tolist(), "radius_m": radius_m} for k, led in enumerate(np.asarray(leds_m))
+            {"id": 10 + k, "position_m": led.tolist(), "radius_m": radius_m, "shape": "disc"}
+            for k, led in enumerate(np.asarray(leds_m))
         ],
         "room_m": [7.0, 7.0, 3.5],
         "provenance": {"seed": "12345678901234567890", "recipe": {"nothing": None}},

@@ -16,7 +16,10 @@ LIBRARY_ROOMS = {
     "cv2": {"estimator"},
     "colour": {"vlcrender/photometry.py"},
 }
-BACKEND_ROOMS = {"backend", "background", "furniture", "irradiance", "poisson", "raycast", "reference", "render"}
+BACKEND_ROOMS = {
+    *("backend", "background", "exposure", "furniture", "irradiance", "philox", "poisson"),
+    *("raycast", "reference", "render"),
+}
 """Modules of vlcrender that may use Mitsuba, through `backend`."""
 
 

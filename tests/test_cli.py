@@ -48,7 +48,7 @@ GENERATE_MISTAKES: dict[str, tuple[list[str], list[str]]] = {
     "negative exposure": (["--set", "exposure_s=-1"], ["exposure_s = -1", "greater than 0"]),
     "not a number": (["--set", "exposure_s=soon"], ["exposure_s", "soon", "number"]),
     "infinite": (["--set", "exposure_s=inf"], ["exposure_s"]),
-    "bits": (["--set", "sensor.bits=9"], ["sensor.bits = 9", "8, 10 or 12"]),
+    "bits": (["--set", "sensor.bits=9"], ["sensor.bits = 9", "8, 10, 12 or 14"]),
     "negative gain": (["--set", "sensor.gain_e_per_dn=-2"], ["sensor.gain_e_per_dn = -2"]),
     "noise": (["--set", "sensor.noise=gaussian"], ["sensor.noise", "gaussian", "shot"]),
     "no --set value": (["--set", "exposure_s"], ["--set exposure_s", "key=value"]),

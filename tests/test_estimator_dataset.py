@@ -367,6 +367,8 @@ def test_estimates_come_back_as_written_in_the_formats_types(folder: Path) -> No
         "status": "string",
         "reason": "string",
         "position_m": "list<element: double>",
+        "covariance_m2": "list<element: double>",
+        "ambiguous": "bool",
         "ranges": "list<element: struct<led: int64, range_m: double>>",
         "time_s": "double",
     }

@@ -12,7 +12,7 @@ from estimator.errors import InputError
 from estimator.estimates import EstimateRow, LedRange, write_estimates
 from estimator.score import Scores, length_text, read_or_score, score_dataset, score_variant
 
-LEDS = {10: Led(id=10, position_m=(1.0, 2.0, 3.5), radius_m=0.01)}
+LEDS = {10: Led(id=10, position_m=(1.0, 2.0, 3.5), radius_m=0.01, shape="disc")}
 TRUTH = (1.0, 2.0, 0.5)
 
 

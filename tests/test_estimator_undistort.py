@@ -23,6 +23,10 @@ def camera(projection: str = "perspective", skew_px: float = 0.0, **coefficients
             "f_number": 2.0,
             "projection": projection,
             "distortion": Distortion(**{**none, **coefficients}) if coefficients else None,
+            "focus_distance_m": None,
+            "psf": "none",
+            "psf_wavelength_nm": 550.0,
+            "psf_kernel": None,
             "R_cam_rig": ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
             "offset_m": (0.0, 0.0, 0.0),
         }

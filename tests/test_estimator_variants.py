@@ -13,7 +13,8 @@ from estimator.batch import estimate_dataset, estimate_frame
 from estimator.dataset import DeviceFrame, read_dataset, read_frame
 from estimator.errors import EstimationFailure
 from estimator.estimates import EstimateRow
-from estimator.variants import VARIANTS, Estimate, Variant
+from estimator.pipeline import Estimate, Variant
+from estimator.variants import VARIANTS
 
 
 @pytest.fixture(scope="module")

@@ -46,7 +46,13 @@ def make_frame(job: Job, frame: int) -> Record:
     view = renderer.view(camera, pose, recipe.windows, during)
     noise = f"{recipe.seed}/{frame}/shot-noise"
     expected = [(part.window, part.expected_electrons(recipe.exposure_s)) for part in view.parts]
-    dn = [(window, expose(recipe.sensor, image, noise, window.row, window.column)) for window, image in expected]
+    dn = [
+        (
+            window,
+            expose(recipe.sensor, image, noise, window.row, window.column, recipe.exposure_s, mounted.name),
+        )
+        for window, image in expected
+    ]
     attributes = exr_attributes(camera, mounted.name, recipe.exposure_s, frame)
     file = f"{FRAMES}/{frame:06d}.exr"
     digest = write_exr(directory / file, dn, sensor, attributes)
@@ -58,6 +64,7 @@ def make_frame(job: Job, frame: int) -> Record:
     device = {
         "frame": frame,
         "shot": shot,
+        "pose": shot,
         "file": file,
         "sha256": digest,
         "camera": mounted.name,
@@ -78,6 +85,7 @@ def make_frame(job: Job, frame: int) -> Record:
             {"led": p.led_id, "u_px": p.center_px[0], "v_px": p.center_px[1], "visible_fraction": p.visible_fraction}
             for p in sorted(view.patches, key=lambda p: p.led_id)
         ],
+        "bound_m2": None,
     }
     return {"frame": frame, "device": device, "truth": truth}
 

@@ -190,11 +190,11 @@ def _finish(plan: Plan, directory: Path, provenance: dict[str, Any], records: li
     write_table(directory / "truth.parquet", [record["truth"] for record in records], TRUTH_SCHEMA)
     dataset = DatasetFile(
         format="vlcrender-dataset",
-        version=2,
+        version=3,
         name=recipe.name,
         frame_count=len(records),
         cameras={mounted.name: camera_entry(mounted) for mounted in recipe.cameras},
-        sensor=SensorEntry(**recipe.sensor.model_dump()),
+        sensor=SensorEntry(**recipe.sensor.acting()),
         accelerometer=AccelerometerEntry(error_deg=recipe.accelerometer.error_deg),
         led_map=led_map(scene.leds),
         room_m=scene.settings.room.size_m,

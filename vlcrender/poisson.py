@@ -2,18 +2,17 @@
 
 So a window of a frame gets the draws that the whole frame would, in any order and on any number of threads. Means of 10
 and more: transformed rejection with squeeze (PTRS, W. Hoermann, Insurance: Mathematics and Economics 12 (1993) 39).
-Below: products of uniforms (Knuth). Uniforms: Philox 4x32-10 (Salmon et al. 2011) keyed by a hash.
+Below: products of uniforms (Knuth). Uniforms: `philox`.
 """
 
-import hashlib
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vlcrender.backend import dr, exact_math, mi
+from vlcrender.philox import PHILOX, places, seed_of
 
-PHILOX: Any = mi.Philox4x32
 MOST_TURNS = 1000
 """A turn takes a draw with a chance of 0.7 or more, so that none ever gets here; no kernel may run for ever."""
 LARGEST_MEAN = 2.0**22
@@ -29,24 +28,17 @@ def poisson(means: NDArray[np.float32], key: str, row: int = 0, column: int = 0)
     low, high = float(means.min()), float(means.max())
     if not 0 <= low <= high <= LARGEST_MEAN:
         raise ValueError(f"means from {low} to {high} electrons; 0 to {LARGEST_MEAN:.0f} are allowed")
-    seed = int.from_bytes(hashlib.blake2b(key.encode(), digest_size=8).digest(), "little")
     with exact_math():
-        # As data: as literals these numbers would make a kernel of each window.
-        columns, first_row, first_column = (
-            dr.opaque(mi.UInt32, number % 2**32) for number in (means.shape[1], row, column)
-        )
-        index = dr.arange(mi.UInt32, means.size)
-        down = index // columns
-        place = (first_column + (index - down * columns), first_row + down)
         flat = np.ascontiguousarray(means, dtype=np.float32).ravel()
-        count: Any = _draw(mi.Float(flat), dr.opaque(mi.UInt64, seed), *place)
+        count: Any = mi.UInt32(draw(mi.Float(flat), seed_of(key), *places(means.shape, row, column)))
         dr.eval(count)
     counts: NDArray[np.uint32] = count.numpy().reshape(means.shape)
     return counts
 
 
 @dr.syntax
-def _draw(mean: Any, seed: Any, column: Any, row: Any) -> Any:
+def draw(mean: Any, seed: Any, column: Any, row: Any) -> Any:
+    """Poisson counts as Float32, for a kernel: means 0 to LARGEST_MEAN, seed and places as `philox` has them."""
     large = mean >= 10.0
     mu = dr.maximum(mean, 10.0)
     b = 0.931 + 2.53 * dr.sqrt(mu)
@@ -78,7 +70,7 @@ def _draw(mean: Any, seed: Any, column: Any, row: Any) -> Any:
         count = dr.select(active, dr.select(large, dr.select(accepted, tried, count), count + steps), count)
         active &= ~dr.select(large, accepted, low) & (turn < MOST_TURNS)
         turn += 1
-    return mi.UInt32(count)
+    return count
 
 
 def _log_probability(k: Any, mu: Any) -> Any:

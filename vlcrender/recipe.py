@@ -12,10 +12,11 @@ from vlcrender.errors import InputError
 from vlcrender.inertial import Accelerometer, TiltError
 from vlcrender.motion import Motion
 from vlcrender.poses import AimedPoses, Poses
+from vlcrender.presets import with_presets
 from vlcrender.rig import MAIN, Mounted, RigCamera, mounted_cameras
 from vlcrender.scene import Scene, load_scene
 from vlcrender.sensor import Sensor
-from vlcrender.settings import Settings, check, override, read_toml
+from vlcrender.settings import Settings, check, read_toml
 from vlcrender.windows import LedWindows
 
 ScaleMode = Literal["binned", "same-photons"]
@@ -84,13 +85,13 @@ class Plan:
 
 
 def load_plan(path: Path, assignments: Iterable[str] = (), scale: int = 1, scale_mode: ScaleMode = "binned") -> Plan:
-    """Read a recipe, apply `key=value` assignments, then `scaled`, and read its scene.
+    """Read a recipe, put in presets and `key=value` assignments, apply `scaled`, and read its scene.
 
     Raises InputError naming file, key and value.
     """
     assignments = list(assignments)
     source = f"{path} with --set" if assignments else str(path)
-    recipe = check(override(read_toml(path), assignments), Recipe, source)
+    recipe = check(with_presets(read_toml(path), assignments, source), Recipe, source)
     scene_path = Path(path.parent / recipe.scene)
     if not scene_path.is_file():
         raise InputError(f"{source}: scene = {recipe.scene!r}: no such file from the recipe's folder")
@@ -100,7 +101,8 @@ def load_plan(path: Path, assignments: Iterable[str] = (), scale: int = 1, scale
 def scaled(recipe: Recipe, by: int, mode: ScaleMode) -> Recipe:
     """The same recipe with `by` x `by` pixels made one, and all that is given in pixels divided by `by`.
 
-    "binned" keeps all photons: full well and gain grow with the pixels' area, so that digital numbers keep their range.
+    "binned" keeps all photons: full well and gain grow with the pixels' area, so that digital numbers keep their range
+    (`Sensor.binned`).
     "same-photons" shortens the exposure by the pixels' area instead: as many photons in a pixel as before.
     Raises InputError where `by` does not divide a sensor or the result is no recipe.
     """
@@ -122,8 +124,7 @@ def scaled(recipe: Recipe, by: int, mode: ScaleMode) -> Recipe:
     if mode == "same-photons":
         changes["exposure_s"] = recipe.exposure_s / by**2
     else:
-        larger = {key: getattr(recipe.sensor, key) * by**2 for key in ("full_well_e", "gain_e_per_dn")}
-        changes["sensor"] = recipe.sensor.model_copy(update=larger)
+        changes["sensor"] = recipe.sensor.binned(by)
     return check(recipe.model_copy(update=changes).model_dump(mode="json"), Recipe, f"--scale {by}")
 
 
