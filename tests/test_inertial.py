@@ -152,7 +152,7 @@ def test_the_stated_error_is_the_scatter_of_tilts_over_devices(name: str) -> Non
     The standard error is FIVE_SIGMA / 5; terms of second order (the length of what is read: 1 +- 0.02 from offset and
     scale) change a variance by their square, 4e-4, and so the spread by 2e-4.
     """
-    plan = load_plan(QUICKSTART, [f'accelerometer={{ preset = "{name}", temperature_c = 35.0 }}'])
+    plan = load_plan(QUICKSTART, [f"accelerometer.preset={name}", "accelerometer.temperature_c=35"])
     device = plan.recipe.accelerometer
     assert isinstance(device, Imu)
     assert 0.5 < device.error_deg < 2.0  # what Huynh & Yoo 2016, 3.3.2, call commercial: up to 2 deg
@@ -209,13 +209,14 @@ def test_bad_values_are_refused_by_name(assignment: str) -> None:
 
 def test_a_part_in_a_dataset(tmp_path: Path) -> None:
     """The reading with its errors goes to the device's table, the pose without them to the truth's."""
-    part = 'accelerometer={ preset = "bmi270", serial = 4, noise_density_ug_rthz = 0.0 }'
-    plan = load_plan(QUICKSTART, [*SMALL, "poses.count=2", "sensor.noise=none", part])
+    part = [f"accelerometer.{what}" for what in ("preset=bmi270", "serial=4", "noise_density_ug_rthz=0")]
+    plan = load_plan(QUICKSTART, [*SMALL, "poses.count=2", "sensor.noise=none", *part])
     generate(plan, tmp_path / "set")
     frames, truth = (pq.read_table(tmp_path / f"set/{name}.parquet").to_pylist() for name in ("frames", "truth"))
     for device, row in zip(frames, truth, strict=True):
         pose = Pose(tuple(row["position_m"]), row["tilt_x_deg"], row["tilt_y_deg"], row["yaw_deg"])
         assert np.allclose(np.reshape(row["R_cam_world"], (3, 3)), pose.rotation, atol=1e-12)
-        assert device["accelerometer_m_s2"] == pytest.approx(plan.recipe.accelerometer.reading_m_s2(pose, stream(0, 0, "")))
+        alone = plan.recipe.accelerometer.reading_m_s2(pose, stream(0, 0, "any: there is no noise"))
+        assert device["accelerometer_m_s2"] == pytest.approx(alone)
         assert np.abs(np.subtract(device["accelerometer_m_s2"], pose.rotation @ [0, 0, G])).max() > 0.01
     assert read_dataset_file(tmp_path / "set").accelerometer.error_deg == plan.recipe.accelerometer.error_deg
