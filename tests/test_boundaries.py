@@ -15,6 +15,8 @@ LIBRARY_ROOMS = {
     "OpenEXR": {"vlcrender/dataset.py", "estimator/dataset.py"},
     "cv2": {"estimator"},
     "colour": {"vlcrender/photometry.py"},
+    "colour_demosaicing": {"vlcrender/tone.py"},
+    "PIL": {"vlcrender/tone.py"},
 }
 BACKEND_ROOMS = {
     *("backend", "background", "exposure", "furniture", "irradiance", "philox", "poisson"),

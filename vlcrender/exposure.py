@@ -11,6 +11,27 @@ from vlcrender.poisson import LARGEST_MEAN, draw, poisson
 from vlcrender.sensor import Electrons, Sensor, clip_full_well
 
 
+def variance_e2(sensor: Sensor, expected_e: NDArray[np.float32], exposure_s: float = 0.0) -> NDArray[np.float64]:
+    """Variance of each pixel's digital number in electrons squared, same shape; inf where it is saturated.
+
+    The fixed patterns count: who does not know them cannot tell them from noise (that a row or a column shares its
+    offset is left aside). Saturated are pixels whose mean is at the full well or at the converter's end. Rounding adds
+    gain^2 / 12 but where digital numbers are the electrons counted.
+    """
+    gain, full = sensor.gain_at_iso_e_per_dn, sensor.noise == "full"
+    mean = expected_e.astype(np.float64)
+    level = mean + sensor.dark_electrons(exposure_s) if full else mean
+    variance = level.copy()
+    if full:
+        added = (sensor.dark_noise_e, sensor.dsnu_e, sensor.row_offset_e, sensor.column_offset_e)
+        variance += (sensor.prnu * mean) ** 2 + sum(sigma**2 for sigma in added)
+    if full or gain != 1.0:
+        variance += gain**2 / 12
+    top_e = min(sensor.full_well_e, (sensor.largest_dn - sensor.black_level_dn) * gain)
+    variance[level >= top_e] = np.inf
+    return variance
+
+
 def expose(
     sensor: Sensor,
     expected_e: NDArray[np.float32],
@@ -64,7 +85,7 @@ def _full_chain(
         of_column, _ = normals(seed_of(f"{individual}/columns"), column, mi.UInt32(0))
         electrons = electrons + number(sensor.dark_noise_e) * noise
         electrons = electrons + number(sensor.row_offset_e) * of_row + number(sensor.column_offset_e) * of_column
-        level = dr.round(electrons / number(sensor.gain_at_iso_e_per_dn) + number(sensor.black_level_dn))  # 9
+        level = dr.round(electrons / number(sensor.gain_at_iso_e_per_dn)) + number(sensor.black_level_dn)  # 8 and 9
         dn: Any = mi.UInt32(dr.clip(level, 0.0, number(sensor.largest_dn)))
         dr.eval(dn)
     image: NDArray[np.uint32] = dn.numpy().reshape(expected_e.shape)

@@ -1,24 +1,34 @@
 """One frame of a dataset: where its cameras are, what they see, what is written of it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-from vlcrender.camera import Pose
+import numpy as np
+
+from vlcrender.bounds import position_bound_m2
+from vlcrender.camera import Camera, Pose
 from vlcrender.dataset import exr_attributes, write_exr, write_preview
 from vlcrender.downlink import decoded_spots
-from vlcrender.exposure import expose
+from vlcrender.exposure import expose, variance_e2
+from vlcrender.irradiance import bake
+from vlcrender.mosaic import MosaicRenderer
 from vlcrender.motion import poses_during
+from vlcrender.photometry import detectors, electron_rate_per_cd_m2
 from vlcrender.poses import pose_of_frame
 from vlcrender.recipe import Recipe
 from vlcrender.render import Renderer
+from vlcrender.rig import Mounted
 from vlcrender.scene import Scene, build_scene
 from vlcrender.scene_settings import SceneSettings
+from vlcrender.sensor import Sensor
 from vlcrender.streams import stream
+from vlcrender.view import Image
 from vlcrender.windows import Window
 
-FRAMES, EXPECTED, PREVIEWS = "frames", "expected", "previews"
+FRAMES, EXPECTED, PREVIEWS, PROCESSED = "frames", "expected", "previews", "processed"
 
 Record = dict[str, Any]
 """One frame's rows: {"frame": n, "device": row of frames.parquet, "truth": row of truth.parquet}."""
@@ -38,37 +48,38 @@ def make_frame(job: Job, frame: int) -> Record:
     """Render, expose and write one frame; depends on nothing but its arguments."""
     recipe, renderer = _renderer(job.recipe_json, job.scene_json, job.scene_folder)
     directory = Path(job.directory)
-    shot, which = divmod(frame, len(recipe.cameras))
+    pose_number, shot, which = recipe.place_of_frame(frame)
     mounted = recipe.cameras[which]
     camera, sensor = mounted.camera, Window.of_sensor(mounted.camera)
     main, during = poses_of_frame(recipe, renderer.scene, frame)
     pose = mounted.pose(main)
     view = renderer.view(camera, pose, recipe.windows, during)
+    exposure_s = recipe.time_s(view)
     noise = f"{recipe.seed}/{frame}/shot-noise"
-    expected = [(part.window, part.expected_electrons(recipe.exposure_s)) for part in view.parts]
+    expected = [(part.window, part.expected_electrons(exposure_s)) for part in view.parts]
     dn = [
-        (
-            window,
-            expose(recipe.sensor, image, noise, window.row, window.column, recipe.exposure_s, mounted.name),
-        )
+        (window, expose(recipe.sensor, image, noise, window.row, window.column, exposure_s, mounted.name))
         for window, image in expected
     ]
-    attributes = exr_attributes(camera, mounted.name, recipe.exposure_s, frame)
+    attributes = exr_attributes(camera, mounted.name, exposure_s, frame)
     file = f"{FRAMES}/{frame:06d}.exr"
     digest = write_exr(directory / file, dn, sensor, attributes)
     if recipe.expected:
         write_exr(directory / EXPECTED / f"{frame:06d}.exr", expected, sensor, attributes)
     write_preview(directory / PREVIEWS / f"{frame:06d}.png", dn, sensor, recipe.sensor.largest_dn)
+    if recipe.processed is not None:
+        picture = recipe.processed.develop(dn[0][1], recipe.sensor, _balance(camera, recipe.sensor, renderer.scene))
+        recipe.processed.write(directory / PROCESSED / f"{frame:06d}{recipe.processed.suffix}", picture)
     # One accelerometer on the rig: its error belongs to the shot.
     reading = mounted.rotation @ recipe.accelerometer.reading_m_s2(main, stream(recipe.seed, shot, "accelerometer"))
     device = {
         "frame": frame,
         "shot": shot,
-        "pose": shot,
+        "pose": pose_number,
         "file": file,
         "sha256": digest,
         "camera": mounted.name,
-        "exposure_s": recipe.exposure_s,
+        "exposure_s": exposure_s,
         "capturable": all(sensor.holds(part.window) for part in view.parts),
         "accelerometer_m_s2": reading.tolist(),
         "spots": decoded_spots(view.parts, camera.width_px, stream(recipe.seed, frame, "demodulator")),
@@ -85,20 +96,58 @@ def make_frame(job: Job, frame: int) -> Record:
             {"led": p.led_id, "u_px": p.center_px[0], "v_px": p.center_px[1], "visible_fraction": p.visible_fraction}
             for p in sorted(view.patches, key=lambda p: p.led_id)
         ],
-        "bound_m2": None,
+        "bound_m2": _bound_m2(recipe, renderer, mounted, main, exposure_s, expected, device["spots"]),
     }
     return {"frame": frame, "device": device, "truth": truth}
 
 
+def _bound_m2(
+    recipe: Recipe,
+    renderer: Renderer | MosaicRenderer,
+    mounted: Mounted,
+    main: Pose,
+    exposure_s: float,
+    expected: Sequence[tuple[Window, Image]],
+    spots: Sequence[dict[str, Any]],
+) -> list[float] | None:
+    """The frame's Cramér-Rao bound, row by row; None where it is not asked for or nothing is determined."""
+    if not recipe.bound:
+        return None
+    position = np.array(mounted.pose(main).position_m)
+    bound = position_bound_m2(
+        mounted.camera,
+        main,
+        lambda pose: renderer.led_patches(mounted.camera, mounted.pose(pose), recipe.windows, mounted.pose(main)),
+        exposure_s,
+        [(window, variance_e2(recipe.sensor, image, exposure_s)) for window, image in expected],
+        [spot["led"] for spot in spots],
+        float(np.median(np.linalg.norm(renderer.scene.leds.centers_m - position, axis=1))),
+        recipe.accelerometer.error_deg,
+        recipe.windows is not None and recipe.windows.overscan,
+    )
+    return None if bound is None else bound.ravel().tolist()
+
+
 def poses_of_frame(recipe: Recipe, scene: Scene, frame: int) -> tuple[Pose, tuple[Pose, ...]]:
     """The pose of the camera `main` at mid-exposure, and those of the frame's own camera during the exposure."""
-    shot, which = divmod(frame, len(recipe.cameras))
-    main = pose_of_frame(recipe.poses, shot, recipe.seed, recipe.camera, scene)
-    return main, poses_during(recipe.motion, recipe.cameras[which], main, recipe.exposure_s, scene)
+    pose_number, _, which = recipe.place_of_frame(frame)
+    main = pose_of_frame(recipe.poses, pose_number, recipe.seed, recipe.camera, scene)
+    # Without a time there is no motion, and the other way round: the recipe sees to it.
+    return main, poses_during(recipe.motion, recipe.cameras[which], main, recipe.exposure_s or 0.0, scene)
+
+
+def _balance(camera: Camera, sensor: Sensor, scene: Scene) -> tuple[float, float, float]:
+    """What makes the LEDs' light white: multipliers of red, green and blue, at least 1 so that white stays white."""
+    rates = [electron_rate_per_cd_m2(camera, scene.settings.led_spectrum, d) for d in detectors(sensor)]
+    red, green, blue = (max(rates) / rate if rate > 0 else 1.0 for rate in (rates if len(rates) == 3 else rates * 3))
+    return red, green, blue
 
 
 @cache
-def _renderer(recipe_json: str, scene_json: str, scene_folder: str) -> tuple[Recipe, Renderer]:
+def _renderer(recipe_json: str, scene_json: str, scene_folder: str) -> tuple[Recipe, Renderer | MosaicRenderer]:
     """One renderer a process and plan."""
     scene = build_scene(SceneSettings.model_validate_json(scene_json), "scene", Path(scene_folder))
-    return Recipe.model_validate_json(recipe_json), Renderer(scene)
+    recipe, light = Recipe.model_validate_json(recipe_json), bake(scene)
+    of_colours = tuple(Renderer(scene, light, detector) for detector in detectors(recipe.sensor))
+    mosaic = recipe.sensor.mosaic
+    return recipe, of_colours[0] if mosaic == "none" else MosaicRenderer(of_colours, mosaic)

@@ -26,9 +26,9 @@ from vlcrender.dataset import (
     write_table,
 )
 from vlcrender.errors import InputError
-from vlcrender.frame import EXPECTED, FRAMES, PREVIEWS, Job, Record, make_frame, poses_of_frame
+from vlcrender.frame import EXPECTED, FRAMES, PREVIEWS, PROCESSED, Job, Record, make_frame, poses_of_frame
 from vlcrender.irradiance import bake, room_mesh
-from vlcrender.recipe import Plan
+from vlcrender.recipe import Plan, Recipe
 from vlcrender.render import check_inside, share_cores
 
 
@@ -57,7 +57,7 @@ def generate(
         check_inside(plan.scene, during[0])
         check_inside(plan.scene, during[-1])
     room_mesh(plan.scene)  # furniture that cannot be used is found before anything is written
-    _prepare(directory, provenance, plan.recipe.expected)
+    _prepare(directory, provenance, plan.recipe)
     job = Job(
         plan.recipe.model_dump_json(), plan.scene.settings.model_dump_json(), str(plan.scene.folder), str(directory)
     )
@@ -151,13 +151,14 @@ def _check_same(path: Path, provenance: dict[str, Any], what: str) -> None:
         raise InputError(f"{path.parent}: holds {what}; nothing was changed; choose another --out or delete it")
 
 
-def _prepare(directory: Path, provenance: dict[str, Any], expected: bool) -> None:
+def _prepare(directory: Path, provenance: dict[str, Any], recipe: Recipe) -> None:
     plan_file = directory / "plan.json"
     if plan_file.exists():
         _check_same(plan_file, provenance, "an unfinished dataset of another recipe, scene or version")
     elif directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
         raise InputError(f"{directory}: is not empty and not a dataset; nothing was changed; choose another --out")
-    for name in (FRAMES, PREVIEWS, *([EXPECTED] if expected else [])):
+    asked_for = {FRAMES: True, PREVIEWS: True, EXPECTED: recipe.expected, PROCESSED: recipe.processed is not None}
+    for name in (name for name, wanted in asked_for.items() if wanted):
         (directory / name).mkdir(parents=True, exist_ok=True)
     for leftover in directory.rglob("*.partial"):
         leftover.unlink()

@@ -9,16 +9,38 @@ photopic observer; both as tabulated by the package colour-science. Silicon: `si
 
 from dataclasses import dataclass
 from functools import cache
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import constants
 
 from vlcrender.camera import Camera
+from vlcrender.quantum_efficiency import COLOURS, QuantumEfficiency
+from vlcrender.sensor import Sensor
 
 WAVELENGTHS_NM: NDArray[np.float64] = np.arange(380.0, 781.0, 1.0)
 LUMINOUS_EFFICACY_LM_W = 683.0
 """Rounded by every photometric table; 683.002 for V(lambda) in standard air."""
+
+
+class Detector(Protocol):
+    """What turns photons into electrons."""
+
+    def quantum_efficiency(self, wavelengths_nm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Electrons a photon, same shape as the wavelengths."""
+
+
+@dataclass(frozen=True)
+class Tabulated:
+    """A detector of which a table is known; one colour of it, or "values" where there is no mosaic."""
+
+    table: QuantumEfficiency
+    colour: str = "values"
+
+    def quantum_efficiency(self, wavelengths_nm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Electrons a photon, same shape as the wavelengths."""
+        return self.table.at(wavelengths_nm, self.colour)
 
 
 @dataclass(frozen=True)
@@ -84,11 +106,19 @@ def spectral_radiance(luminance_cd_m2: float, spectrum: NDArray[np.float64]) -> 
     return radiance
 
 
-def electron_rate_per_cd_m2(camera: Camera, spectrum_name: str, silicon: Silicon) -> float:
+def detectors(sensor: Sensor) -> tuple[Detector, ...]:
+    """A sensor's one detector, or with a mosaic those under each of COLOURS."""
+    table = sensor.quantum_efficiency
+    if table == "silicon":
+        return (Silicon(),)
+    return tuple(Tabulated(table, colour) for colour in (COLOURS if table.coloured else ("values",)))
+
+
+def electron_rate_per_cd_m2(camera: Camera, spectrum_name: str, detector: Detector) -> float:
     """Electrons a second in an on-axis pixel that sees 1 cd/m2. The image model of datasets/FORMAT.md's frames."""
     watt_per_nm = spectral_radiance(1.0, relative_spectrum(spectrum_name))
     photon_j = constants.h * constants.c / (WAVELENGTHS_NM * 1e-9)
-    electrons = np.trapezoid(watt_per_nm * silicon.quantum_efficiency(WAVELENGTHS_NM) / photon_j, WAVELENGTHS_NM)
+    electrons = np.trapezoid(watt_per_nm * detector.quantum_efficiency(WAVELENGTHS_NM) / photon_j, WAVELENGTHS_NM)
     solid_angle_sr = np.pi / 4 / camera.working_f_number**2
     area_m2 = (camera.pixel_pitch_um * 1e-6) ** 2
     return float(solid_angle_sr * area_m2 * camera.transmittance * electrons)

@@ -10,6 +10,7 @@ from pydantic import Field, model_validator
 from vlcrender.camera import Camera
 from vlcrender.errors import InputError
 from vlcrender.inertial import Accelerometer, TiltError
+from vlcrender.metering import Metering
 from vlcrender.motion import Motion
 from vlcrender.poses import AimedPoses, Poses
 from vlcrender.presets import with_presets
@@ -17,6 +18,8 @@ from vlcrender.rig import MAIN, Mounted, RigCamera, mounted_cameras
 from vlcrender.scene import Scene, load_scene
 from vlcrender.sensor import Sensor
 from vlcrender.settings import Settings, check, read_toml
+from vlcrender.tone import Processed
+from vlcrender.view import View
 from vlcrender.windows import LedWindows
 
 ScaleMode = Literal["binned", "same-photons"]
@@ -32,9 +35,17 @@ class Recipe(Settings):
     scene: str
     """Path of the scene file, from the recipe's folder."""
     seed: Annotated[int, Field(ge=0, lt=2**63)]
-    exposure_s: Annotated[float, Field(gt=0, le=100)]
+    exposure_s: Annotated[float, Field(gt=0, le=100)] | None = None
+    exposure: Metering | None = None
+    """In place of `exposure_s`: how each frame's is chosen."""
+    repeats: Annotated[int, Field(ge=1, le=1_000_000)] = 1
+    """Shots of each pose, one after another; they differ by noise alone."""
     expected: bool = False
     """Whether the noise-free images are written too."""
+    processed: Processed | None = None
+    """Whether pictures as a phone makes them are written too, and how."""
+    bound: bool = False
+    """Whether each frame's Cramér-Rao bound is computed: some seconds for a full frame of many LEDs."""
     camera: Camera = Camera()
     sensor: Sensor = Sensor()
     accelerometer: Accelerometer = TiltError()
@@ -46,6 +57,20 @@ class Recipe(Settings):
     """Cameras beside `main`, which is the one under `camera` and the one that `poses` are for."""
 
     @model_validator(mode="after")
+    def _one_way_to_expose(self) -> Self:
+        if (self.exposure_s is None) == (self.exposure is None):
+            raise ValueError("exposure_s: has to be given, or the table exposure in its place, and not both")
+        if self.exposure is not None and self.motion is not None:
+            raise ValueError("exposure: cannot be chosen with motion, whose blur needs the time first; give exposure_s")
+        return self
+
+    @model_validator(mode="after")
+    def _processed_is_of_full_frames(self) -> Self:
+        if self.processed is not None and self.windows is not None:
+            raise ValueError("processed: is made of full frames; leave windows out, or it")
+        return self
+
+    @model_validator(mode="after")
     def _camera_names_differ(self) -> Self:
         names = [MAIN, *(entry.name for entry in self.rig)]
         for name in names:
@@ -53,6 +78,14 @@ class Recipe(Settings):
                 raise ValueError(
                     f"rig: {name!r} is the name of more than one camera (the one under camera is {MAIN!r})"
                 )
+        return self
+
+    @model_validator(mode="after")
+    def _bounds_are_of_noisy_cameras_at_rest(self) -> Self:
+        if self.bound and self.motion is not None:
+            raise ValueError("bound = true: is for cameras at rest; leave out [motion]")
+        if self.bound and self.sensor.noise == "none":
+            raise ValueError('bound = true: without noise there is none; sensor.noise must not be "none"')
         return self
 
     @model_validator(mode="after")
@@ -72,8 +105,20 @@ class Recipe(Settings):
 
     @property
     def frame_count(self) -> int:
-        """One frame for each camera at each pose."""
-        return self.poses.count * len(self.cameras)
+        """One frame for each camera, pose and repeat."""
+        return self.poses.count * self.repeats * len(self.cameras)
+
+    def time_s(self, view: View) -> float:
+        """Exposure time of a view, seconds."""
+        if self.exposure is not None:
+            return self.exposure.time_s(view, self.sensor.full_well_e)
+        assert self.exposure_s is not None  # _one_way_to_expose
+        return self.exposure_s
+
+    def place_of_frame(self, frame: int) -> tuple[int, int, int]:
+        """Pose, shot and camera of a frame, each counted from 0; frames of one shot, then of one pose, are together."""
+        shot, which = divmod(frame, len(self.cameras))
+        return shot // self.repeats, shot, which
 
 
 @dataclass(frozen=True)
@@ -91,7 +136,12 @@ def load_plan(path: Path, assignments: Iterable[str] = (), scale: int = 1, scale
     """
     assignments = list(assignments)
     source = f"{path} with --set" if assignments else str(path)
-    recipe = check(with_presets(read_toml(path), assignments, source), Recipe, source)
+    tree = read_toml(path)
+    keys = {assignment.partition("=")[0].partition(".")[0].strip() for assignment in assignments}
+    for way, other in (("exposure", "exposure_s"), ("exposure_s", "exposure")):
+        if way in keys and other not in keys:
+            tree.pop(other, None)  # one way to expose that is assigned replaces the recipe's other
+    recipe = check(with_presets(tree, assignments, source), Recipe, source)
     scene_path = Path(path.parent / recipe.scene)
     if not scene_path.is_file():
         raise InputError(f"{source}: scene = {recipe.scene!r}: no such file from the recipe's folder")
@@ -122,7 +172,12 @@ def scaled(recipe: Recipe, by: int, mode: ScaleMode) -> Recipe:
     if recipe.windows is not None:
         changes["windows"] = recipe.windows.model_copy(update={"margin_px": recipe.windows.margin_px / by})
     if mode == "same-photons":
-        changes["exposure_s"] = recipe.exposure_s / by**2
+        if recipe.exposure_s is not None:
+            changes["exposure_s"] = recipe.exposure_s / by**2
+        else:  # what is metered are electrons in a pixel
+            changes["exposure"] = recipe.exposure and recipe.exposure.model_copy(
+                update={"longest_s": recipe.exposure.longest_s / by**2}
+            )
     else:
         changes["sensor"] = recipe.sensor.binned(by)
     return check(recipe.model_copy(update=changes).model_dump(mode="json"), Recipe, f"--scale {by}")

@@ -22,7 +22,7 @@ from vlcrender.irradiance import Light, bake
 from vlcrender.led_image import image_of_led, leds_that_may_be_seen
 from vlcrender.led_shape import Disc, Rectangle
 from vlcrender.lens import blur, blur_kernel, relative_illumination
-from vlcrender.photometry import Silicon, electron_rate_per_cd_m2
+from vlcrender.photometry import Detector, Silicon, electron_rate_per_cd_m2
 from vlcrender.raycast import pane_reflectance
 from vlcrender.scene import Pane, Scene
 from vlcrender.view import Image, LedPatch, Reflection, View, ViewPart
@@ -65,10 +65,10 @@ class _Lit:
 class Renderer:
     """Renders views of one scene."""
 
-    def __init__(self, scene: Scene, light: Light | None = None, silicon: Silicon | None = None) -> None:
-        """Prepare a scene. `light` is its bake, made or taken from the cache where not given."""
+    def __init__(self, scene: Scene, light: Light | None = None, detector: Detector | None = None) -> None:
+        """Prepare a scene. `light` is its bake, made or taken from the cache where not given; `detector`, silicon."""
         self.scene = scene
-        self.silicon = silicon or Silicon()
+        self.detector = detector or Silicon()
         self._light = light or bake(scene)
         self._background = Background(scene, self._light)
         self._shapes = [
@@ -94,17 +94,10 @@ class Renderer:
         for place in places:
             check_inside(self.scene, place)
         kernels = self._kernels(camera, pose)
-        spread = max((kernel.shape[0] // 2 for kernel in kernels.values() if kernel is not None), default=0)
+        spread = _spread(kernels)
         images = [dict(self._led_images(camera, place, windows, spread)) for place in places]
-        lit = {i: window.grown(_radius(kernels[i])) for i, window in _around(images).items()}
-        sensor = Window.of_sensor(camera)
-        if windows is None:
-            frames: tuple[Window, ...] = (sensor,)
-            lit = {i: window.common(sensor) for i, window in lit.items() if sensor.overlaps(window)}
-        else:
-            if not windows.overscan:
-                lit = {i: window.common(sensor) for i, window in lit.items() if sensor.overlaps(window)}
-            frames = led_windows(lit.values(), camera, windows)
+        lit = _lit_windows(camera, images, kernels, windows)
+        frames = (Window.of_sensor(camera),) if windows is None else led_windows(lit.values(), camera, windows)
         _check_size(frames, camera)
         backgrounds, reflections = self._rooms(camera, places, frames, images, spread, kernels)
         patches = self._patches(camera, pose, images, lit, kernels)
@@ -120,6 +113,17 @@ class Renderer:
             )
         )
 
+    def led_patches(
+        self, camera: Camera, pose: Pose, windows: LedWindows | None = None, blurred_at: Pose | None = None
+    ) -> tuple[LedPatch, ...]:
+        """The LEDs' own light alone: the patches of `view` in double precision, without the room behind them.
+
+        Blurred as at the pose `blurred_at` where given: kernels change in steps of depth, which differences would see.
+        """
+        kernels = self._kernels(camera, blurred_at or pose)
+        images = [dict(self._led_images(camera, pose, windows, _spread(kernels)))]
+        return self._patches(camera, pose, images, _lit_windows(camera, images, kernels, windows), kernels, np.float64)
+
     def background_cd_m2(self, camera: Camera, pose: Pose) -> Image:
         """Luminance of the room times relative illumination, mean over each pixel, (height, width); sharp, no LEDs."""
         images, _ = self._background.images(camera, pose, (Window.of_sensor(camera),), (1.0, 1.0))
@@ -129,7 +133,7 @@ class Renderer:
         """Electrons a second of 1 cd/m2 on the axis: of light that left an LED, and of all other light."""
         settings = self.scene.settings
         lamp, other = (
-            electron_rate_per_cd_m2(camera, spectrum, self.silicon)
+            electron_rate_per_cd_m2(camera, spectrum, self.detector)
             for spectrum in (settings.led_spectrum, settings.ambient.spectrum)
         )
         return lamp, other
@@ -209,6 +213,7 @@ class Renderer:
         images: Sequence[Mapping[int, _Lit]],
         lit: Mapping[int, Window],
         kernels: Mapping[int, Array | None],
+        precision: type[np.floating] = np.float32,
     ) -> tuple[LedPatch, ...]:
         """The LEDs' own light, the mean over the images at several poses."""
         leds = self.scene.leds
@@ -234,7 +239,7 @@ class Renderer:
                     center_px=(float(center_px[i, 0]), float(center_px[i, 1])),
                     row=window.row,
                     column=window.column,
-                    electrons_per_s=np.ascontiguousarray(spread, dtype=np.float32),
+                    electrons_per_s=np.ascontiguousarray(spread, dtype=precision),
                     visible_fraction=sum(image.visible_fraction for image in seen) / len(images),
                     imaged_fraction=sum(image.imaged_fraction for image in seen) / len(images),
                 )
@@ -376,6 +381,25 @@ def _around(images: Sequence[Mapping[int, _Lit]]) -> dict[int, Window]:
         for i, image in of_pose.items():
             lit[i] = lit[i].around(image.window) if i in lit else image.window
     return dict(sorted(lit.items()))
+
+
+def _lit_windows(
+    camera: Camera,
+    images: Sequence[Mapping[int, _Lit]],
+    kernels: Mapping[int, Array | None],
+    windows: LedWindows | None,
+) -> dict[int, Window]:
+    """The pixels of the view that each LED lights, blur included, by the LED's index."""
+    lit = {i: window.grown(_radius(kernels[i])) for i, window in _around(images).items()}
+    if windows is not None and windows.overscan:
+        return lit
+    sensor = Window.of_sensor(camera)
+    return {i: window.common(sensor) for i, window in lit.items() if sensor.overlaps(window)}
+
+
+def _spread(kernels: Mapping[int, Array | None]) -> int:
+    """How far light is blurred at most, pixels."""
+    return max(map(_radius, kernels.values()), default=0)
 
 
 def _radius(kernel: Array | None) -> int:

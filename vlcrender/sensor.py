@@ -11,7 +11,7 @@ The whole chain, in this order (`exposure.expose` runs it):
 6. the full well clips: what a photodiode cannot hold is lost before anything is read
 7. read noise, and the fixed offsets of row and column, are added
 8. the gain divides; the converter's own noise is added, in digital numbers
-9. the black level is added, the number is rounded (not truncated) and clipped to 0 and the converter's largest
+9. the number is rounded (not truncated), the black level added, and the sum clipped to 0 and the converter's largest
 
 `noise = "shot"`, the default, has of all noise the draw alone (1, 4, 6, 8, 9): at 1 e/DN the difference of two
 exposures is exactly Skellam. `noise = "none"` has not even that.
@@ -106,6 +106,11 @@ class Sensor(Settings):
         return int(2**self.bits - 1)
 
     @property
+    def white_dn(self) -> int:
+        """The digital number of a full well, or the converter's largest where that is less."""
+        return min(self.largest_dn, round(self.full_well_e / self.gain_at_iso_e_per_dn) + self.black_level_dn)
+
+    @property
     def gain_at_iso_e_per_dn(self) -> float:
         """Electrons a digital number at the sensor's ISO: 1 / K of EMVA 1288."""
         return self.gain_e_per_dn * (self.base_iso / self.iso)
@@ -144,9 +149,10 @@ class Sensor(Settings):
         """Convert electrons: round(e / gain) + black level, within 0 and the converter's largest number."""
         gain = self.gain_at_iso_e_per_dn
         if gain == 1.0 and electrons.dtype == np.uint32:  # counts are numbers already
-            dn = electrons + np.uint32(self.black_level_dn)
-        else:
-            dn = np.rint(electrons / np.float64(gain)) + self.black_level_dn
+            counts = np.minimum(electrons, np.uint32(self.largest_dn - self.black_level_dn))
+            counts += np.uint32(self.black_level_dn)
+            return counts.astype(np.uint32, copy=False)
+        dn = np.rint(electrons / np.float64(gain)) + self.black_level_dn
         clipped: NDArray[np.uint32] = np.clip(dn, 0, self.largest_dn).astype(np.uint32)
         return clipped
 

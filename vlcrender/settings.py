@@ -9,6 +9,7 @@ from types import UnionType
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic.fields import FieldInfo
 
 from vlcrender.errors import InputError
 
@@ -114,12 +115,18 @@ def _is_tag(part: object, model: type[Settings]) -> bool:
 
 def _tags(annotation: Any) -> set[str]:
     tags: set[str] = set()
+    unions: list[tuple[Any, FieldInfo]] = []
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         for field in annotation.model_fields.values():
-            if field.discriminator:
-                for member in get_args(field.annotation):
-                    tags |= set(get_args(member.model_fields[str(field.discriminator)].annotation))
+            unions.append((field.annotation, field))
             tags |= _tags(field.annotation)
+    elif get_origin(annotation) is Annotated:  # a union that is optional has its discriminator here
+        union, *metadata = get_args(annotation)
+        unions = [(union, item) for item in metadata if isinstance(item, FieldInfo)]
+    for union, field in unions:
+        if field.discriminator:
+            for member in get_args(union):
+                tags |= set(get_args(member.model_fields[str(field.discriminator)].annotation))
     for argument in get_args(annotation):
         tags |= _tags(argument)
     return tags

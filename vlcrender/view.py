@@ -20,7 +20,7 @@ class LedPatch:
     """Image of the LED's centre (u, v); may lie outside the sensor."""
     row: int
     column: int
-    electrons_per_s: Image
+    electrons_per_s: NDArray[np.floating]
     visible_fraction: float
     """Share of the LED's image that falls on the sensor and that nothing hides."""
     imaged_fraction: float

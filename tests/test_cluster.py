@@ -1,0 +1,33 @@
+"""A dask cluster makes the same bytes as one process."""
+
+from pathlib import Path
+
+import pytest
+from conftest import ROOT, SMALL
+from distributed import LocalCluster
+
+from vlcrender.dataset import sha256_of
+from vlcrender.errors import InputError
+from vlcrender.generate import generate
+from vlcrender.recipe import load_plan
+
+
+def digests(directory: Path) -> dict[str, str]:
+    return {path.name: sha256_of(path) for path in sorted((directory / "frames").iterdir())}
+
+
+def test_the_threads_of_a_cluster_make_the_same_bytes(tmp_path: Path) -> None:
+    """In threads, which is where the kernels' settings once differed; workers in processes are tested without dask."""
+    plan = load_plan(ROOT / "datasets/quickstart.toml", [*SMALL, "poses.count=4"])
+    generate(plan, tmp_path / "alone")
+    with LocalCluster(
+        n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None, protocol="tcp"
+    ) as cluster:
+        generate(plan, tmp_path / "cluster", scheduler=cluster.scheduler_address)
+    assert digests(tmp_path / "cluster") == digests(tmp_path / "alone")
+
+
+def test_no_scheduler_is_one_line(tmp_path: Path) -> None:
+    plan = load_plan(ROOT / "datasets/quickstart.toml", [*SMALL, "poses.count=1"])
+    with pytest.raises(InputError, match=r"^--scheduler nonsense://x: no scheduler answers: "):
+        generate(plan, tmp_path / "set", scheduler="nonsense://x")

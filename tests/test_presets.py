@@ -1,0 +1,118 @@
+"""Presets and what a recipe may say of a sensor; each refusal is one line that names key and value."""
+
+from pathlib import Path
+
+import pytest
+from conftest import ROOT
+
+from vlcrender.errors import InputError
+from vlcrender.presets import preset, presets, with_presets
+from vlcrender.recipe import Recipe, load_plan
+
+QUICKSTART = ROOT / "datasets/quickstart.toml"
+
+
+def recipe(*assignments: str) -> Recipe:
+    return load_plan(QUICKSTART, assignments).recipe
+
+
+@pytest.mark.parametrize("name", presets("sensors"))
+def test_every_preset_is_a_sensor(name: str) -> None:
+    made = recipe(f"sensor.preset={name}")
+    given = preset("sensors", name)
+    assert set(given) == {"camera", "sensor"}
+    assert made.camera.pixel_pitch_um == given["camera"]["pixel_pitch_um"]
+    assert made.sensor.model_dump(include=set(given["sensor"])) == given["sensor"]
+    # A full well uses the converter: it ends above 90 % of it, and not more than a tenth beyond.
+    level = made.sensor.full_well_e / made.sensor.gain_at_iso_e_per_dn + made.sensor.black_level_dn
+    assert name == "ideal" or 0.9 < level / made.sensor.largest_dn < 1.1
+
+
+@pytest.mark.parametrize("name", presets("sensors"))
+def test_every_number_of_a_preset_says_where_it_is_from(name: str) -> None:
+    text = (ROOT / f"vlcrender/presets/sensors/{name}.toml").read_text()
+    for line in text.splitlines():
+        if "=" in line and not line.startswith("#") and name != "ideal":
+            assert "#" in line or "noise = " in line or "quantum_efficiency" in line, line
+
+
+def test_the_issue_asks_for_these() -> None:
+    assert {"ideal", "industrial", "phone-1.2um"} < set(presets("sensors"))
+
+
+def test_what_a_recipe_says_wins_over_the_preset_it_names(tmp_path: Path) -> None:
+    tree = {"sensor": {"preset": "phone-1.2um", "bits": 12}, "camera": {"f_number": 1.8}, "name": "x"}
+    made = with_presets(tree, [], "here")
+    assert made["sensor"]["bits"] == 12
+    assert made["sensor"]["full_well_e"] == 4900.0
+    assert made["camera"] == {"pixel_pitch_um": 1.2, "f_number": 1.8}
+    assert "preset" not in made["sensor"]
+    assert tree["sensor"]["preset"] == "phone-1.2um", "the tree given is left as it is"
+
+
+def test_an_assigned_preset_wins_over_the_recipe_and_other_assignments_over_it() -> None:
+    made = recipe("sensor.read_noise_e=9", "sensor.preset=industrial", "camera.pixel_pitch_um=3.0")
+    assert made.sensor.read_noise_e == 9.0
+    assert made.sensor.full_well_e == 9458.0
+    assert made.camera.pixel_pitch_um == 3.0
+
+
+REFUSED = {
+    "preset": (["sensor.preset=phone"], ["sensor.preset", "phone-1.2um", "ideal", "industrial"]),
+    "preset is no name": (["sensor.preset=[1]"], ["sensor.preset"]),
+    "bits": (["sensor.bits=9.5"], ["sensor.bits = 9.5", "8, 10, 12 or 14"]),
+    "gain": (["sensor.gain_e_per_dn=-1"], ["sensor.gain_e_per_dn = -1", "greater than 0"]),
+    "nan": (["sensor.prnu=nan"], ["sensor.prnu", "NaN", "finite"]),
+    "noise": (["sensor.read_noise_e=-2"], ["sensor.read_noise_e = -2"]),
+    "well": (
+        ["sensor.read_noise_e=300", "sensor.full_well_e=250"],
+        ["full_well_e = 250", "exceed the noise of 300 e", "read_noise_e"],
+    ),
+    "black": (["sensor.bits=8", "sensor.black_level_dn=255"], ["black_level_dn = 255", "below 255"]),
+    "iso": (["sensor.iso=0"], ["sensor.iso = 0"]),
+    "doubling": (["sensor.dark_current_doubling_c=0"], ["sensor.dark_current_doubling_c = 0"]),
+    "qe above 1": (
+        ["sensor.quantum_efficiency={wavelengths_nm=[400, 500], values=[0.5, 1.2]}"],
+        ["sensor.quantum_efficiency", "values[1] = 1.2", "less than or equal to 1"],
+    ),
+    "qe short": (
+        ["sensor.quantum_efficiency={wavelengths_nm=[400, 500, 600], values=[0.5, 0.2]}"],
+        ["sensor.quantum_efficiency", "2 numbers for 3"],
+    ),
+    "qe backwards": (
+        ["sensor.quantum_efficiency={wavelengths_nm=[500, 400], values=[0.5, 0.2]}"],
+        ["wavelengths_nm: have to increase"],
+    ),
+    "qe half": (
+        ["sensor.quantum_efficiency={wavelengths_nm=[400, 500], red=[0.5, 0.2]}"],
+        ["sensor.quantum_efficiency", "red, green and blue"],
+    ),
+    "qe word": (["sensor.quantum_efficiency=gold"], ['"gold"', '"silicon"', "wavelengths_nm"]),
+    "mosaic without colours": (["sensor.mosaic=rggb"], ['mosaic = "rggb"', "red, green and blue"]),
+    "mosaic": (["sensor.mosaic=gbbr"], ["sensor.mosaic", "rggb"]),
+    "two exposures": (["exposure_s=1e-4", "exposure.kind=noise-level", "exposure.level_db=-9"], ["exposure_s", "both"]),
+    "metered motion": (
+        ["exposure.kind=noise-level", "exposure.level_db=-9", "motion.linear_velocity_m_s=[1, 0, 0]"],
+        ["exposure", "motion", "exposure_s"],
+    ),
+    "share": (
+        ["exposure.kind=peak", "exposure.share_of_full_well=1.5", "exposure.longest_s=1.0"],
+        ["exposure.share_of_full_well = 1.5"],
+    ),
+    "level": (["exposure.kind=noise-level", "exposure.level_db=nan"], ["exposure.level_db"]),
+    "repeats": (["repeats=0"], ["repeats = 0"]),
+    "processed windows": (["processed={}", "windows.kind=leds"], ["processed", "windows"]),
+    "quality": (["processed.quality=101"], ["processed.quality = 101"]),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_refused_by_name(case: str) -> None:
+    assignments, mentions = REFUSED[case]
+    with pytest.raises(InputError) as refusal:
+        recipe(*assignments)
+    line = str(refusal.value)
+    assert "\n" not in line
+    assert "quickstart.toml" in line
+    for mention in mentions:
+        assert mention in line, line
