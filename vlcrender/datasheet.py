@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 from vlcrender.errors import InputError
 from vlcrender.exposure import expose
 from vlcrender.nonuniformity import response_variance
-from vlcrender.photometry import Silicon
+from vlcrender.photometry import detectors
 from vlcrender.photon_transfer import FLAT_EXPOSURE_S, ROUNDING_DN2, UNDITHERED_DN2, Measurement, Shoot, measure
 from vlcrender.presets import KINDS, preset, with_presets
 from vlcrender.quantity import Quantity
+from vlcrender.quantum_efficiency import COLOURS
 from vlcrender.saturation import full_well_e, saturation_e
 from vlcrender.sensor import Sensor
 from vlcrender.settings import Settings, check, read_toml
@@ -111,15 +112,14 @@ def make_datasheet(
 
     Raises InputError for a sensor that cannot be measured: blind at this wavelength, noiseless, or never full.
     """
-    table = sensor.quantum_efficiency
-    colour = "values" if table == "silicon" or not table.coloured else "green"
-    at = np.array([wavelength_nm])
-    efficiency = float(Silicon().quantum_efficiency(at)[0] if table == "silicon" else table.at(at, colour)[0])
+    kinds = detectors(sensor)
+    detector = kinds[0] if len(kinds) == 1 else kinds[COLOURS.index("green")]
+    efficiency = float(detector.quantum_efficiency(np.array([wavelength_nm]))[0])
     if not efficiency > 1e-6:
         raise InputError(f"--wavelength-nm {wavelength_nm:g}: the sensor is blind there")
     measured = measure(bench(sensor, efficiency, side_px, progress))
     conditions = (
-        f"light of {wavelength_nm:g} nm, even over the pixels" + (", on green pixels" if colour == "green" else ""),
+        f"light of {wavelength_nm:g} nm, even over the pixels" + (", all of them green" if len(kinds) > 1 else ""),
         f"{sensor.temperature_c:g} °C, ISO {sensor.iso:g}, {sensor.bits} bits, noise = {sensor.noise}",
         f"{side_px} x {side_px} pixels, flat fields of {FLAT_EXPOSURE_S * 1000:g} ms",
     )
@@ -129,7 +129,10 @@ def make_datasheet(
 def bench(
     sensor: Sensor, efficiency: float, side_px: int, progress: Callable[[int], None] = lambda frames: None
 ) -> Shoot:
-    """A camera of this sensor under even light: each call is a new exposure with a stream of its own."""
+    """A camera of this sensor under even light: each call is a new exposure with a stream of its own.
+
+    Another `serial` is another camera, on another day.
+    """
     taken = 0
 
     def shoot(photons: float, exposure_s: float, warmer_c: float) -> NDArray[np.uint32]:
@@ -138,7 +141,7 @@ def bench(
         progress(taken)
         warm = sensor.model_copy(update={"temperature_c": sensor.temperature_c + warmer_c})
         light = np.full((side_px, side_px), photons * efficiency, dtype=np.float32)
-        return expose(warm, light, f"datasheet/{taken}", exposure_s=exposure_s)
+        return expose(warm, light, f"datasheet/{sensor.serial}/{taken}", exposure_s=exposure_s)
 
     return shoot
 

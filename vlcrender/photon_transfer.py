@@ -147,7 +147,7 @@ def measure(shoot: Shoot) -> Measurement:
     lights = (0.0, points[top].photons / 2)
     stacks = [patterns(shoot(light, FLAT_EXPOSURE_S, 0.0) for _ in range(STACK)) for light in lights]
     series = [dark_series(shoot, full.mean_dn - dark.mean_dn, warmer) for warmer in WARMER_C]
-    currents = [line([p.exposure_s for p in darks], [p.mean for p in darks])[1].over(gain) for darks in series]
+    currents_dn_s = [line([p.exposure_s for p in darks], [p.mean for p in darks])[1] for darks in series]
     dark_variance, _ = line([p.exposure_s for p in series[0]], [p.variance() for p in series[0]])
     if dark_variance.value <= 0:
         dark_variance = Quantity(0.0, UNSEEN_DN2)
@@ -160,8 +160,8 @@ def measure(shoot: Shoot) -> Measurement:
         gain=gain,
         quantum_efficiency=fit_responsivity(dark, used, stacks[1]).over(gain),
         dark_variance_dn2=dark_variance,
-        dark_current_e_s=currents[0],
-        doubling_c=doubling(currents),
+        dark_current_e_s=currents_dn_s[0].over(gain),
+        doubling_c=doubling(currents_dn_s),
         dark_patterns=stacks[0],
         bright_patterns=stacks[1],
         full_well_e=full.mean.plus(dark.mean.times(-1)).over(gain),
