@@ -162,6 +162,7 @@ def datasheet(
     *,
     out: Path | None = None,
     wavelength_nm: float = 530.0,
+    side_px: int = 512,
     json_: Annotated[bool, Parameter(name="--json", negative=())] = False,
 ) -> None:
     """Measure a sensor by photon transfer on its own frames (EMVA 1288) and print what is found beside what was set.
@@ -174,17 +175,23 @@ def datasheet(
         HTML page to write, with plots; the sensor's name with -datasheet.html in the current folder where not given.
     wavelength_nm
         Of the light.
+    side_px
+        Rows and columns of the frames; with twice as many the tolerances are half as large.
     json_
         Print JSON instead of a table.
     """
     from vlcrender.datasheet import cells, load_sensor, make_datasheet  # starts Mitsuba
     from vlcrender.datasheet_page import page
 
+    if not 32 <= side_px <= 4096:
+        raise InputError(f"--side-px {side_px}: is not 32 to 4096")
     name, settings = load_sensor(sensor)
     path = out or Path(f"{name}-datasheet.html")
+    if not path.parent.is_dir():
+        raise InputError(f"--out {path}: no such folder as {path.parent}")
     with Console(stderr=True).status("measuring") as status:
         sheet = make_datasheet(
-            name, settings, wavelength_nm, progress=lambda frames: status.update(f"measuring: {frames} frames")
+            name, settings, wavelength_nm, side_px, lambda frames: status.update(f"measuring: {frames} frames")
         )
     path.write_text(page(sheet), encoding="utf-8")
     if json_:

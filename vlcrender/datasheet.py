@@ -27,7 +27,6 @@ from vlcrender.settings import Settings, check, read_toml
 
 SIGMAS = 4.0
 """Of 14 values one is off by chance on one page in 1000."""
-SIDE_PX = 512
 
 
 class _SensorTable(Settings):
@@ -105,7 +104,7 @@ def make_datasheet(
     title: str,
     sensor: Sensor,
     wavelength_nm: float = 530.0,
-    side_px: int = SIDE_PX,
+    side_px: int = 512,
     progress: Callable[[int], None] = lambda frames: None,
 ) -> Datasheet:
     """Measure a sensor with `side_px` x `side_px` pixels. `progress` is told how many frames have been taken.

@@ -36,8 +36,8 @@ class Patterns:
 def patterns(frames: Iterable[NDArray[np.uint32]]) -> Patterns:
     """The patterns of exposures alike, two or more, each (rows, columns).
 
-    In the mean of L frames rows' means have the variance s^2_row + (s^2_pixel + sigma^2 / L) / columns, columns' means
-    alike, and all pixels s^2_row + s^2_column + s^2_pixel + sigma^2 / L: three equations.
+    Of the mean of L frames: what pixels differ by beyond their row's and column's means has the variance
+    s^2_pixel + sigma^2 / L, rows' means s^2_row + (s^2_pixel + sigma^2 / L) / columns, columns' means alike.
     """
     count = 0
     total = squares = np.zeros((1, 1))
@@ -47,14 +47,15 @@ def patterns(frames: Iterable[NDArray[np.uint32]]) -> Patterns:
     mean = total / count
     noise = float(np.mean((squares - count * mean**2) / (count - 1))) / count
     rows, columns = mean.shape
-    of_rows, of_columns = (Quantity(v, v * (2 / (n - 1)) ** 0.5) for v, n in _variances_of_means(mean))
-    inner = (float(mean.var(ddof=1)) - of_rows.value - of_columns.value) / (1 - 1 / rows - 1 / columns)
-    pixels = Quantity(inner, inner * (2 / mean.size) ** 0.5)
+    everything = mean.mean()
+    by_row, by_column = mean.mean(axis=1, keepdims=True), mean.mean(axis=0, keepdims=True)
+    of_rows, of_columns = _variance(by_row - everything, rows - 1), _variance(by_column - everything, columns - 1)
+    pixels = _variance(mean - by_row - by_column + everything, (rows - 1) * (columns - 1))
     # Where noise does not spread a pixel's numbers, up to this is left of rounding in the variance of pixels' means.
-    undithered = float(np.exp(-4 * np.pi**2 * noise * count)) / (2 * np.pi**2) if inner else UNSEEN_DN2
-    unseen = Quantity(0.0, 0.0 if inner else UNSEEN_DN2)
+    undithered = float(np.exp(-4 * np.pi**2 * noise * count)) / (2 * np.pi**2) if pixels.value else UNSEEN_DN2
+    unseen = Quantity(0.0, 0.0 if pixels.value else UNSEEN_DN2)
     return Patterns(
-        mean_dn=float(mean.mean()),
+        mean_dn=float(everything),
         row=of_rows.plus(pixels.times(-1 / columns)).plus(unseen),
         column=of_columns.plus(pixels.times(-1 / rows)).plus(unseen),
         pixel=pixels.plus(Quantity(-noise, undithered)),
@@ -63,9 +64,10 @@ def patterns(frames: Iterable[NDArray[np.uint32]]) -> Patterns:
     )
 
 
-def _variances_of_means(image: NDArray[np.float64]) -> list[tuple[float, int]]:
-    """Variance and number of the means of rows, and of columns."""
-    return [(float(means.var(ddof=1)), means.size) for means in (image.mean(axis=1), image.mean(axis=0))]
+def _variance(deviations: NDArray[np.float64], freedom: int) -> Quantity:
+    """Of normal deviations with so many degrees of freedom."""
+    variance = float(np.sum(deviations**2)) / freedom
+    return Quantity(variance, variance * (2 / freedom) ** 0.5)
 
 
 def response_variance(dark: Patterns, bright: Patterns) -> Quantity:
