@@ -2,15 +2,17 @@
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 from scipy import stats
 
 from vlcrender.exposure import expose
-from vlcrender.sensor import Sensor, clip_full_well
+from vlcrender.poisson import LARGEST_MEAN
+from vlcrender.sensor import LARGEST_WELL_E, Sensor, clip_full_well
 from vlcrender.streams import stream
 
 N = 400_000
 MEANS = [0.2, 3.0, 40.0, 3000.0]
-WIDE = Sensor(full_well_e=1e9, gain_e_per_dn=1.0)
+WIDE = Sensor(full_well_e=LARGEST_WELL_E, gain_e_per_dn=1.0)
 
 
 def draw(mean: float, name: str) -> np.ndarray:
@@ -85,6 +87,14 @@ def test_full_well_clips_electrons_before_gain() -> None:
     assert expose(
         Sensor(full_well_e=100.0, gain_e_per_dn=0.5, noise="none"), np.array([[1000.0]], dtype=np.float32), "x"
     ).tolist() == [[200]]
+
+
+def test_no_well_holds_more_than_is_drawn() -> None:
+    assert LARGEST_WELL_E == LARGEST_MEAN
+    sensor = Sensor(full_well_e=LARGEST_WELL_E, gain_e_per_dn=1000.0, bits=14)
+    assert (expose(sensor, np.full((2, 2), 1e12, dtype=np.float32), "x") >= (LARGEST_WELL_E - 1e4) / 1000).all()
+    with pytest.raises(ValidationError, match="full_well_e"):
+        Sensor(full_well_e=2 * LARGEST_WELL_E)
 
 
 def test_streams_share_nothing_between_neighbouring_seeds_frames_and_names() -> None:

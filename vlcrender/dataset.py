@@ -211,8 +211,8 @@ def exr_attributes(camera: Camera, camera_name: str, exposure_s: float, frame: i
     }
 
 
-def write_preview(path: Path, images: Sequence[Shown], sensor: Window, largest_dn: int) -> None:
-    """Write a small grey picture: block means, gamma 2.2, white at the converter's largest number.
+def write_preview(path: Path, images: Sequence[Shown], sensor: Window, white_dn: int, black_dn: int = 0) -> None:
+    """Write a small grey picture: block means above the black level, gamma 2.2.
 
     It shows the sensor and all windows; what was not read out is black.
     """
@@ -227,12 +227,12 @@ def write_preview(path: Path, images: Sequence[Shown], sensor: Window, largest_d
             (row % block, column % block),
             (-(row + window.rows) % block, -(column + window.columns) % block),
         )
-        padded = np.pad(image, tuple(zip(before, after, strict=True)))
+        padded = np.pad(np.maximum(image, black_dn) - black_dn, tuple(zip(before, after, strict=True)))
         rows, columns = padded.shape[0] // block, padded.shape[1] // block
         here = np.s_[row // block : row // block + rows, column // block : column // block + columns]
         sums[here] += padded.reshape(rows, block, columns, block).sum(axis=(1, 3))
     small = sums[: max(1, whole.rows // block), : max(1, whole.columns // block)] / block**2
-    imsave(path, (np.clip(small / largest_dn, 0, 1)) ** (1 / 2.2), cmap="gray", vmin=0, vmax=1)
+    imsave(path, (np.clip(small / (white_dn - black_dn), 0, 1)) ** (1 / 2.2), cmap="gray", vmin=0, vmax=1)
 
 
 def write_table(path: Path, rows: Sequence[Mapping[str, Any]], schema: pa.Schema) -> None:

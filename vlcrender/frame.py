@@ -66,7 +66,8 @@ def make_frame(job: Job, frame: int) -> Record:
     digest = write_exr(directory / file, dn, sensor, attributes)
     if recipe.expected:
         write_exr(directory / EXPECTED / f"{frame:06d}.exr", expected, sensor, attributes)
-    write_preview(directory / PREVIEWS / f"{frame:06d}.png", dn, sensor, recipe.sensor.largest_dn)
+    preview = directory / PREVIEWS / f"{frame:06d}.png"
+    write_preview(preview, dn, sensor, recipe.sensor.largest_dn, recipe.sensor.black_level_dn)
     if recipe.processed is not None:
         picture = recipe.processed.develop(dn[0][1], recipe.sensor, _balance(camera, recipe.sensor, renderer.scene))
         recipe.processed.write(directory / PROCESSED / f"{frame:06d}{recipe.processed.suffix}", picture)
