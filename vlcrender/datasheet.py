@@ -26,7 +26,7 @@ from vlcrender.sensor import Sensor
 from vlcrender.settings import Settings, check, read_toml
 
 SIGMAS = 4.0
-"""Of 14 values one is off by chance on one page in 1000."""
+"""Of 15 values one is off by chance on one page in 1000."""
 
 
 class _SensorTable(Settings):
@@ -36,6 +36,7 @@ class _SensorTable(Settings):
 LABELS = {
     "K": ("system gain", "DN/e", "slope of variance over mean, up to 70 % of saturation"),
     "QE": ("quantum efficiency", "%", "slope of mean over photons, / K"),
+    "mu_y.dark": ("dark level", "DN", "mean of dark frames at no exposure time"),
     "sigma_d": ("dark noise", "e", "dark variance at no exposure time, less rounding's 1/12, / K²"),
     "mu_I": ("dark current", "e/s", "slope of the dark mean over time, / K"),
     "T_d": ("doubles every", "°C", "dark current at three temperatures"),
@@ -167,6 +168,7 @@ def compare(sensor: Sensor, efficiency: float, measured: Measurement) -> tuple[R
     return (
         _row("K", gain, measured.gain),
         _row("QE", efficiency * 100, measured.quantum_efficiency.times(100)),
+        _row("mu_y.dark", sensor.black_level_dn, measured.dark_level_dn),
         _hidden_row("sigma_d", dark_noise_e, measured)
         if hidden
         else _root_row("sigma_d", dark_noise_e, measured.dark_noise_e2),

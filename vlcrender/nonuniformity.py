@@ -25,7 +25,18 @@ class Patterns:
     pixel: Quantity
     noise_dn2: float
     """What temporal noise has left in a pixel of the mean of all frames; the others are without it."""
-    pixels: int
+    shape: tuple[int, int]
+
+    @property
+    def pixels(self) -> int:
+        """Number of pixels."""
+        return self.shape[0] * self.shape[1]
+
+    @property
+    def mean_error(self) -> float:
+        """By how much the patterns' own mean is off 0: it is one of so many rows, columns and pixels."""
+        parts = zip((self.row, self.column, self.pixel), (*self.shape, self.pixels), strict=True)
+        return float(np.sqrt(sum(max(part.value, 0.0) / number for part, number in parts)))
 
     @property
     def total(self) -> Quantity:
@@ -60,7 +71,7 @@ def patterns(frames: Iterable[NDArray[np.uint32]]) -> Patterns:
         column=of_columns.plus(pixels.times(-1 / rows)).plus(unseen),
         pixel=pixels.plus(Quantity(-noise, undithered)),
         noise_dn2=noise,
-        pixels=mean.size,
+        shape=(rows, columns),
     )
 
 

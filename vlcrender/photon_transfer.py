@@ -94,6 +94,8 @@ class Measurement:
     gain: Quantity
     """K, DN an electron."""
     quantum_efficiency: Quantity
+    dark_level_dn: Quantity
+    """mu_y.dark of no exposure time; its error is also that of the patterns' mean."""
     dark_variance_dn2: Quantity
     """sigma_y.dark^2, without the dark current's."""
     dark_current_e_s: Quantity
@@ -147,7 +149,8 @@ def measure(shoot: Shoot) -> Measurement:
     lights = (0.0, points[top].photons / 2)
     stacks = [patterns(shoot(light, FLAT_EXPOSURE_S, 0.0) for _ in range(STACK)) for light in lights]
     series = [dark_series(shoot, full.mean_dn - dark.mean_dn, warmer) for warmer in WARMER_C]
-    currents_dn_s = [line([p.exposure_s for p in darks], [p.mean for p in darks])[1] for darks in series]
+    fits = [line([p.exposure_s for p in darks], [p.mean for p in darks]) for darks in series]
+    currents_dn_s = [slope for _, slope in fits]
     dark_variance, _ = line([p.exposure_s for p in series[0]], [p.variance() for p in series[0]])
     if dark_variance.value <= 0:
         dark_variance = Quantity(0.0, UNSEEN_DN2)
@@ -159,6 +162,7 @@ def measure(shoot: Shoot) -> Measurement:
         saturation_index=top,
         gain=gain,
         quantum_efficiency=fit_responsivity(dark, used, stacks[1]).over(gain),
+        dark_level_dn=fits[0][0].plus(Quantity(0.0, stacks[0].mean_error)),
         dark_variance_dn2=dark_variance,
         dark_current_e_s=currents_dn_s[0].over(gain),
         doubling_c=doubling(currents_dn_s),

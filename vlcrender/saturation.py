@@ -17,14 +17,14 @@ def full_well_e(sensor: Sensor, dark_e: float) -> float:
     acting, gain = sensor.acting(), sensor.gain_at_iso_e_per_dn
     parts = [acting["read_noise_e"], acting["adc_noise_dn"] * gain, acting["row_offset_e"], acting["column_offset_e"]]
     noise = max(float(np.linalg.norm(parts)), 1e-6)
-    mean, _ = _clipped(np.array(sensor.full_well_e), np.array(noise), _converter_e(sensor))
+    mean, _ = clipped(np.array(sensor.full_well_e), np.array(noise), _converter_e(sensor))
     return float(mean) - dark_e
 
 
 def saturation_e(sensor: Sensor, dark_e: float, levels_e: Array, pixels: int) -> tuple[float, float]:
     """Signal, electrons, where the temporal variance is largest, and a standard error of finding it.
 
-    It is found as one of `levels_e`, evenly spaced from their step on, by variances of `pixels` pixels each, which have
+    It is found as one of `levels_e`, evenly spaced, by variances of `pixels` pixels each, which have
     a standard error of sqrt(2 / pixels): it may be any whose expected variance is as good as the largest within 4
     standard errors of a difference, or a neighbour of the best. The farthest of them counts for 4 standard errors.
     """
@@ -33,7 +33,7 @@ def saturation_e(sensor: Sensor, dark_e: float, levels_e: Array, pixels: int) ->
     best = float(fine[np.argmax(variances)])
     doubt = 4 * np.sqrt(2) * np.sqrt(2 / pixels)
     good = levels_e[_temporal_variance_e2(sensor, dark_e, levels_e) >= (1 - doubt) * variances.max()]
-    return best, float(max(np.abs(good - best).max(initial=0.0), levels_e[0])) / 4
+    return best, float(max(np.abs(good - best).max(initial=0.0), levels_e[1] - levels_e[0])) / 4
 
 
 def _temporal_variance_e2(sensor: Sensor, dark_e: float, signal_e: Array) -> Array:
@@ -47,9 +47,9 @@ def _temporal_variance_e2(sensor: Sensor, dark_e: float, signal_e: Array) -> Arr
     spread = np.hypot(acting["prnu"] * signal_e, acting["dsnu_e"])
     means = np.maximum((signal_e + dark_e)[:, None] + spread[:, None] * nodes, 1e-9)
     if sensor.full_well_e <= _converter_e(sensor):
-        variances = _clipped(means, np.sqrt(means), sensor.full_well_e)[1] + after_e2
+        variances = clipped(means, np.sqrt(means), sensor.full_well_e)[1] + after_e2
     else:
-        variances = _clipped(means, np.sqrt(means + after_e2), _converter_e(sensor))[1]
+        variances = clipped(means, np.sqrt(means + after_e2), _converter_e(sensor))[1]
     average: Array = variances @ weights / weights.sum()
     return average
 
@@ -59,7 +59,7 @@ def _converter_e(sensor: Sensor) -> float:
     return (sensor.largest_dn - sensor.black_level_dn) * sensor.gain_at_iso_e_per_dn
 
 
-def _clipped(mean: Array, deviation: Array, limit: float) -> tuple[Array, Array]:
+def clipped(mean: Array, deviation: Array, limit: float) -> tuple[Array, Array]:
     """Mean and variance of normal numbers clipped at a limit.
 
     With x standard normal and Q = 1 - Phi: E min(x, z) = z Q - phi and E min(x, z)^2 = Phi - z phi + z^2 Q.
