@@ -104,6 +104,8 @@ def test_patterns_are_told_apart_by_rows_columns_and_pixels(rng: np.random.Gener
     for quantity, truth in ((found.row, 9.0), (found.column, 4.0), (found.pixel, 1.0), (found.total, 14.0)):
         assert abs(quantity.value - truth) < 5 * quantity.error
         assert quantity.error < 0.15 * truth
+    # their own mean, of 200 rows, 300 columns and 60 000 pixels; variances are known to 10 % of rows, the most of them
+    assert found.mean_error == pytest.approx(np.sqrt(9 / 200 + 4 / 300 + 1 / 60_000), rel=5 * 0.05)
     # of 24 frames, 16 + 1/12 of noise: known to sqrt(2 / (23 * 60 000))
     assert found.noise_dn2 == pytest.approx((16 + 1 / 12) / 24, rel=5 * np.sqrt(2 / (23 * 60_000)))
 
