@@ -245,6 +245,16 @@ def test_a_camera_that_cannot_be_measured_is_refused(rng: np.random.Generator) -
         measure(endless)
 
 
+def test_a_mosaic_is_measured_by_its_green_pixels() -> None:
+    curves = {"red": [0.1, 0.6], "green": [0.4, 0.5], "blue": [0.6, 0.0]}
+    coloured = {"mosaic": "rggb", "quantum_efficiency": {"wavelengths_nm": [500, 600], **curves}}
+    sheet = make_datasheet("x", Sensor.model_validate({**FULL, **coloured}), wavelength_nm=550.0, side_px=64)
+    row = row_of(sheet.rows, "QE")
+    assert row.set_value == pytest.approx(45.0)
+    assert row.passed
+    assert "green" in sheet.conditions[0]
+
+
 def test_sensors_are_presets_or_files(tmp_path: Path) -> None:
     assert load_sensor("ideal")[1].noise == "shot"
     file = tmp_path / "mine.toml"
@@ -309,7 +319,8 @@ def test_the_command_prints_a_table_or_json_and_writes_the_page(
 @pytest.mark.parametrize(
     ("arguments", "mention"),
     [
-        (["ideal", "--wavelength-nm", "1300"], "--wavelength-nm 1300"),
+        (["ideal", "--wavelength-nm", "1200"], "--wavelength-nm 1200: the sensor is blind there"),
+        (["ideal", "--wavelength-nm", "nan"], "--wavelength-nm nan"),
         (["ideal", "--side-px", "1"], "--side-px 1"),
         (["unknown"], "unknown"),
         (["ideal", "--out", "no/such/x.html"], "no/such"),

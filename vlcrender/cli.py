@@ -185,6 +185,8 @@ def datasheet(
 
     if not 32 <= side_px <= 4096:
         raise InputError(f"--side-px {side_px}: is not 32 to 4096")
+    if not 200 <= wavelength_nm <= 1200:
+        raise InputError(f"--wavelength-nm {wavelength_nm:g}: is not 200 to 1200")
     name, settings = load_sensor(sensor)
     path = out or Path(f"{name}-datasheet.html")
     if not path.parent.is_dir():
