@@ -17,7 +17,7 @@ from vlcrender.camera import Camera, Pose, image_of_points, project
 from vlcrender.dataset import camera_entry
 from vlcrender.distortion import Distortion
 from vlcrender.generate import generate
-from vlcrender.inertial import Accelerometer
+from vlcrender.inertial import TiltError
 from vlcrender.recipe import load_plan
 from vlcrender.rig import mounted_cameras
 from vlcrender.streams import stream
@@ -71,7 +71,7 @@ def test_a_gravity_reading_levels_the_pixels_that_the_pose_tilted(tilts: tuple[f
     aim = np.array(pose.position_m) + axis * 2.45 / axis[2]
     leds = aim + np.array([[0, 0, 0], [0.13, 0, 0], [0, 0.13, 0], [-0.13, 0.26, 0]])
     seen, _ = project(camera, pose, leds)
-    reading = Accelerometer(error_deg=0.0).reading_m_s2(pose, stream(0, 0, "none"))
+    reading = TiltError(error_deg=0.0).reading_m_s2(pose, stream(0, 0, "none"))
     levelled = level(seen, camera.matrix, rotation(*tilt_from_gravity(tuple(reading))))
     expected, _ = project(camera, Pose(pose.position_m, yaw_deg=25.0), leds)
     # double precision; the horizon is near at 75.5 deg from the zenith: pixels of 1e5, so 1e5 * 1e-15 * amplification

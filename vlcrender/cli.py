@@ -1,6 +1,8 @@
 """The command line of vlcrender. Errors are one line; the exit code is 2 for bad input, 130 when interrupted."""
 
+import json
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -149,6 +151,61 @@ def show(
     from vlcrender.show import draw  # starts Mitsuba
 
     draw(loaded, camera, path, reference)
+    Console(width=max(Console().width, 100)).print(table)
+    print(f"{path}: written")
+
+
+@app.command
+def datasheet(
+    sensor: str,
+    /,
+    *,
+    out: Path | None = None,
+    wavelength_nm: float = 530.0,
+    side_px: int = 512,
+    json_: Annotated[bool, Parameter(name="--json", negative=())] = False,
+) -> None:
+    """Measure a sensor by photon transfer on its own frames (EMVA 1288) and print what is found beside what was set.
+
+    Parameters
+    ----------
+    sensor
+        Name of a preset, or a TOML file with a [sensor] table; a recipe is one.
+    out
+        HTML page to write, with plots; the sensor's name with -datasheet.html in the current folder where not given.
+    wavelength_nm
+        Of the light.
+    side_px
+        Rows and columns of the frames; with twice as many the tolerances are half as large.
+    json_
+        Print JSON instead of a table.
+    """
+    from vlcrender.datasheet import cells, load_sensor, make_datasheet  # starts Mitsuba
+    from vlcrender.datasheet_page import page
+
+    if not 32 <= side_px <= 4096:
+        raise InputError(f"--side-px {side_px}: is not 32 to 4096")
+    if not 200 <= wavelength_nm <= 1200:
+        raise InputError(f"--wavelength-nm {wavelength_nm:g}: is not 200 to 1200")
+    name, settings = load_sensor(sensor)
+    path = out or Path(f"{name}-datasheet.html")
+    if not path.parent.is_dir():
+        raise InputError(f"--out {path}: no such folder as {path.parent}")
+    with Console(stderr=True).status("measuring") as status:
+        sheet = make_datasheet(
+            name, settings, wavelength_nm, side_px, lambda frames: status.update(f"measuring: {frames} frames")
+        )
+    path.write_text(page(sheet), encoding="utf-8")
+    if json_:
+        rows = {row.key: {k: v for k, v in asdict(row).items() if k != "key"} for row in sheet.rows}
+        print(json.dumps({"sensor": name, "conditions": sheet.conditions, "rows": rows}, indent=2, ensure_ascii=False))
+        return
+    table = Table(title=f"{name}: {'; '.join(sheet.conditions)}")
+    for heading in ("", "", "set", "measured", "tolerance", "", ""):
+        table.add_column(heading, justify="right" if heading else "left")
+    for row in sheet.rows:
+        set_text, measured, tolerance, verdict = cells(row)
+        table.add_row(row.key, row.name, set_text, measured, tolerance and f"± {tolerance}", row.unit, verdict)
     Console(width=max(Console().width, 100)).print(table)
     print(f"{path}: written")
 

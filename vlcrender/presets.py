@@ -32,8 +32,9 @@ def preset(kind: str, name: str) -> dict[str, Any]:
 def with_presets(tree: Mapping[str, Any], assignments: Iterable[str], source: str) -> dict[str, Any]:
     """A recipe's tree with its presets put in, then `key=value` assignments as `settings.override` has them.
 
-    What the recipe itself says wins over a preset that it names; a preset that an assignment names wins over the
-    recipe, and other assignments over all. `source` names the recipe in the InputError for a preset that there is not.
+    What the recipe itself says wins over a preset that it names; a preset that an assignment names takes the place of
+    the recipe's own table, and other assignments win over all. `source` names the recipe in the InputError for a preset
+    that there is not.
     """
     given = list(assignments)
     chosen = {key: [a for a in given if a.partition("=")[0].strip() == f"{key}.preset"] for key in KINDS}
@@ -45,7 +46,7 @@ def with_presets(tree: Mapping[str, Any], assignments: Iterable[str], source: st
             tree = _merged(_named(kind, key, table["preset"], source), own)
         for assignment in chosen[key]:
             name = override({}, [assignment])[key]["preset"]
-            tree = _merged(tree, _named(kind, key, name, source))
+            tree = _merged({**tree, key: {}}, _named(kind, key, name, source))  # of one part, nothing of another
     return override(tree, [a for a in given if not any(a in of_key for of_key in chosen.values())])
 
 

@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 
 from vlcrender.camera import Camera
 from vlcrender.errors import InputError
-from vlcrender.inertial import Accelerometer
+from vlcrender.inertial import Accelerometer, TiltError
 from vlcrender.metering import Metering
 from vlcrender.motion import Motion
 from vlcrender.poses import AimedPoses, Poses
@@ -48,7 +48,7 @@ class Recipe(Settings):
     """Whether each frame's Cramér-Rao bound is computed: some seconds for a full frame of many LEDs."""
     camera: Camera = Camera()
     sensor: Sensor = Sensor()
-    accelerometer: Accelerometer = Accelerometer()
+    accelerometer: Accelerometer = TiltError()
     poses: Poses
     windows: LedWindows | None = None
     """What is read out of the sensor; all of it where not given."""

@@ -78,7 +78,7 @@ def _one_line(problem: Any, model: type[Settings]) -> str:
     kind, message, value = str(problem["type"]), str(problem["msg"]), problem["input"]
     message = message.removeprefix("Value error, ").replace("\n", " ")
     if kind == "extra_forbidden":
-        allowed = _keys_at(model, location[:-1])
+        allowed = _keys_at(model, list(problem["loc"])[:-1])
         unknown = str(location[-1])
         near = [name for name in allowed if _stem(name) == _stem(unknown)] or difflib.get_close_matches(
             unknown, allowed, n=1
@@ -133,10 +133,14 @@ def _tags(annotation: Any) -> set[str]:
 
 
 def _keys_at(annotation: Any, location: list[Any]) -> set[str]:
-    """The keys a model allows at a location: follows tables, arrays and unions."""
+    """The keys a model allows at a location: follows tables, arrays and unions, tagged ones into the member meant."""
     origin = get_origin(annotation)
     if origin in (Union, UnionType):
-        return set().union(*(_keys_at(member, location) for member in get_args(annotation)))
+        members = get_args(annotation)
+        tagged = [member for member in members if location and location[0] in _literals(member)]
+        if tagged:
+            return _keys_at(tagged[0], location[1:])
+        return set().union(*(_keys_at(member, location) for member in members))
     if origin is Annotated:
         return _keys_at(get_args(annotation)[0], location)
     if origin in (list, tuple):
@@ -147,3 +151,10 @@ def _keys_at(annotation: Any, location: list[Any]) -> set[str]:
         field = annotation.model_fields.get(str(location[0]))
         return _keys_at(field.annotation, location[1:]) if field else set()
     return set()
+
+
+def _literals(model: Any) -> set[Any]:
+    """The values of a model's literal fields, its tag among them."""
+    if not (isinstance(model, type) and issubclass(model, BaseModel)):
+        return set()
+    return {value for field in model.model_fields.values() for value in get_args(field.annotation)}
