@@ -1,19 +1,10 @@
 """The named pipelines: from what a device has, one frame, to where it is."""
 
-from estimator.dataset import DeviceFrame
+from estimator.gravity_fit import GRAVITY_FIT
 from estimator.huynh2016 import huynh2016, huynh2016_as_printed
-from estimator.pipeline import Estimate, Variant
-from estimator.position import position_from_pixels
-from estimator.sighting import centroids_px, led_positions_m, sightings
-from estimator.undistort import pinhole_pixels
-
-
-def pnp(frame: DeviceFrame) -> Estimate:
-    """Perspective-n-point on centroids of the raw image; gravity is not used."""
-    seen = sightings(frame)
-    pixels = pinhole_pixels(centroids_px(seen), frame.camera)
-    return Estimate(position_from_pixels(led_positions_m(seen), pixels, frame.camera.matrix()))
-
+from estimator.pipeline import Variant
+from estimator.pnp import IPPE, PNP, SQPNP
+from estimator.upright import UP2P
 
 VARIANTS = {
     variant.name: variant
@@ -28,6 +19,10 @@ VARIANTS = {
             "Huynh & Yoo 2016 as printed: brightest pixels, Eq. 3 with its extra cosines",
             huynh2016_as_printed,
         ),
-        Variant("pnp", "perspective-n-point (SQPNP, IPPE, Levenberg-Marquardt) on raw centroids, no gravity", pnp),
+        PNP,
+        IPPE,
+        SQPNP,
+        UP2P,
+        GRAVITY_FIT,
     )
 }
