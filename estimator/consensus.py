@@ -20,6 +20,7 @@ MODEL_ERROR_PX = 0.1
 # With fewer, a spot that does not fit cannot be told from those that do.
 FEWEST_WITHOUT_DOUBT = 3
 FEWEST_AMONG_DOUBTFUL = 4
+MOST_ROBUST = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,22 +61,21 @@ def consensus(
         why = f"LEDs identified: {len(everything)}, needed: {FEWEST_WITHOUT_DOUBT}"
         raise EstimationFailure("position", why)
     fits = minima(seen, starts)
-    if fits and _agrees(fits[0], seen, pixel_rad).all():
+    if fits and _explains(fits[0], seen, pixel_rad):
         return Consensus(fits[0], fits[1:], everything, gravity)
-    for robust in minima(seen, [*starts, *more_starts()], robust=True)[:3]:
+    for robust in minima(seen, [*starts, *more_starts()], robust=True)[:MOST_ROBUST]:
         believed = _agrees(robust, seen, pixel_rad)
         while believed.sum() >= FEWEST_AMONG_DOUBTFUL and 2 * believed.sum() > len(believed):
             chosen = seen.only(believed)
             fits = minima(chosen, [robust.pose, *starts])
-            agree = _agrees(fits[0], chosen, pixel_rad) if fits else np.zeros(1, dtype=bool)
-            if agree.all():
+            if fits and _explains(fits[0], chosen, pixel_rad):
                 return Consensus(fits[0], fits[1:], believed, gravity)
-            # One at a time: the worst draws the fit, and the others with it, to itself.
-            if not fits:
+            if not fits or _agrees(fits[0], chosen, pixel_rad).all():
                 break
+            # One at a time: the worst draws the fit, and the others with it, to itself.
             believed = believed.copy()
             believed[np.flatnonzero(believed)[np.argmax(fits[0].spots_chi2)]] = False
-    raise EstimationFailure("position", "no pose explains most of the spots")
+    raise EstimationFailure("position", "no pose explains gravity and most of the spots")
 
 
 def minima(seen: Observations, starts: Iterable[Pose], robust: bool = False) -> tuple[Fit, ...]:
@@ -101,6 +101,11 @@ def _same(one: Fit, other: Fit) -> bool:
     """Whether two fits ended in one place; to be told from another minimum it has to be turned by a milliradian."""
     turned = np.linalg.norm(one.pose.R_cam_world - other.pose.R_cam_world)
     return bool(turned < 1e-3 and np.allclose(one.pose.position_m, other.pose.position_m, atol=1e-3))
+
+
+def _explains(found: Fit, seen: Observations, pixel_rad: float) -> bool:
+    """Whether a fit explains all spots and the reading of gravity."""
+    return found.tilt_chi2 <= chi2.isf(CHANCE, 2) and bool(_agrees(found, seen, pixel_rad).all())
 
 
 def _agrees(found: Fit, seen: Observations, pixel_rad: float) -> NDArray[np.bool_]:

@@ -14,11 +14,15 @@ from numpy.typing import NDArray
 
 from estimator.errors import EstimationFailure
 
+Pixels = NDArray[np.float64]
+
 # The 5 x 5 mean that blobs are searched in: keeps a spot whole that is but a few electrons a pixel.
 SMOOTHING_PX = 5
 # Ceiling and walls at 1/100 of a lamp stay below this share of the brightest; a lamp at a quarter of it stays above.
 THRESHOLD_OF_BRIGHTEST = 0.05
 THRESHOLD_SIGMA = 6.0
+# A demodulator's pixel is off by some 10 px: the lamp is within so many of it.
+NEAR_PX = 40.0
 # One bright pixel smoothed covers 25; smaller blobs are noise near the threshold.
 SMALLEST_BLOB_PX = 16
 # No scene has as many lamps: what is smaller than the thousand largest blobs is noise in an image that holds no lamp.
@@ -36,7 +40,7 @@ LEAST_SIGNAL_TO_NOISE = 5.0
 class Spot:
     """A lamp's image, in continuous pixels with pixel centres at +0.5.
 
-    `covariance_px2` is (2, 2), of the centroid (u, v), from shot noise alone. The brightest pixel is given by its
+    `covariance_px2` is (2, 2), of the centroid (u, v), from the pixels' noise. The brightest pixel is given by its
     centre; on a flat-topped or clipped lamp noise alone decides which one it is, and ties go to the first row's first.
     """
 
@@ -55,7 +59,8 @@ class Spot:
 class Readout:
     """A window of the sensor in electrons, (rows, columns), from pixel (row, column) of the sensor on.
 
-    `raw_e` is the image before the denoiser and `clipped` where it was full.
+    `raw_e` is the image before the denoiser and `clipped` where it was full. Beside shot noise a pixel's variance has a
+    part that stays, `floor_e2`, and one that goes with the square of its light, by the pixels' unequal response `prnu`.
     """
 
     row: int
@@ -63,6 +68,8 @@ class Readout:
     image_e: NDArray[np.float32]
     raw_e: NDArray[np.float32]
     clipped: NDArray[np.bool_]
+    floor_e2: float = 0.0
+    prnu: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,9 +93,13 @@ class _Ellipse:
         return np.asarray(np.sqrt((self.axes**2) @ (self.semi_axes_px + grown_px) ** 2))
 
 
-def detect(readouts: Sequence[Readout], sensor_px: int, reach_px: int) -> tuple[Spot, ...]:
+def detect(
+    readouts: Sequence[Readout], sensor_px: int, reach_px: int, lamps_px: Pixels | None = None
+) -> tuple[Spot, ...]:
     """Find the lamps in what was read out of a sensor of `sensor_px` pixels: all of it, or windows around lamps.
 
+    What counts as bright is measured near `lamps_px`, (n, 2), where somebody saw lamps that matter, so that a brighter
+    one elsewhere hides none of them; without, or where nothing is read out there, the image's brightest does.
     `reach_px` is the half width of the box that the denoiser averaged over, 0 where the images are the raw ones. A spot
     whose light may go over the border of its window is reported and flagged: its centroid is biased. Raises
     EstimationFailure where there is no spot at all.
@@ -96,7 +107,7 @@ def detect(readouts: Sequence[Readout], sensor_px: int, reach_px: int) -> tuple[
     size = (SMOOTHING_PX, SMOOTHING_PX)
     smooth = [cv2.blur(readout.image_e, size, borderType=cv2.BORDER_REPLICATE) for readout in readouts]
     whole = sum(image.size for image in smooth) == sensor_px and len(smooth) == 1
-    background_e, threshold_e = _levels(smooth, whole)
+    background_e, threshold_e = _levels(smooth, whole, _brightest(readouts, smooth, lamps_px))
     spots: list[Spot] = []
     for readout, image in zip(readouts, smooth, strict=True):
         ellipses = _ellipses(image, background_e, threshold_e, LARGEST_BLOB_OF_FRAME * sensor_px)
@@ -122,7 +133,22 @@ def _spots(readout: Readout, ellipses: Sequence[_Ellipse], reach_px: int) -> lis
     return spots
 
 
-def _levels(smooth: Sequence[NDArray[np.float32]], whole: bool) -> tuple[float, float]:
+def _brightest(readouts: Sequence[Readout], smooth: Sequence[NDArray[np.float32]], lamps_px: Pixels | None) -> float:
+    """How bright the lamps are, electrons: the median of what is brightest near each, or the image's brightest."""
+    peaks = []
+    for u_px, v_px in [] if lamps_px is None else lamps_px:
+        near = []
+        for readout, image in zip(readouts, smooth, strict=True):
+            row, column = v_px - readout.row, u_px - readout.column
+            rows = slice(max(int(row - NEAR_PX), 0), max(int(row + NEAR_PX), 0))
+            columns = slice(max(int(column - NEAR_PX), 0), max(int(column + NEAR_PX), 0))
+            near.append(float(image[rows, columns].max(initial=-np.inf)))
+        peaks.append(max(near))
+    found = [peak for peak in peaks if np.isfinite(peak)]
+    return float(np.median(found)) if found else max(float(image.max()) for image in smooth)
+
+
+def _levels(smooth: Sequence[NDArray[np.float32]], whole: bool, brightest_e: float) -> tuple[float, float]:
     """Background and the threshold for blobs, electrons.
 
     In the whole image most pixels are background, and every few of them are enough. A lamp may fill most of a window
@@ -138,7 +164,7 @@ def _levels(smooth: Sequence[NDArray[np.float32]], whole: bool) -> tuple[float, 
         outermost = np.concatenate([np.concatenate([s[0], s[-1], s[:, 0], s[:, -1]]) for s in smooth])
         low, background = map(float, np.percentile(outermost, [5, 25]))
         sigma = (background - low) / 0.9704  # between these percentiles of a normal distribution
-    above_walls = THRESHOLD_OF_BRIGHTEST * (max(float(image.max()) for image in smooth) - background)
+    above_walls = THRESHOLD_OF_BRIGHTEST * (brightest_e - background)
     return background, background + max(THRESHOLD_SIGMA * sigma, above_walls)
 
 
@@ -201,7 +227,8 @@ def _measure(readout: Readout, ellipse: _Ellipse, others: list[_Ellipse], reach_
 
     signal = np.where(support, electrons - background_e, 0.0)
     # Shot noise: a raw pixel's variance is its electrons.
-    variance = np.maximum(readout.raw_e[window].astype(np.float64), 0.0)
+    raw_e = np.maximum(readout.raw_e[window].astype(np.float64), 0.0)
+    variance = raw_e + readout.floor_e2 + (readout.prnu * raw_e) ** 2
     flux = signal.sum()
     if flux <= LEAST_SIGNAL_TO_NOISE * np.sqrt(variance[support].sum()):
         return None

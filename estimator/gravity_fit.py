@@ -6,6 +6,7 @@ they are (`estimator/reprojection.py`). LEDs in a plane have two poses that look
 whole arc of them: both are fits that start from there, and gravity decides. Wrong identities are left out by consensus.
 """
 
+from dataclasses import replace
 from itertools import combinations, islice
 
 import cv2
@@ -14,8 +15,10 @@ from numpy.typing import NDArray
 
 from estimator.consensus import Consensus, consensus
 from estimator.dataset import DeviceFrame
+from estimator.errors import EstimationFailure
 from estimator.pipeline import Estimate, Variant
 from estimator.pnp import candidates, in_a_plane
+from estimator.position import fix_orientation
 from estimator.reprojection import Observations, Pose, observations, projected
 from estimator.sighting import sightings
 from estimator.upright import upright_pose
@@ -36,7 +39,15 @@ def gravity_fit(frame: DeviceFrame) -> Estimate:
     """Position, its covariance, and whether another position is nearly as likely; raises EstimationFailure."""
     seen = observations(frame, sightings(frame))
     pixel_rad = 1.0 / frame.camera.K[0][0]
-    agreed = consensus(seen, pixel_rad, _starts(seen), lambda: _from_triples(seen, pixel_rad))
+    starts = _starts(seen)
+    try:
+        agreed = consensus(seen, pixel_rad, starts, lambda: _from_triples(seen, pixel_rad))
+    except EstimationFailure:
+        if not fix_orientation(seen.leds_m):
+            raise
+        # The reading itself may be what is wrong.
+        without = replace(seen, tilt_sigma_rad=np.inf)
+        agreed = consensus(without, pixel_rad, starts, lambda: _from_triples(seen, pixel_rad))
     return Estimate(agreed.best.pose.position_m, covariance_m2=agreed.covariance_m2, ambiguous=ambiguous(agreed))
 
 

@@ -17,7 +17,7 @@ from estimator.consensus import consensus
 from estimator.dataset import DeviceFrame
 from estimator.errors import EstimationFailure
 from estimator.pipeline import Estimate, Variant
-from estimator.position import on_one_line
+from estimator.position import fix_orientation
 from estimator.rectify import LOWEST_SINE, rotation
 from estimator.reprojection import Observations, Pose, observations, projected
 from estimator.sighting import sightings
@@ -35,7 +35,6 @@ MOST_PAIRS = 120
 GATE_SIGMA = 3.0
 GATE_PX = 3.0
 BEST_PAIRS = 3
-FEWEST_FOR_ORIENTATION = 4
 # World axes to PoseLib's, whose upright axis is y.
 Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
@@ -47,7 +46,7 @@ def up2p(frame: DeviceFrame) -> Estimate:
     seen = observations(frame, sightings(frame))
     pixel_rad = 1.0 / frame.camera.K[0][0]
     starts = _from_pairs(seen, pixel_rad)
-    if len(seen.leds_m) >= FEWEST_FOR_ORIENTATION and not on_one_line(seen.leds_m):
+    if fix_orientation(seen.leds_m):
         seen = replace(seen, tilt_sigma_rad=np.inf)
     agreed = consensus(seen, pixel_rad, starts[:1], lambda: starts[1:])
     return Estimate(agreed.best.pose.position_m, covariance_m2=agreed.covariance_m2)
