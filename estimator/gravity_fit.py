@@ -6,6 +6,7 @@ they are (`estimator/reprojection.py`). LEDs in a plane have two poses that look
 whole arc of them: both are fits that start from there, and gravity decides. Wrong identities are left out by consensus.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations, islice
 
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from estimator.consensus import Consensus, consensus
 from estimator.dataset import DeviceFrame
 from estimator.errors import EstimationFailure
+from estimator.identify import Sighting
 from estimator.pipeline import Estimate, Variant
 from estimator.pnp import candidates, in_a_plane
 from estimator.position import fix_orientation
@@ -37,7 +39,12 @@ FEWEST_FOR_IPPE = 4
 
 def gravity_fit(frame: DeviceFrame) -> Estimate:
     """Position, its covariance, and whether another position is nearly as likely; raises EstimationFailure."""
-    seen = observations(frame, sightings(frame))
+    return fit_sightings(frame, sightings(frame))
+
+
+def fit_sightings(frame: DeviceFrame, sighted: Sequence[Sighting]) -> Estimate:
+    """The same from spots that are identified already; of the frame, its camera and gravity count."""
+    seen = observations(frame, sighted)
     pixel_rad = 1.0 / frame.camera.K[0][0]
     starts = _starts(seen)
     try:

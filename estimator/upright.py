@@ -7,6 +7,7 @@ then leaves gravity out and fits position and orientation to the spots that agre
 orientation (fewer than four, or on one line), it takes the tilt as read.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations
 
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from estimator.consensus import consensus
 from estimator.dataset import DeviceFrame
 from estimator.errors import EstimationFailure
+from estimator.identify import Sighting
 from estimator.pipeline import Estimate, Variant
 from estimator.position import fix_orientation
 from estimator.rectify import LOWEST_SINE, rotation
@@ -43,7 +45,12 @@ def up2p(frame: DeviceFrame) -> Estimate:
     """Upright two-point RANSAC and refinement; raises EstimationFailure, also where PoseLib is not installed."""
     if poselib is None:
         raise EstimationFailure("up2p", "PoseLib is not installed (pip install vlcrender[poselib])")
-    seen = observations(frame, sightings(frame))
+    return fit_sightings(frame, sightings(frame))
+
+
+def fit_sightings(frame: DeviceFrame, sighted: Sequence[Sighting]) -> Estimate:
+    """The same from spots that are identified already; of the frame, its camera and gravity count."""
+    seen = observations(frame, sighted)
     pixel_rad = 1.0 / frame.camera.K[0][0]
     starts = _from_pairs(seen, pixel_rad)
     if fix_orientation(seen.leds_m):
