@@ -21,6 +21,8 @@ MODEL_ERROR_PX = 0.1
 FEWEST_WITHOUT_DOUBT = 3
 FEWEST_AMONG_DOUBTFUL = 4
 MOST_ROBUST = 3
+NEAR_RAD = 0.01
+NEAR_M = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +84,8 @@ def minima(seen: Observations, starts: Iterable[Pose], robust: bool = False) -> 
     """The local minima from the starts on, each once, the best first, of those with all LEDs before and above it."""
     fits: list[Fit] = []
     for start in starts:
+        if any(_near(start, other.pose) for other in fits):
+            continue
         try:
             found = fit(seen, start, "soft_l1" if robust else "linear")
         except EstimationFailure:
@@ -92,15 +96,16 @@ def minima(seen: Observations, starts: Iterable[Pose], robust: bool = False) -> 
         ahead = depth_m > 0
         # Robustly fitted, a pose is not to be thrown away for a wrong LED's sake.
         possible = below and (2 * ahead.sum() > len(ahead) if robust else ahead.all())
-        if possible and np.isfinite(found.cost) and not any(_same(found, other) for other in fits):
+        if possible and np.isfinite(found.cost) and not any(_near(found.pose, other.pose) for other in fits):
             fits.append(found)
     return tuple(sorted(fits, key=lambda one: one.cost))
 
 
-def _same(one: Fit, other: Fit) -> bool:
-    """Whether two fits ended in one place; to be told from another minimum it has to be turned by a milliradian."""
-    turned = np.linalg.norm(one.pose.R_cam_world - other.pose.R_cam_world)
-    return bool(turned < 1e-3 and np.allclose(one.pose.position_m, other.pose.position_m, atol=1e-3))
+def _near(one: Pose, other: Pose) -> bool:
+    """Whether two poses lead to one minimum: 0.6 deg is less than two minima of any plane are apart."""
+    turned = np.linalg.norm(one.R_cam_world - other.R_cam_world)
+    moved = np.linalg.norm(one.position_m - other.position_m)
+    return bool(turned < NEAR_RAD and moved < NEAR_M)
 
 
 def _explains(found: Fit, seen: Observations, pixel_rad: float) -> bool:

@@ -244,7 +244,8 @@ class DeviceFrame:
 
     def clipped(self, part: Part) -> NDArray[np.bool_]:
         """Where a pixel of a part is full, or may be, and its electrons are unknown, (rows, columns)."""
-        return part.image_dn >= self.sensor.full_dn()
+        # An integer: beside a float the whole image would be made one.
+        return part.image_dn >= int(np.ceil(self.sensor.full_dn()))
 
 
 def read_dataset(folder: Path) -> Dataset:
