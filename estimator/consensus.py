@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from estimator.errors import EstimationFailure
-from estimator.reprojection import Fit, Observations, Pose, fit, projected
+from estimator.reprojection import Fit, Observations, Pose, fit, projected, straightened
 
 Floats = NDArray[np.float64]
 
@@ -46,17 +46,25 @@ class Consensus:
         return self.best.covariance_m2 * widened
 
 
-def consensus(
+def consensus(seen: Observations, starts: Sequence[Pose], more_starts: Callable[[], Iterable[Pose]]) -> Consensus:
+    """Fit from every start; where chance does not explain the best fit, find out which spots to believe and fit those.
+
+    `more_starts` are poses to begin from when some spots are wrong. Through a lens that bends, all is done again once a
+    pose is known. Raises EstimationFailure where too few spots agree, or no pose has the LEDs before and above it.
+    """
+    agreed = _consensus(seen, starts, more_starts)
+    if seen.camera.projection == "perspective" and seen.camera.distortion is None:
+        return agreed
+    poses = [found.pose for found in (agreed.best, *agreed.others)]
+    return _consensus(straightened(seen, agreed.best.pose), poses, more_starts)
+
+
+def _consensus(
     seen: Observations,
-    pixel_rad: float,
     starts: Sequence[Pose],
     more_starts: Callable[[], Iterable[Pose]],
 ) -> Consensus:
-    """Fit from every start; where chance does not explain the best fit, find out which spots to believe and fit those.
-
-    `pixel_rad` is a pixel in units of the image distance; `more_starts` are poses to begin from when some spots are
-    wrong. Raises EstimationFailure where too few spots agree, or none of the poses has the LEDs before and above it.
-    """
+    pixel_rad = 1 / seen.camera.K[0][0]
     gravity = bool(np.isfinite(seen.tilt_sigma_rad))
     everything = np.ones(len(seen.leds_m), dtype=bool)
     if len(everything) < FEWEST_WITHOUT_DOUBT:

@@ -31,6 +31,8 @@ MOST_BLOBS = 1000
 LARGEST_BLOB_OF_FRAME = 0.1
 # Pieces of a blob above half level count as lamps of their own from a fifth of the largest piece's area on.
 SMALLEST_PIECE = 0.2
+# A square of half side r has the second moments of a disc of radius 2 r / sqrt(3), and corners at sqrt(2) r.
+SQUARE_STRETCH = 1.5**0.5
 MARGIN_PX = 2.0
 RING_PX = 3.0
 LEAST_SIGNAL_TO_NOISE = 5.0
@@ -79,6 +81,9 @@ class _Ellipse:
     centre_px: NDArray[np.float64]
     axes: NDArray[np.float64]
     semi_axes_px: NDArray[np.float64]
+    low_px: NDArray[np.float64]
+    high_px: NDArray[np.float64]
+    """Corners of the upright box around the part itself."""
     area_px: int
 
     def distance2(self, u_px: NDArray[np.float64], v_px: NDArray[np.float64], grown_px: float) -> NDArray[np.float64]:
@@ -95,12 +100,17 @@ class _Ellipse:
 
 
 def detect(
-    readouts: Sequence[Readout], sensor_px: int, reach_px: int, lamps_px: Pixels | None = None
+    readouts: Sequence[Readout],
+    sensor_px: int,
+    reach_px: int,
+    lamps_px: Pixels | None = None,
+    corners: bool = False,
 ) -> tuple[Spot, ...]:
     """Find the lamps in what was read out of a sensor of `sensor_px` pixels: all of it, or windows around lamps.
 
     What counts as bright is measured near `lamps_px`, (n, 2), where somebody saw lamps that matter, so that a brighter
-    one elsewhere hides none of them; without, or where nothing is read out there, the image's brightest does.
+    one elsewhere hides none of them; without, or where nothing is read out there, the image's brightest does. `corners`
+    says that lamps may have some: the ellipse that a square's centroid is taken over goes around it.
     `reach_px` is the half width of the box that the denoiser averaged over, 0 where the images are the raw ones. A spot
     whose light may go over the border of its window is reported and flagged: its centroid is biased. Raises
     EstimationFailure where there is no spot at all.
@@ -111,7 +121,8 @@ def detect(
     background_e, threshold_e = _levels(smooth, whole, _brightest(readouts, smooth, lamps_px))
     spots: list[Spot] = []
     for readout, image in zip(readouts, smooth, strict=True):
-        ellipses = _ellipses(image, background_e, threshold_e, LARGEST_BLOB_OF_FRAME * sensor_px)
+        stretch = SQUARE_STRETCH if corners else 1.0
+        ellipses = _ellipses(image, background_e, threshold_e, LARGEST_BLOB_OF_FRAME * sensor_px, stretch)
         spots += _spots(readout, ellipses, reach_px)
     if not spots:
         raise EstimationFailure("detect", "no spot found")
@@ -170,9 +181,9 @@ def _levels(smooth: Sequence[NDArray[np.float32]], whole: bool, brightest_e: flo
 
 
 def _ellipses(
-    smooth: NDArray[np.float32], background_e: float, threshold_e: float, largest_px: float
+    smooth: NDArray[np.float32], background_e: float, threshold_e: float, largest_px: float, stretch: float
 ) -> list[_Ellipse]:
-    """The blobs above the threshold, cut at half of their own level, as ellipses."""
+    """The blobs above the threshold, cut at half of their own level, as ellipses made longer by `stretch`."""
     mask = (smooth > threshold_e).view(np.uint8)
     # Outlines are found a hundred times sooner than labels and their statistics for all of a large image.
     outlines, nesting = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
@@ -196,11 +207,11 @@ def _ellipses(
         pieces = cv2.connectedComponents(core, connectivity=8)[1]
         areas = np.bincount(pieces.ravel())[1:]
         for piece in np.flatnonzero(areas >= SMALLEST_PIECE * areas.max()).tolist():
-            ellipses.append(_ellipse(pieces == piece + 1, left, top))
+            ellipses.append(_ellipse(pieces == piece + 1, left, top, stretch))
     return ellipses
 
 
-def _ellipse(core: NDArray[np.bool_], left: int, top: int) -> _Ellipse:
+def _ellipse(core: NDArray[np.bool_], left: int, top: int, stretch: float) -> _Ellipse:
     """The ellipse with the centroid and second moments of the pixels set; (left, top) is the window's first pixel."""
     weights = core.astype(np.float64)
     of_columns, of_rows = weights.sum(axis=0), weights.sum(axis=1)
@@ -212,7 +223,11 @@ def _ellipse(core: NDArray[np.bool_], left: int, top: int) -> _Ellipse:
     moments = np.array([[of_columns @ du**2, mixed], [mixed, of_rows @ dv**2]]) / count
     variances, axes = np.linalg.eigh(moments)
     # A uniform ellipse has variance a^2 / 4 along its semi-axis a.
-    return _Ellipse(centre, axes, 2 * np.sqrt(np.maximum(variances, 0)) + 0.5, int(count))
+    semi_axes_px = 2 * stretch * np.sqrt(np.maximum(variances, 0)) + 0.5
+    columns, rows = np.flatnonzero(of_columns), np.flatnonzero(of_rows)
+    low_px = np.array([columns[0] + left, rows[0] + top], dtype=np.float64)
+    high_px = np.array([columns[-1] + left + 1, rows[-1] + top + 1], dtype=np.float64)
+    return _Ellipse(centre, axes, semi_axes_px, low_px, high_px, int(count))
 
 
 def _measure(readout: Readout, ellipse: _Ellipse, others: list[_Ellipse], reach_px: int) -> Spot | None:
@@ -252,8 +267,7 @@ def _measure(readout: Readout, ellipse: _Ellipse, others: list[_Ellipse], reach_
 
     inside = ellipse.distance2(u_px, v_px, 0.0) <= 1
     brightest = np.unravel_index(np.argmax(np.where(inside, electrons, -np.inf)), inside.shape)
-    light = ellipse.half_extent(margin_px)
-    low, high = ellipse.centre_px - light, ellipse.centre_px + light
+    low, high = ellipse.low_px - margin_px, ellipse.high_px + margin_px
     return Spot(
         u_px=u + readout.column,
         v_px=v + readout.row,

@@ -45,16 +45,15 @@ def gravity_fit(frame: DeviceFrame) -> Estimate:
 def fit_sightings(frame: DeviceFrame, sighted: Sequence[Sighting]) -> Estimate:
     """The same from spots that are identified already; of the frame, its camera and gravity count."""
     seen = observations(frame, sighted)
-    pixel_rad = 1.0 / frame.camera.K[0][0]
     starts = _starts(seen)
     try:
-        agreed = consensus(seen, pixel_rad, starts, lambda: _from_triples(seen, pixel_rad))
+        agreed = consensus(seen, starts, lambda: _from_triples(seen))
     except EstimationFailure:
         if not fix_orientation(seen.leds_m):
             raise
         # The reading itself may be what is wrong.
         without = replace(seen, tilt_sigma_rad=np.inf)
-        agreed = consensus(without, pixel_rad, starts, lambda: _from_triples(seen, pixel_rad))
+        agreed = consensus(without, starts, lambda: _from_triples(seen))
     return Estimate(agreed.best.pose.position_m, covariance_m2=agreed.covariance_m2, ambiguous=ambiguous(agreed))
 
 
@@ -74,8 +73,9 @@ def _starts(seen: Observations) -> list[Pose]:
     return starts
 
 
-def _from_triples(seen: Observations, pixel_rad: float) -> list[Pose]:
+def _from_triples(seen: Observations) -> list[Pose]:
     """The poses from three spots each (P3P) that put most of the other spots right."""
+    pixel_rad = 1 / seen.camera.K[0][0]
     count = len(seen.leds_m)
     triples = list(combinations(range(count), 3))
     if len(triples) > MOST_TRIPLES:

@@ -7,8 +7,11 @@ image is then the image of M = mean of X / |X|^4 over the face. With the mean X0
 and the mean square extent s^2 along any direction of the face, X / |X|^4 to second order gives M along
 X0 + 4 s^2 (n . X0) / d^2 n: **the image of a point above the LED by 4 s^2 h / d^2**, h being its height above the
 camera. s^2 is r^2 / 4 for a disc of radius r, and r^2 / 3 for a square of half side r. What is left goes with
-r^4 / h^3, a nanometre. It holds on a pinhole's image plane. After a distortion is taken out, what the lens bends within
-one spot is missing; for a fish-eye, whose image has another scale from place to place, nothing is corrected.
+r^4 / h^3, a nanometre.
+
+It holds on a pinhole's image plane. A lens that bends also does so within a spot, whose centroid then is not where its
+centre goes when the lens is taken out. `straightened` takes that off the centroids, once a pose says how large the
+spots are.
 """
 
 from collections.abc import Sequence
@@ -24,7 +27,7 @@ from estimator.dataset import Camera, DeviceFrame
 from estimator.errors import EstimationFailure
 from estimator.identify import Sighting
 from estimator.rectify import tilt_from_gravity
-from estimator.undistort import pinhole_pixels
+from estimator.undistort import lens_pixels, pinhole_pixels
 
 Floats = NDArray[np.float64]
 
@@ -55,6 +58,7 @@ class Observations:
     """Centres of the LEDs, (n, 3), world."""
     lift_m2: Floats
     """4 s^2 of each LED, (n,): see the module."""
+    camera: Camera
     plane: Floats
     """Centroids, (n, 2), in units of the image distance."""
     whitening: Floats
@@ -114,12 +118,12 @@ def observations(frame: DeviceFrame, seen: Sequence[Sighting]) -> Observations:
     from_pixels = np.linalg.inv(camera.matrix())
     to_plane = from_pixels[:2, :2] @ slope
     covariance = to_plane @ (covariance_px2 + BEST_CENTROID_PX**2 * np.eye(2)) @ to_plane.transpose(0, 2, 1)
-    centred = camera.projection == "perspective"
-    lift = [centred * led.radius_m**2 * (SQUARE_TO_DISC if led.shape == "square" else 1.0) for led in leds]
+    lift = [led.radius_m**2 * (SQUARE_TO_DISC if led.shape == "square" else 1.0) for led in leds]
     sigma_deg = max(frame.accelerometer_error_deg, BEST_TILT_DEG)
     return Observations(
         leds_m=np.array([led.position_m for led in leds]),
         lift_m2=np.array(lift),
+        camera=camera,
         plane=out @ from_pixels[:2, :2].T + from_pixels[:2, 2],
         whitening=np.linalg.inv(np.linalg.cholesky(covariance)),
         tilt_rad=np.array(tilt_from_gravity(frame.accelerometer_m_s2)),
@@ -152,6 +156,28 @@ def projected(pose: Pose, leds_m: Floats, lift_m2: Floats) -> tuple[Floats, Floa
     # Of what is behind the camera nothing is an image; it only has to be far off, and finite.
     depth = np.where(np.abs(seen[:, 2]) < 1e-9, 1e-9, seen[:, 2])
     return seen[:, :2] / depth[:, None], seen[:, 2]
+
+
+def straightened(seen: Observations, pose: Pose) -> Observations:
+    """The same with centroids as if the lens had not bent the spots, by the sizes they have from a pose.
+
+    Each LED is four points, sqrt(2) s from its centre along x and y, which have its s^2. Their images weigh as the
+    lens's light does, z / |X|^4, whatever the lens: what it spreads over more pixels it makes dimmer.
+    """
+    steps = np.sqrt(seen.lift_m2 / 2)[:, None, None] * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
+    points = (seen.leds_m[:, None] + steps - pose.position_m) @ pose.R_cam_world.T
+    before = (points[..., 2] > 0).all(axis=1)
+    points = points[before]
+    weights = points[..., 2] / (points**2).sum(axis=2) ** 2
+    weights /= weights.sum(axis=1, keepdims=True)
+    straight = points[..., :2] / points[..., 2:]
+    K = seen.camera.matrix()
+    bent = lens_pixels(straight.reshape(-1, 2) @ K[:2, :2].T + K[:2, 2], seen.camera).reshape(straight.shape)
+    centroids = pinhole_pixels((weights[..., None] * bent).sum(axis=1), seen.camera)
+    plane = seen.plane.copy()
+    taken_out = (np.column_stack([centroids, np.ones(len(centroids))]) @ np.linalg.inv(K).T)[:, :2]
+    plane[before] -= taken_out - (weights[..., None] * straight).sum(axis=1)
+    return replace(seen, plane=plane)
 
 
 def fit(seen: Observations, start: Pose, loss: Literal["linear", "soft_l1"] = "linear") -> Fit:

@@ -51,16 +51,16 @@ def up2p(frame: DeviceFrame) -> Estimate:
 def fit_sightings(frame: DeviceFrame, sighted: Sequence[Sighting]) -> Estimate:
     """The same from spots that are identified already; of the frame, its camera and gravity count."""
     seen = observations(frame, sighted)
-    pixel_rad = 1.0 / frame.camera.K[0][0]
-    starts = _from_pairs(seen, pixel_rad)
+    starts = _from_pairs(seen)
     if fix_orientation(seen.leds_m):
         seen = replace(seen, tilt_sigma_rad=np.inf)
-    agreed = consensus(seen, pixel_rad, starts[:1], lambda: starts[1:])
+    agreed = consensus(seen, starts[:1], lambda: starts[1:])
     return Estimate(agreed.best.pose.position_m, covariance_m2=agreed.covariance_m2)
 
 
-def _from_pairs(seen: Observations, pixel_rad: float) -> list[Pose]:
+def _from_pairs(seen: Observations) -> list[Pose]:
     """The poses from two spots each that put most of the other spots about right, the best first."""
+    pixel_rad = 1 / seen.camera.K[0][0]
     level, above = _levelled(seen)
     tilt = rotation(*seen.tilt_rad)
     pairs = list(combinations(np.flatnonzero(above).tolist(), 2))
