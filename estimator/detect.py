@@ -6,7 +6,7 @@ light is in it, blurred or not, and the background around it cancels.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -33,6 +33,8 @@ LARGEST_BLOB_OF_FRAME = 0.1
 SMALLEST_PIECE = 0.2
 # A square of half side r has the second moments of a disc of radius 2 r / sqrt(3), and corners at sqrt(2) r.
 SQUARE_STRETCH = 1.5**0.5
+# Where a disc of blur has fallen to the threshold it has a fifth of its way to go.
+FRINGE_BEYOND = 1.25
 MARGIN_PX = 2.0
 RING_PX = 3.0
 LEAST_SIGNAL_TO_NOISE = 5.0
@@ -85,6 +87,8 @@ class _Ellipse:
     high_px: NDArray[np.float64]
     """Corners of the upright box around the part itself."""
     area_px: int
+    fringe_px: float
+    """How much further than a sharp lamp's the light goes that was found around it."""
 
     def distance2(self, u_px: NDArray[np.float64], v_px: NDArray[np.float64], grown_px: float) -> NDArray[np.float64]:
         """Squared distance from the centre in units of the grown ellipse: at most 1 inside. Takes a row of u, a column
@@ -131,7 +135,8 @@ def detect(
 
 def _spots(readout: Readout, ellipses: Sequence[_Ellipse], reach_px: int) -> list[Spot]:
     """Measure each ellipse of a window, beside those near it."""
-    margin_px = MARGIN_PX + reach_px
+    fringe_px = max((ellipse.fringe_px for ellipse in ellipses), default=0.0)
+    margin_px = MARGIN_PX + max(reach_px, fringe_px)
     centres = np.array([ellipse.centre_px for ellipse in ellipses]).reshape(-1, 2)
     extents = np.array([ellipse.half_extent(margin_px + RING_PX) for ellipse in ellipses]).reshape(-1, 2)
     spots = []
@@ -207,7 +212,11 @@ def _ellipses(
         pieces = cv2.connectedComponents(core, connectivity=8)[1]
         areas = np.bincount(pieces.ravel())[1:]
         for piece in np.flatnonzero(areas >= SMALLEST_PIECE * areas.max()).tolist():
-            ellipses.append(_ellipse(pieces == piece + 1, left, top, stretch))
+            ellipse = _ellipse(pieces == piece + 1, left, top, stretch)
+            if len(areas) == 1:
+                box = np.array([left, top]), np.array([left + width, top + height])
+                ellipse = replace(ellipse, fringe_px=_fringe_px(ellipse, *box))
+            ellipses.append(ellipse)
     return ellipses
 
 
@@ -227,12 +236,21 @@ def _ellipse(core: NDArray[np.bool_], left: int, top: int, stretch: float) -> _E
     columns, rows = np.flatnonzero(of_columns), np.flatnonzero(of_rows)
     low_px = np.array([columns[0] + left, rows[0] + top], dtype=np.float64)
     high_px = np.array([columns[-1] + left + 1, rows[-1] + top + 1], dtype=np.float64)
-    return _Ellipse(centre, axes, semi_axes_px, low_px, high_px, int(count))
+    return _Ellipse(centre, axes, semi_axes_px, low_px, high_px, int(count), fringe_px=0.0)
+
+
+def _fringe_px(ellipse: _Ellipse, low_px: NDArray[np.int64], high_px: NDArray[np.int64]) -> float:
+    """How far a blob's box goes beyond its ellipse's, without what the smoothing adds; none where it is no lamp's own.
+
+    A fringe wider than the lamp itself is not its blur but something bright beside it.
+    """
+    fringe_px = max((ellipse.low_px - low_px).max(), (high_px - ellipse.high_px).max()) - SMOOTHING_PX // 2
+    return FRINGE_BEYOND * float(fringe_px) if 0 < fringe_px < ellipse.semi_axes_px.max() else 0.0
 
 
 def _measure(readout: Readout, ellipse: _Ellipse, others: list[_Ellipse], reach_px: int) -> Spot | None:
     """Centroid and covariance of one spot, or None where it does not stand out of its own noise."""
-    margin_px = MARGIN_PX + reach_px
+    margin_px = MARGIN_PX + max(reach_px, ellipse.fringe_px)
     height_px, width_px = readout.image_e.shape
     reach = ellipse.half_extent(margin_px + RING_PX)
     left, top = np.maximum(np.floor(ellipse.centre_px - reach), 0).astype(int)
@@ -246,7 +264,7 @@ def _measure(readout: Readout, ellipse: _Ellipse, others: list[_Ellipse], reach_
     ring = ~support & (ellipse.distance2(u_px, v_px, margin_px + RING_PX) <= 1)
     for other in others:
         # Where two supports meet, a pixel belongs to the spot it is nearer to.
-        other_distance2 = other.distance2(u_px, v_px, margin_px)
+        other_distance2 = other.distance2(u_px, v_px, MARGIN_PX + max(reach_px, other.fringe_px))
         support &= distance2 <= other_distance2
         ring &= other_distance2 > 1
     background_e = electrons[ring].mean() if ring.any() else 0.0
