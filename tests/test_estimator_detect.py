@@ -199,7 +199,7 @@ def test_a_lamp_that_fills_its_window_is_found_and_flagged() -> None:
 
 
 def square(view: View, led_m: Array, half_m: float) -> Array:
-    """Expected electrons of a square lamp with sides along x and y, by 2 x 2 points a pixel: coarse, and as good as another image."""
+    """Electrons of a square lamp with sides along x and y, by 2 x 2 points a pixel: coarse, and as good as another."""
     sub = (np.arange(2 * view.width_px) + 0.5) / 2, (np.arange(2 * view.height_px) + 0.5) / 2
     u, v = np.meshgrid(*sub)
     rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ (view.R_cam_world.T @ np.linalg.inv(view.K)).T
