@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.consensus import Consensus, consensus
-from estimator.dataset import DeviceFrame
+from estimator.dataset import Camera, DeviceFrame
 from estimator.pipeline import Estimate, Variant
 from estimator.pnp import candidates, in_a_plane
 from estimator.reprojection import Observations, Pose, observations, projected
@@ -34,10 +34,14 @@ FEWEST_FOR_IPPE = 4
 
 def gravity_fit(frame: DeviceFrame) -> Estimate:
     """Position, its covariance, and whether another position is nearly as likely; raises EstimationFailure."""
-    seen = observations(frame, sightings(frame))
-    pixel_rad = 1.0 / frame.camera.K[0][0]
-    agreed = consensus(seen, pixel_rad, _starts(seen), lambda: _from_triples(seen, pixel_rad))
+    agreed = agreement(observations(frame, sightings(frame)), frame.camera)
     return Estimate(agreed.best.pose.position_m, covariance_m2=agreed.covariance_m2, ambiguous=ambiguous(agreed))
+
+
+def agreement(seen: Observations, camera: Camera) -> Consensus:
+    """The pose, and which of the spots it rests on; raises EstimationFailure."""
+    pixel_rad = 1.0 / camera.K[0][0]
+    return consensus(seen, pixel_rad, _starts(seen), lambda: _from_triples(seen, pixel_rad))
 
 
 def ambiguous(agreed: Consensus) -> bool:
