@@ -2,6 +2,7 @@
 
 from estimator.gravity_fit import GRAVITY_FIT
 from estimator.huynh2016 import huynh2016, huynh2016_as_printed
+from estimator.maximum_likelihood import ML
 from estimator.pipeline import Variant
 from estimator.pnp import IPPE, PNP, SQPNP
 from estimator.upright import UP2P
@@ -24,5 +25,6 @@ VARIANTS = {
         SQPNP,
         UP2P,
         GRAVITY_FIT,
+        ML,
     )
 }

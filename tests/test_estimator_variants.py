@@ -154,6 +154,6 @@ def test_failures_carry_their_stage(noisy: Path) -> None:
 
 
 def test_the_registry_goes_by_its_names() -> None:
-    names = ["huynh2016", "huynh2016-as-printed", "pnp", "ippe", "sqpnp", "up2p", "gravity-fit"]
+    names = ["huynh2016", "huynh2016-as-printed", "pnp", "ippe", "sqpnp", "up2p", "gravity-fit", "ml"]
     assert list(VARIANTS) == names
     assert all(variant.name == name and "\n" not in variant.summary for name, variant in VARIANTS.items())
