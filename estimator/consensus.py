@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from estimator.errors import EstimationFailure
-from estimator.reprojection import Fit, Observations, Pose, fit, projected
+from estimator.reprojection import Fit, Observations, Pose, fit, projected, straightened
 
 Floats = NDArray[np.float64]
 
@@ -20,6 +20,9 @@ MODEL_ERROR_PX = 0.1
 # With fewer, a spot that does not fit cannot be told from those that do.
 FEWEST_WITHOUT_DOUBT = 3
 FEWEST_AMONG_DOUBTFUL = 4
+MOST_ROBUST = 3
+NEAR_RAD = 0.01
+NEAR_M = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,45 +46,54 @@ class Consensus:
         return self.best.covariance_m2 * widened
 
 
-def consensus(
+def consensus(seen: Observations, starts: Sequence[Pose], more_starts: Callable[[], Iterable[Pose]]) -> Consensus:
+    """Fit from every start; where chance does not explain the best fit, find out which spots to believe and fit those.
+
+    `more_starts` are poses to begin from when some spots are wrong. Through a lens that bends, all is done again once a
+    pose is known. Raises EstimationFailure where too few spots agree, or no pose has the LEDs before and above it.
+    """
+    agreed = _consensus(seen, starts, more_starts)
+    if seen.camera.projection == "perspective" and seen.camera.distortion is None:
+        return agreed
+    poses = [found.pose for found in (agreed.best, *agreed.others)]
+    return _consensus(straightened(seen, agreed.best.pose), poses, more_starts)
+
+
+def _consensus(
     seen: Observations,
-    pixel_rad: float,
     starts: Sequence[Pose],
     more_starts: Callable[[], Iterable[Pose]],
 ) -> Consensus:
-    """Fit from every start; where chance does not explain the best fit, find out which spots to believe and fit those.
-
-    `pixel_rad` is a pixel in units of the image distance; `more_starts` are poses to begin from when some spots are
-    wrong. Raises EstimationFailure where too few spots agree, or none of the poses has the LEDs before and above it.
-    """
+    pixel_rad = 1 / seen.camera.K[0][0]
     gravity = bool(np.isfinite(seen.tilt_sigma_rad))
     everything = np.ones(len(seen.leds_m), dtype=bool)
     if len(everything) < FEWEST_WITHOUT_DOUBT:
         why = f"LEDs identified: {len(everything)}, needed: {FEWEST_WITHOUT_DOUBT}"
         raise EstimationFailure("position", why)
     fits = minima(seen, starts)
-    if fits and _agrees(fits[0], seen, pixel_rad).all():
+    if fits and _explains(fits[0], seen, pixel_rad):
         return Consensus(fits[0], fits[1:], everything, gravity)
-    for robust in minima(seen, [*starts, *more_starts()], robust=True)[:3]:
+    for robust in minima(seen, [*starts, *more_starts()], robust=True)[:MOST_ROBUST]:
         believed = _agrees(robust, seen, pixel_rad)
         while believed.sum() >= FEWEST_AMONG_DOUBTFUL and 2 * believed.sum() > len(believed):
             chosen = seen.only(believed)
             fits = minima(chosen, [robust.pose, *starts])
-            agree = _agrees(fits[0], chosen, pixel_rad) if fits else np.zeros(1, dtype=bool)
-            if agree.all():
+            if fits and _explains(fits[0], chosen, pixel_rad):
                 return Consensus(fits[0], fits[1:], believed, gravity)
-            # One at a time: the worst draws the fit, and the others with it, to itself.
-            if not fits:
+            if not fits or _agrees(fits[0], chosen, pixel_rad).all():
                 break
+            # One at a time: the worst draws the fit, and the others with it, to itself.
             believed = believed.copy()
             believed[np.flatnonzero(believed)[np.argmax(fits[0].spots_chi2)]] = False
-    raise EstimationFailure("position", "no pose explains most of the spots")
+    raise EstimationFailure("position", "no pose explains gravity and most of the spots")
 
 
 def minima(seen: Observations, starts: Iterable[Pose], robust: bool = False) -> tuple[Fit, ...]:
     """The local minima from the starts on, each once, the best first, of those with all LEDs before and above it."""
     fits: list[Fit] = []
     for start in starts:
+        if any(_near(start, other.pose) for other in fits):
+            continue
         try:
             found = fit(seen, start, "soft_l1" if robust else "linear")
         except EstimationFailure:
@@ -92,15 +104,21 @@ def minima(seen: Observations, starts: Iterable[Pose], robust: bool = False) -> 
         ahead = depth_m > 0
         # Robustly fitted, a pose is not to be thrown away for a wrong LED's sake.
         possible = below and (2 * ahead.sum() > len(ahead) if robust else ahead.all())
-        if possible and np.isfinite(found.cost) and not any(_same(found, other) for other in fits):
+        if possible and np.isfinite(found.cost) and not any(_near(found.pose, other.pose) for other in fits):
             fits.append(found)
     return tuple(sorted(fits, key=lambda one: one.cost))
 
 
-def _same(one: Fit, other: Fit) -> bool:
-    """Whether two fits ended in one place; to be told from another minimum it has to be turned by a milliradian."""
-    turned = np.linalg.norm(one.pose.R_cam_world - other.pose.R_cam_world)
-    return bool(turned < 1e-3 and np.allclose(one.pose.position_m, other.pose.position_m, atol=1e-3))
+def _near(one: Pose, other: Pose) -> bool:
+    """Whether two poses lead to one minimum: 0.6 deg is less than two minima of any plane are apart."""
+    turned = np.linalg.norm(one.R_cam_world - other.R_cam_world)
+    moved = np.linalg.norm(one.position_m - other.position_m)
+    return bool(turned < NEAR_RAD and moved < NEAR_M)
+
+
+def _explains(found: Fit, seen: Observations, pixel_rad: float) -> bool:
+    """Whether a fit explains all spots and the reading of gravity."""
+    return found.tilt_chi2 <= chi2.isf(CHANCE, 2) and bool(_agrees(found, seen, pixel_rad).all())
 
 
 def _agrees(found: Fit, seen: Observations, pixel_rad: float) -> NDArray[np.bool_]:

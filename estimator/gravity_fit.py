@@ -6,6 +6,8 @@ they are (`estimator/reprojection.py`). LEDs in a plane have two poses that look
 whole arc of them: both are fits that start from there, and gravity decides. Wrong identities are left out by consensus.
 """
 
+from collections.abc import Sequence
+from dataclasses import replace
 from itertools import combinations, islice
 
 import cv2
@@ -13,9 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.consensus import Consensus, consensus
-from estimator.dataset import Camera, DeviceFrame
+from estimator.dataset import DeviceFrame
+from estimator.errors import EstimationFailure
+from estimator.identify import Sighting
 from estimator.pipeline import Estimate, Variant
 from estimator.pnp import candidates, in_a_plane
+from estimator.position import fix_orientation
 from estimator.reprojection import Observations, Pose, observations, projected
 from estimator.sighting import sightings
 from estimator.upright import upright_pose
@@ -34,14 +39,26 @@ FEWEST_FOR_IPPE = 4
 
 def gravity_fit(frame: DeviceFrame) -> Estimate:
     """Position, its covariance, and whether another position is nearly as likely; raises EstimationFailure."""
-    agreed = agreement(observations(frame, sightings(frame)), frame.camera)
+    return fit_sightings(frame, sightings(frame))
+
+
+def fit_sightings(frame: DeviceFrame, sighted: Sequence[Sighting]) -> Estimate:
+    """The same from spots that are identified already; of the frame, its camera and gravity count."""
+    agreed = agreement(observations(frame, sighted))
     return Estimate(agreed.best.pose.position_m, covariance_m2=agreed.covariance_m2, ambiguous=ambiguous(agreed))
 
 
-def agreement(seen: Observations, camera: Camera) -> Consensus:
-    """The pose, and which of the spots it rests on; raises EstimationFailure."""
-    pixel_rad = 1.0 / camera.K[0][0]
-    return consensus(seen, pixel_rad, _starts(seen), lambda: _from_triples(seen, pixel_rad))
+def agreement(seen: Observations) -> Consensus:
+    """The pose, and what of spots and gravity it rests on; raises EstimationFailure."""
+    starts = _starts(seen)
+    try:
+        return consensus(seen, starts, lambda: _from_triples(seen))
+    except EstimationFailure:
+        if not fix_orientation(seen.leds_m):
+            raise
+        # The reading itself may be what is wrong.
+        without = replace(seen, tilt_sigma_rad=np.inf)
+        return consensus(without, starts, lambda: _from_triples(seen))
 
 
 def ambiguous(agreed: Consensus) -> bool:
@@ -60,8 +77,9 @@ def _starts(seen: Observations) -> list[Pose]:
     return starts
 
 
-def _from_triples(seen: Observations, pixel_rad: float) -> list[Pose]:
+def _from_triples(seen: Observations) -> list[Pose]:
     """The poses from three spots each (P3P) that put most of the other spots right."""
+    pixel_rad = 1 / seen.camera.K[0][0]
     count = len(seen.leds_m)
     triples = list(combinations(range(count), 3))
     if len(triples) > MOST_TRIPLES:

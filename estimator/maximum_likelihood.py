@@ -74,7 +74,7 @@ def ml(frame: DeviceFrame) -> Estimate:
             raise EstimationFailure("position", "too few LEDs identified to fix a position")
         begin = fit(seen, upright).pose
     else:
-        agreed = agreement(seen, frame.camera)
+        agreed = agreement(seen)
         begin, believed, level, unsure = agreed.best.pose, agreed.believed, agreed.gravity, ambiguous(agreed)
     gravity = Gravity.of(frame) if level else NO_GRAVITY
     start = pose_of_rotation(begin.position_m, begin.R_cam_world, frame.camera)

@@ -46,11 +46,8 @@ class Noise:
     def of(frame: DeviceFrame) -> "Noise":
         """What a frame's sensor says."""
         sensor = frame.sensor
-        dark_e2 = sensor.gain_e_per_dn**2 / 12
-        for sigma_e in (sensor.dsnu_e, sensor.read_noise_e, sensor.row_offset_e, sensor.column_offset_e):
-            dark_e2 += sigma_e**2
-        dark_e2 += (sensor.adc_noise_dn * sensor.gain_e_per_dn) ** 2
-        full_e = (sensor.largest_dn() - sensor.black_level_dn) * sensor.gain_e_per_dn
+        dark_e2 = sensor.floor_e2() + sensor.row_offset_e**2 + sensor.column_offset_e**2
+        full_e = (sensor.full_dn() - sensor.black_level_dn) * sensor.gain_e_per_dn
         return Noise(dark_e2, sensor.prnu**2, full_e)
 
 

@@ -7,8 +7,11 @@ image is then the image of M = mean of X / |X|^4 over the face. With the mean X0
 and the mean square extent s^2 along any direction of the face, X / |X|^4 to second order gives M along
 X0 + 4 s^2 (n . X0) / d^2 n: **the image of a point above the LED by 4 s^2 h / d^2**, h being its height above the
 camera. s^2 is r^2 / 4 for a disc of radius r, and r^2 / 3 for a square of half side r. What is left goes with
-r^4 / h^3, a nanometre. It holds on a pinhole's image plane. After a distortion is taken out, what the lens bends within
-one spot is missing; for a fish-eye, whose image has another scale from place to place, nothing is corrected.
+r^4 / h^3, a nanometre.
+
+It holds on a pinhole's image plane. A lens that bends also does so within a spot, whose centroid then is not where its
+centre goes when the lens is taken out. `straightened` takes that off the centroids, once a pose says how large the
+spots are.
 """
 
 from collections.abc import Sequence
@@ -24,7 +27,7 @@ from estimator.dataset import Camera, DeviceFrame
 from estimator.errors import EstimationFailure
 from estimator.identify import Sighting
 from estimator.rectify import tilt_from_gravity
-from estimator.undistort import pinhole_pixels
+from estimator.undistort import lens_pixels, pinhole_pixels
 
 Floats = NDArray[np.float64]
 
@@ -55,6 +58,7 @@ class Observations:
     """Centres of the LEDs, (n, 3), world."""
     lift_m2: Floats
     """4 s^2 of each LED, (n,): see the module."""
+    camera: Camera
     plane: Floats
     """Centroids, (n, 2), in units of the image distance."""
     whitening: Floats
@@ -100,39 +104,47 @@ def observations(frame: DeviceFrame, seen: Sequence[Sighting]) -> Observations:
     Raises EstimationFailure where gravity reads nothing or no spot is left.
     """
     camera = frame.camera
+    pixels = np.array([(sighting.spot.u_px, sighting.spot.v_px) for sighting in seen]).reshape(-1, 2)
+    covariance_px2 = np.array([sighting.spot.covariance_px2 for sighting in seen]).reshape(-1, 2, 2)
+    leds = [sighting.led for sighting in seen]
+    try:
+        out, slope = _pinhole(pixels, camera)
+    except EstimationFailure:
+        kept = [k for k, pixel in enumerate(pixels) if _has_pinhole(pixel, camera)]
+        if not kept:
+            raise
+        pixels, covariance_px2, leds = pixels[kept], covariance_px2[kept], [leds[k] for k in kept]
+        out, slope = _pinhole(pixels, camera)
     from_pixels = np.linalg.inv(camera.matrix())
-    plane, whitening, kept = [], [], []
-    for sighting in seen:
-        spot = sighting.spot
-        try:
-            pixel, slope = _pinhole(np.array([spot.u_px, spot.v_px]), camera)
-        except EstimationFailure:
-            continue
-        to_plane = from_pixels[:2, :2] @ slope
-        covariance = to_plane @ (spot.covariance_px2 + BEST_CENTROID_PX**2 * np.eye(2)) @ to_plane.T
-        plane.append(from_pixels[:2, :2] @ pixel + from_pixels[:2, 2])
-        whitening.append(np.linalg.inv(np.linalg.cholesky(covariance)))
-        kept.append(sighting.led)
-    if not kept:
-        raise EstimationFailure("undistort", "the lens cannot be taken out of any spot")
-    centred = camera.projection == "perspective"
-    lift = [centred * led.radius_m**2 * (SQUARE_TO_DISC if led.shape == "square" else 1.0) for led in kept]
+    to_plane = from_pixels[:2, :2] @ slope
+    covariance = to_plane @ (covariance_px2 + BEST_CENTROID_PX**2 * np.eye(2)) @ to_plane.transpose(0, 2, 1)
+    lift = [led.radius_m**2 * (SQUARE_TO_DISC if led.shape == "square" else 1.0) for led in leds]
     sigma_deg = max(frame.accelerometer_error_deg, BEST_TILT_DEG)
     return Observations(
-        leds_m=np.array([led.position_m for led in kept]),
+        leds_m=np.array([led.position_m for led in leds]),
         lift_m2=np.array(lift),
-        plane=np.array(plane),
-        whitening=np.array(whitening),
+        camera=camera,
+        plane=out @ from_pixels[:2, :2].T + from_pixels[:2, 2],
+        whitening=np.linalg.inv(np.linalg.cholesky(covariance)),
         tilt_rad=np.array(tilt_from_gravity(frame.accelerometer_m_s2)),
         tilt_sigma_rad=float(np.radians(sigma_deg)),
     )
 
 
-def _pinhole(pixel: Floats, camera: Camera) -> tuple[Floats, Floats]:
-    """A pixel (2,) with the lens taken out, and the slope (2, 2) of that, by central differences over a pixel."""
+def _pinhole(pixels: Floats, camera: Camera) -> tuple[Floats, Floats]:
+    """Pixels (n, 2) with the lens taken out, and the slopes (n, 2, 2) of that, by central differences over a pixel."""
     steps = np.array([[0.0, 0.0], [0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]])
-    out = pinhole_pixels(pixel + steps, camera)
-    return out[0], np.column_stack([out[1] - out[2], out[3] - out[4]])
+    out = pinhole_pixels((pixels + steps[:, None]).reshape(-1, 2), camera).reshape(5, -1, 2)
+    return out[0], np.stack([out[1] - out[2], out[3] - out[4]], axis=2)
+
+
+def _has_pinhole(pixel: Floats, camera: Camera) -> bool:
+    """Whether the lens can be taken out of a pixel (2,)."""
+    try:
+        _pinhole(pixel[None], camera)
+    except EstimationFailure:
+        return False
+    return True
 
 
 def projected(pose: Pose, leds_m: Floats, lift_m2: Floats) -> tuple[Floats, Floats]:
@@ -146,8 +158,30 @@ def projected(pose: Pose, leds_m: Floats, lift_m2: Floats) -> tuple[Floats, Floa
     return seen[:, :2] / depth[:, None], seen[:, 2]
 
 
+def straightened(seen: Observations, pose: Pose) -> Observations:
+    """The same with centroids as if the lens had not bent the spots, by the sizes they have from a pose.
+
+    Each LED is four points, sqrt(2) s from its centre along x and y, which have its s^2. Their images weigh as the
+    lens's light does, z / |X|^4, whatever the lens: what it spreads over more pixels it makes dimmer.
+    """
+    steps = np.sqrt(seen.lift_m2 / 2)[:, None, None] * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
+    points = (seen.leds_m[:, None] + steps - pose.position_m) @ pose.R_cam_world.T
+    before = (points[..., 2] > 0).all(axis=1)
+    points = points[before]
+    weights = points[..., 2] / (points**2).sum(axis=2) ** 2
+    weights /= weights.sum(axis=1, keepdims=True)
+    straight = points[..., :2] / points[..., 2:]
+    K = seen.camera.matrix()
+    bent = lens_pixels(straight.reshape(-1, 2) @ K[:2, :2].T + K[:2, 2], seen.camera).reshape(straight.shape)
+    centroids = pinhole_pixels((weights[..., None] * bent).sum(axis=1), seen.camera)
+    plane = seen.plane.copy()
+    taken_out = (np.column_stack([centroids, np.ones(len(centroids))]) @ np.linalg.inv(K).T)[:, :2]
+    plane[before] -= taken_out - (weights[..., None] * straight).sum(axis=1)
+    return replace(seen, plane=plane)
+
+
 def fit(seen: Observations, start: Pose, loss: Literal["linear", "soft_l1"] = "linear") -> Fit:
-    """The local minimum from `start` on: Levenberg's method with a trust region (SciPy), exact derivatives.
+    """The local minimum from `start` on, by Levenberg's and Marquardt's method (SciPy) with exact derivatives.
 
     Raises EstimationFailure where what is seen does not fix a pose there.
     """
@@ -173,8 +207,16 @@ def fit(seen: Observations, start: Pose, loss: Literal["linear", "soft_l1"] = "l
     x0 = np.concatenate([cv2.Rodrigues(start.R_cam_world)[0].ravel(), start.R_cam_world @ (centre - start.position_m)])
     try:
         with np.errstate(all="ignore"):
+            # MINPACK is several times faster, and knows no robust loss.
             found = least_squares(
-                residuals, x0, slopes, loss=loss, f_scale=ROBUST_SIGMA, x_scale="jac", max_nfev=MOST_EVALUATIONS
+                residuals,
+                x0,
+                slopes,
+                method="lm" if loss == "linear" else "trf",
+                loss=loss,
+                f_scale=ROBUST_SIGMA,
+                x_scale="jac",
+                max_nfev=MOST_EVALUATIONS,
             )
             # Of a robust loss it would not be the information.
             slope = slopes(found.x)

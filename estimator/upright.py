@@ -7,6 +7,7 @@ then leaves gravity out and fits position and orientation to the spots that agre
 orientation (fewer than four, or on one line), it takes the tilt as read.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations
 
@@ -16,8 +17,9 @@ from numpy.typing import NDArray
 from estimator.consensus import consensus
 from estimator.dataset import DeviceFrame
 from estimator.errors import EstimationFailure
+from estimator.identify import Sighting
 from estimator.pipeline import Estimate, Variant
-from estimator.position import on_one_line
+from estimator.position import fix_orientation
 from estimator.rectify import LOWEST_SINE, rotation
 from estimator.reprojection import Observations, Pose, observations, projected
 from estimator.sighting import sightings
@@ -35,7 +37,6 @@ MOST_PAIRS = 120
 GATE_SIGMA = 3.0
 GATE_PX = 3.0
 BEST_PAIRS = 3
-FEWEST_FOR_ORIENTATION = 4
 # World axes to PoseLib's, whose upright axis is y.
 Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
@@ -44,17 +45,22 @@ def up2p(frame: DeviceFrame) -> Estimate:
     """Upright two-point RANSAC and refinement; raises EstimationFailure, also where PoseLib is not installed."""
     if poselib is None:
         raise EstimationFailure("up2p", "PoseLib is not installed (pip install vlcrender[poselib])")
-    seen = observations(frame, sightings(frame))
-    pixel_rad = 1.0 / frame.camera.K[0][0]
-    starts = _from_pairs(seen, pixel_rad)
-    if len(seen.leds_m) >= FEWEST_FOR_ORIENTATION and not on_one_line(seen.leds_m):
+    return fit_sightings(frame, sightings(frame))
+
+
+def fit_sightings(frame: DeviceFrame, sighted: Sequence[Sighting]) -> Estimate:
+    """The same from spots that are identified already; of the frame, its camera and gravity count."""
+    seen = observations(frame, sighted)
+    starts = _from_pairs(seen)
+    if fix_orientation(seen.leds_m):
         seen = replace(seen, tilt_sigma_rad=np.inf)
-    agreed = consensus(seen, pixel_rad, starts[:1], lambda: starts[1:])
+    agreed = consensus(seen, starts[:1], lambda: starts[1:])
     return Estimate(agreed.best.pose.position_m, covariance_m2=agreed.covariance_m2)
 
 
-def _from_pairs(seen: Observations, pixel_rad: float) -> list[Pose]:
+def _from_pairs(seen: Observations) -> list[Pose]:
     """The poses from two spots each that put most of the other spots about right, the best first."""
+    pixel_rad = 1 / seen.camera.K[0][0]
     level, above = _levelled(seen)
     tilt = rotation(*seen.tilt_rad)
     pairs = list(combinations(np.flatnonzero(above).tolist(), 2))
