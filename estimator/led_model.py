@@ -169,5 +169,6 @@ def _blurred(image: Floats, fine: Canvas, canvas: Canvas, lens: LensBlur, kernel
 def _filtered(image: Floats, kernel: Floats) -> Floats:
     """Convolution, nothing beyond the image."""
     # OpenCV correlates: the kernel is turned round.
-    turned = np.ascontiguousarray(kernel[::-1, ::-1])
-    return np.asarray(cv2.filter2D(np.ascontiguousarray(image), -1, turned, borderType=cv2.BORDER_CONSTANT))
+    turned = np.ascontiguousarray(kernel[::-1, ::-1], dtype=np.float32)
+    single = np.ascontiguousarray(image, dtype=np.float32)  # to a millionth of the light, in half the time
+    return np.asarray(cv2.filter2D(single, -1, turned, borderType=cv2.BORDER_CONSTANT), dtype=np.float64)

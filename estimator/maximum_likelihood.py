@@ -43,6 +43,8 @@ BEST_TILT_DEG = 1e-6
 WORSE = 1.01
 # An LED has to stand out of its background by so many standard deviations of its amplitude, or it says nothing.
 LEAST_SIGNAL_TO_NOISE = 5.0
+# LEDs whose chi2 is too great by this share of the worst one's go with it, and the rest are looked at again.
+AS_BAD = 0.25
 # Centroids are good to this, a model's error included: says which other LEDs' places are sure from the start.
 START_PX = 0.05
 FEWEST_FOR_CONSENSUS = 3
@@ -210,13 +212,14 @@ def _covariance(information: Floats) -> Floats:
 
 
 def _unlike(climb: _Climb) -> Mask:
-    """Of the LEDs used, those that do not stand out; or else the one that looks least like itself, if any does not."""
+    """Of the LEDs used, those that do not stand out; or else those that look least like themselves, if any do not.
+
+    A wrong LED draws the pose to itself, so that right ones near it misfit too, but by far less.
+    """
     if climb.faint.any():
         return climb.faint
-    worst = int(np.argmax(np.where(climb.used, climb.excess, -np.inf)))
-    bad = np.zeros(len(climb.used), dtype=bool)
-    bad[worst] = climb.used[worst] and climb.excess[worst] > 0
-    return bad
+    excess = np.where(climb.used, climb.excess, 0.0)
+    return np.asarray((excess > 0) & (excess >= AS_BAD * excess.max()))
 
 
 ML = Variant(
