@@ -44,17 +44,21 @@ def gravity_fit(frame: DeviceFrame) -> Estimate:
 
 def fit_sightings(frame: DeviceFrame, sighted: Sequence[Sighting]) -> Estimate:
     """The same from spots that are identified already; of the frame, its camera and gravity count."""
-    seen = observations(frame, sighted)
+    agreed = agreement(observations(frame, sighted))
+    return Estimate(agreed.best.pose.position_m, covariance_m2=agreed.covariance_m2, ambiguous=ambiguous(agreed))
+
+
+def agreement(seen: Observations) -> Consensus:
+    """The pose, and what of spots and gravity it rests on; raises EstimationFailure."""
     starts = _starts(seen)
     try:
-        agreed = consensus(seen, starts, lambda: _from_triples(seen))
+        return consensus(seen, starts, lambda: _from_triples(seen))
     except EstimationFailure:
         if not fix_orientation(seen.leds_m):
             raise
         # The reading itself may be what is wrong.
         without = replace(seen, tilt_sigma_rad=np.inf)
-        agreed = consensus(without, starts, lambda: _from_triples(seen))
-    return Estimate(agreed.best.pose.position_m, covariance_m2=agreed.covariance_m2, ambiguous=ambiguous(agreed))
+        return consensus(without, starts, lambda: _from_triples(seen))
 
 
 def ambiguous(agreed: Consensus) -> bool:

@@ -4,6 +4,7 @@ from estimator.errors import InputError
 from estimator.gravity_fit import GRAVITY_FIT
 from estimator.huynh2016 import HUYNH2016, HUYNH2016_AS_PRINTED, huynh2016_with
 from estimator.kim import KIM
+from estimator.maximum_likelihood import ML
 from estimator.nakazawa2013 import NAKAZAWA2013
 from estimator.pipeline import Variant
 from estimator.pnp import IPPE, PNP, SQPNP
@@ -25,6 +26,7 @@ VARIANTS = {
         SQPNP,
         UP2P,
         GRAVITY_FIT,
+        ML,
     )
 }
 STAGED = {"huynh2016": huynh2016_with}

@@ -37,7 +37,7 @@ LED_E = 4000.0
 # 130 px or 130 mm off at least, and moves what believes it by decimetres.
 RIGHT_M = 0.02
 
-ROBUST = {"gravity-fit", "up2p"}
+ROBUST = {"gravity-fit", "ml", "up2p"}
 
 
 @dataclass(frozen=True)
