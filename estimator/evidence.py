@@ -30,6 +30,8 @@ RING_PX = 8
 FLAT = 1e-3
 # An LED takes part once the pose says to this where it is, one standard deviation.
 CERTAIN_PX = 0.5
+# Of the pixels inside an LED so many have to be known, that is read out and not full.
+LEAST_KNOWN = 0.5
 # A square's corner is 1.4 half sides away; a slanted lens's scale varies over a face.
 FARTHEST = 3.0
 
@@ -77,8 +79,9 @@ class Evidence:
 def gather(frame: DeviceFrame, pose: TiltedPose, covariance: Floats) -> Evidence:
     """What a frame shows of the LEDs of the map that are seen from a pose known to a covariance (6, 6).
 
-    LEDs whose place is not sure to CERTAIN_PX are left out, and so are full pixels, and pixels that another LED of the
-    map lights too. Raises EstimationFailure where nothing is left.
+    LEDs whose place is not sure to CERTAIN_PX are left out, and so are full pixels, pixels that another LED of the map
+    lights too, and LEDs whose inside is mostly full: where an edge is would hang on how bright they are, which nobody
+    saw. Raises EstimationFailure where nothing is left.
     """
     leds, seen, more = _in_view(frame, pose, covariance)
     lens = LensBlur(frame.camera, seen.depth_m)
@@ -92,6 +95,9 @@ def gather(frame: DeviceFrame, pose: TiltedPose, covariance: Floats) -> Evidence
     led_of_group: list[int] = []
     for k in range(len(leds)):
         electrons, known = _readings(frame, canvas, k)
+        inside = shares[k] > 1 - FLAT
+        if inside.any() and not known[inside].mean() > LEAST_KNOWN:
+            continue
         for other in _neighbours(canvas, k):
             here, there = _common(canvas, k, other)
             known[here] &= ~near[other][1][there]
@@ -115,7 +121,7 @@ def gather(frame: DeviceFrame, pose: TiltedPose, covariance: Floats) -> Evidence
                     flats.append((len(led_of_group), float(flat.sum()), total_e, total))
             led_of_group.append(k)
     if not edges:
-        raise EstimationFailure("fit", "no LED of the map is in view")
+        raise EstimationFailure("fit", "no LED of the map is in view and not full")
     cells, weights, electrons = (np.concatenate(column) for column in zip(*edges, strict=True))
     counts = np.array([len(edge[0]) for edge in edges])
     flat_group, flat_pixels, flat_electrons, flat_light = np.array(flats).reshape(-1, 4).T
