@@ -97,7 +97,7 @@ def make_frame(job: Job, frame: int) -> Record:
             {"led": p.led_id, "u_px": p.center_px[0], "v_px": p.center_px[1], "visible_fraction": p.visible_fraction}
             for p in sorted(view.patches, key=lambda p: p.led_id)
         ],
-        "bound_m2": _bound_m2(recipe, renderer, mounted, main, exposure_s, expected, device["spots"]),
+        "bound_m2": _bound_m2(recipe, renderer, mounted, main, exposure_s, expected),
     }
     return {"frame": frame, "device": device, "truth": truth}
 
@@ -109,7 +109,6 @@ def _bound_m2(
     main: Pose,
     exposure_s: float,
     expected: Sequence[tuple[Window, Image]],
-    spots: Sequence[dict[str, Any]],
 ) -> list[float] | None:
     """The frame's Cramér-Rao bound, row by row; None where it is not asked for or nothing is determined."""
     if not recipe.bound:
@@ -121,7 +120,6 @@ def _bound_m2(
         lambda pose: renderer.led_patches(mounted.camera, mounted.pose(pose), recipe.windows, mounted.pose(main)),
         exposure_s,
         [(window, variance_e2(recipe.sensor, image, exposure_s)) for window, image in expected],
-        [spot["led"] for spot in spots],
         float(np.median(np.linalg.norm(renderer.scene.leds.centers_m - position, axis=1))),
         recipe.accelerometer.error_deg,
         recipe.windows is not None and recipe.windows.overscan,
