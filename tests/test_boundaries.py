@@ -20,7 +20,7 @@ LIBRARY_ROOMS = {
 }
 BACKEND_ROOMS = {
     *("backend", "background", "exposure", "furniture", "irradiance", "philox", "poisson"),
-    *("raycast", "reference", "render"),
+    *("obstacles", "raycast", "reference", "render"),
 }
 """Modules of vlcrender that may use Mitsuba, through `backend`."""
 

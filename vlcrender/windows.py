@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from vlcrender.camera import Camera
@@ -49,6 +50,12 @@ class Window:
     def pixels(self) -> int:
         """Number of pixels."""
         return self.rows * self.columns
+
+    def centers_px(self) -> NDArray[np.float64]:
+        """(u, v) of the pixels' centres, (rows, columns, 2)."""
+        u = np.arange(self.column, self.end_column) + 0.5
+        v = np.arange(self.row, self.end_row) + 0.5
+        return np.stack(np.meshgrid(u, v), axis=-1)
 
     def grown(self, by_px: int) -> "Window":
         """The window with `by_px` pixels more on each side."""
