@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vlcrender.camera import Camera, Pose, rays_world, transform
+from vlcrender.camera import Camera, Pose, ray_world
 from vlcrender.glass import pane_reflectance
 from vlcrender.led_blur import radius_px
 from vlcrender.led_image import image_of_led, leds_that_may_be_seen
@@ -71,13 +71,15 @@ def false_images(
         window = Window(image.row, image.column, *image.coverage.shape)
         if not any(frame.overlaps(window) for frame in frames):
             continue
-        height_m = float(leds.centers_m[i, 2])
-        clear = obstacles.clear_share(camera, pose, height_m, window, image.coverage > 0, (number, mirrored))
-        centers = window.centers_px()
-        rays = rays_world(camera, mirrored, centers)
-        cosine = np.abs(transform(pane.normal[None], rays)[..., 0]) / np.sqrt((rays**2).sum(axis=-1))
-        weight = relative_illumination(camera, centers[..., 0], centers[..., 1])
-        weight = weight * pane_reflectance(cosine, pane.refractive_index, np.sqrt)
+        lit = image.coverage > 0
+        (clear,) = obstacles.clear_shares(
+            camera, pose, [(float(leds.centers_m[i, 2]), window, lit)], (number, mirrored)
+        )
+        u, v = window.centers_px()
+        x, y, z = ray_world(camera, mirrored, u, v)
+        east, north, up = pane.normal.tolist()
+        cosine = np.abs(x * east + y * north + z * up) / np.sqrt(x * x + y * y + z * z)
+        weight = relative_illumination(camera, u, v) * pane_reflectance(cosine, pane.refractive_index, np.sqrt)
         pattern = luminance_pattern(leds, i, camera, mirrored, window)
         light = e_per_s_per_cd_m2 * leds.luminances_cd_m2[i] * image.coverage * clear * weight * pattern
         for frame in frames:

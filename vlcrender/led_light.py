@@ -5,13 +5,14 @@ diffuser it is what it lights of the sheet.
 """
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vlcrender.camera import Camera, Pose, rays_world
-from vlcrender.led_image import image_of_led, leds_that_may_be_seen
+from vlcrender.camera import Camera, Pose, ray_world
+from vlcrender.led_image import image_of_led, leds_that_may_be_seen, places_on_plane
 from vlcrender.led_shape import Disc, Rectangle
 from vlcrender.lens import relative_illumination
 from vlcrender.obstacles import Obstacles
@@ -48,7 +49,7 @@ def led_lights(
     """By index, each LED that lights a pixel of the view, or by a blur of up to `spread_px` may."""
     overscan = windows is not None and windows.overscan
     reach = _overscan_px(camera) if overscan else spread_px
-    lights = {}
+    images = []
     for i in leds_that_may_be_seen(camera, pose, leds.centers_m, leds.reaches_m, reach).tolist():
         image = image_of_led(camera, pose, *face_of_led(leds, i), reach)
         if image is None:
@@ -56,15 +57,20 @@ def led_lights(
         window = Window(image.row, image.column, *image.coverage.shape)
         if overscan and not Window.of_sensor(camera).grown(reach - 1).holds(window):
             continue  # an LED cut by the widest overscan is left out
-        coverage = image.coverage
-        seen = 1.0
-        if obstacles.there_are_some:
-            clear = obstacles.clear_share(camera, pose, float(leds.centers_m[i, 2]), window, coverage > 0)
-            seen = float((coverage * clear).sum() / coverage.sum())
-            coverage = coverage * clear
+        images.append((i, window, image))
+    clear: Sequence[Array | float] = [1.0] * len(images)
+    if obstacles.there_are_some:
+        asked = [(float(leds.centers_m[i, 2]), window, image.coverage > 0) for i, window, image in images]
+        clear = obstacles.clear_shares(camera, pose, asked)
+    lights = {}
+    for (i, window, image), share in zip(images, clear, strict=True):
+        coverage, seen = image.coverage, 1.0
+        if not isinstance(share, float):
+            coverage = image.coverage * share
+            seen = float(coverage.sum() / image.coverage.sum())
         if seen > 0:
             imaged = 1.0 if overscan else image.visible_fraction
-            weight = relative_illumination(camera, *np.moveaxis(window.centers_px(), -1, 0))
+            weight = relative_illumination(camera, *window.centers_px())
             pattern = luminance_pattern(leds, i, camera, pose, window)
             lights[i] = LedLight(window, coverage, weight, pattern, seen * image.visible_fraction, seen * imaged)
     return lights
@@ -87,25 +93,24 @@ def luminance_pattern(leds: Leds, i: int, camera: Camera, pose: Pose, window: Wi
     pixel sees more than a part FINE of the LED's distance behind it.
     """
     sheet, order = leds.sheets[i], float(leds.orders[i])
+    u, v = window.centers_px()
     if sheet is not None:
-        height = float(leds.centers_m[i, 2] - pose.position_m[2])
+        origin = np.array([0.0, 0.0, leds.centers_m[i, 2]])
 
-        def at(off: tuple[float, float]) -> tuple[Array, Array]:
-            rays = rays_world(camera, pose, window.centers_px() + np.array(off))
-            reach = height / np.maximum(rays[..., 2], 1e-9)
-            return pose.position_m[0] + reach * rays[..., 0], pose.position_m[1] + reach * rays[..., 1]
+        def at(off_u: float, off_v: float) -> tuple[Array, Array]:
+            return places_on_plane(camera, pose, origin, u + off_u, v + off_v)
 
-        middle = at((0.0, 0.0))
+        middle = at(0.0, 0.0)
         steps = [np.abs(np.diff(place, axis=axis)).max(initial=0.0) for place in middle for axis in (0, 1)]
         if max(steps) < FINE * sheet.distance_m and min(window.rows, window.columns) > 1:
             return sheet.luminance(*middle)
         nodes = list(itertools.product((-GAUSS_PX, GAUSS_PX), repeat=2))
-        mean: Array = sum((sheet.luminance(*at(off)) for off in nodes), np.zeros(middle[0].shape)) / len(nodes)
+        mean: Array = sum((sheet.luminance(*at(*off)) for off in nodes), np.zeros(middle[0].shape)) / len(nodes)
         return mean
     if abs(order - 1.0) < 1e-12:
         return 1.0
-    rays = rays_world(camera, pose, window.centers_px())
-    cosine = np.maximum(rays[..., 2] / np.sqrt((rays**2).sum(axis=-1)), 0.0)
+    x, y, z = ray_world(camera, pose, u, v)
+    cosine = np.maximum(z / np.sqrt(x * x + y * y + z * z), 0.0)
     pattern: Array = cosine ** (order - 1.0)
     return pattern
 
