@@ -5,8 +5,9 @@ diffuser it is what it lights of the sheet.
 """
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,9 @@ OVERSCAN_DEG = 75.0
 GAUSS_PX = 0.5 / np.sqrt(3.0)
 FINE = 0.02
 """Of a pixel that sees less the middle is the mean, to 2 (m + 3) * 0.02^2 / 24: 3e-4 for an order m of 5."""
+GRID_POINTS = 17
+"""Across a window and down, where it is asked how much a pixel sees."""
+PIXELS_AT_ONCE = 50_000
 
 Array = NDArray[np.float64]
 
@@ -70,7 +74,7 @@ def led_lights(
             seen = float(coverage.sum() / image.coverage.sum())
         if seen > 0:
             imaged = 1.0 if overscan else image.visible_fraction
-            weight = relative_illumination(camera, *window.centers_px())
+            weight = _in_bands(window, partial(relative_illumination, camera))
             pattern = luminance_pattern(leds, i, camera, pose, window)
             lights[i] = LedLight(window, coverage, weight, pattern, seen * image.visible_fraction, seen * imaged)
     return lights
@@ -93,26 +97,45 @@ def luminance_pattern(leds: Leds, i: int, camera: Camera, pose: Pose, window: Wi
     pixel sees more than a part FINE of the LED's distance behind it.
     """
     sheet, order = leds.sheets[i], float(leds.orders[i])
-    u, v = window.centers_px()
     if sheet is not None:
-        origin = np.array([0.0, 0.0, leds.centers_m[i, 2]])
-
-        def at(off_u: float, off_v: float) -> tuple[Array, Array]:
-            return places_on_plane(camera, pose, origin, u + off_u, v + off_v)
-
-        middle = at(0.0, 0.0)
-        steps = [np.abs(np.diff(place, axis=axis)).max(initial=0.0) for place in middle for axis in (0, 1)]
-        if max(steps) < FINE * sheet.distance_m and min(window.rows, window.columns) > 1:
-            return sheet.luminance(*middle)
+        at = partial(places_on_plane, camera, pose, np.array([0.0, 0.0, leds.centers_m[i, 2]]))
+        if _widest_step_m(window, at) < FINE * sheet.distance_m:
+            return _in_bands(window, lambda u, v: sheet.luminance(*at(u, v)))
         nodes = list(itertools.product((-GAUSS_PX, GAUSS_PX), repeat=2))
-        mean: Array = sum((sheet.luminance(*at(*off)) for off in nodes), np.zeros(middle[0].shape)) / len(nodes)
-        return mean
+
+        def mean(u: Array, v: Array) -> Array:
+            total: Array = sum((sheet.luminance(*at(u + a, v + b)) for a, b in nodes), np.zeros(()))
+            return total / len(nodes)
+
+        return _in_bands(window, mean)
     if abs(order - 1.0) < 1e-12:
         return 1.0
-    x, y, z = ray_world(camera, pose, u, v)
+    x, y, z = ray_world(camera, pose, *window.centers_px())
     cosine = np.maximum(z / np.sqrt(x * x + y * y + z * z), 0.0)
     pattern: Array = cosine ** (order - 1.0)
     return pattern
+
+
+def _widest_step_m(window: Window, at: Callable[[Array, Array], tuple[Array, Array]]) -> float:
+    """How far the place on a plane, along x or y, moves at most over a pixel: on a grid, since it changes slowly."""
+    u = np.linspace(window.column + 0.5, window.end_column - 0.5, GRID_POINTS)[None, :]
+    v = np.linspace(window.row + 0.5, window.end_row - 0.5, GRID_POINTS)[:, None]
+    sides = (at(u - 0.5, v), at(u + 0.5, v)), (at(u, v - 0.5), at(u, v + 0.5))
+    return max(float(np.abs(b - a).max()) for before, after in sides for a, b in zip(before, after, strict=True))
+
+
+def _in_bands(window: Window, of: Callable[[Array, Array], Array]) -> Array:
+    """A function of the pixel centres u (1, columns) and v (rows, 1), (rows, columns).
+
+    In bands of rows, whose temporary arrays stay in the processor's cache.
+    """
+    u, v = window.centers_px()
+    image = np.empty((window.rows, window.columns))
+    rows = max(1, PIXELS_AT_ONCE // window.columns)
+    for start in range(0, window.rows, rows):
+        band = slice(start, start + rows)
+        image[band] = of(u, v[band])
+    return image
 
 
 def _overscan_px(camera: Camera) -> int:
