@@ -19,8 +19,8 @@ LIBRARY_ROOMS = {
     "PIL": {"vlcrender/texture.py", "vlcrender/tone.py"},
 }
 BACKEND_ROOMS = {
-    *("backend", "background", "exposure", "furniture", "irradiance", "philox", "poisson"),
-    *("raycast", "reference", "render"),
+    *("backend", "background", "exposure", "furniture", "irradiance", "mitsuba_room"),
+    *("obstacles", "philox", "poisson", "raycast", "reference", "render"),
 }
 """Modules of vlcrender that may use Mitsuba, through `backend`."""
 

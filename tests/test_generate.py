@@ -14,10 +14,10 @@ import pyarrow.parquet as pq
 import pytest
 from conftest import ROOT, SMALL
 
-from vlcrender.dataset import problems_of
 from vlcrender.errors import InputError
 from vlcrender.generate import generate
 from vlcrender.recipe import Plan, load_plan
+from vlcrender.verify import problems_of
 
 RECIPE = ROOT / "datasets/quickstart.toml"
 

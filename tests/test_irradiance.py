@@ -9,7 +9,8 @@ from conftest import ROOT
 
 from vlcrender.geometry import Mesh, join, mesh_of_surfaces
 from vlcrender.glass import pane_reflectance
-from vlcrender.irradiance import bake, led_illuminance_lux, mitsuba_scene, path_traced_lux, room_mesh
+from vlcrender.irradiance import bake, led_illuminance_lux, path_traced_lux, room_mesh
+from vlcrender.mitsuba_room import mitsuba_scene
 from vlcrender.scene import Leds, Scene, build_scene, load_scene
 from vlcrender.scene_settings import SceneSettings
 from vlcrender.settings import check, read_toml

@@ -9,10 +9,10 @@ import pytest
 from conftest import ROOT, SMALL
 from pydantic import TypeAdapter
 
-from vlcrender.dataset import problems_of
 from vlcrender.generate import generate
 from vlcrender.metering import Metering, NoiseLevelMetering, PeakMetering
 from vlcrender.recipe import load_plan
+from vlcrender.verify import problems_of
 from vlcrender.view import LedPatch, View, ViewPart
 from vlcrender.windows import Window
 

@@ -14,10 +14,10 @@ from estimator.batch import estimate_dataset
 from estimator.dataset import read_dataset
 from estimator.variants import VARIANTS
 from vlcrender.camera import Pose
-from vlcrender.dataset import problems_of
 from vlcrender.generate import generate
 from vlcrender.recipe import load_plan
 from vlcrender.rig import pose_of
+from vlcrender.verify import problems_of
 
 angles = st.floats(-179, 179)
 

@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 from vlcrender.backend import dr
 from vlcrender.background import _edges
 from vlcrender.camera import Camera, Pose
-from vlcrender.dataset import problems_of
 from vlcrender.errors import InputError
 from vlcrender.generate import generate
 from vlcrender.recipe import load_plan
 from vlcrender.render import Renderer
 from vlcrender.scene import Scene
+from vlcrender.verify import problems_of
 from vlcrender.windows import LedWindows, Window, led_windows
 
 LEDS = LedWindows(kind="leds")

@@ -13,10 +13,11 @@ from rich.table import Table
 
 from vlcrender import __version__
 from vlcrender.camera import Camera
-from vlcrender.dataset import problems_of, read_dataset_file
+from vlcrender.dataset import read_dataset_file
 from vlcrender.errors import InputError
 from vlcrender.recipe import ScaleMode, load_plan
 from vlcrender.scene import load_scene
+from vlcrender.verify import problems_of
 from vlcrender.visibility import ENOUGH_LEDS, level_coverage, tilted_coverage
 
 app = App(

@@ -20,7 +20,6 @@ from vlcrender.dataset import (
     SensorEntry,
     camera_entry,
     led_map,
-    problems_of,
     sha256_of,
     write_json,
     write_table,
@@ -30,6 +29,7 @@ from vlcrender.frame import EXPECTED, FRAMES, PREVIEWS, PROCESSED, Job, Record, 
 from vlcrender.irradiance import bake, room_mesh
 from vlcrender.recipe import Plan, Recipe
 from vlcrender.render import check_inside, share_cores
+from vlcrender.verify import problems_of
 
 
 def generate(

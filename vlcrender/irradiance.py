@@ -12,7 +12,7 @@ a hash of the scene and of all that went into it.
 
 import hashlib
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from vlcrender.backend import dr, exact_math, mi
 from vlcrender.furniture import furniture_meshes
 from vlcrender.geometry import Mesh, join, mesh_of_surfaces
 from vlcrender.glass import pane_reflectance
+from vlcrender.mitsuba_room import mitsuba_scene
 from vlcrender.scene import Scene
 from vlcrender.sources import Sources, point_sources
 from vlcrender.surfaces import Pane
@@ -38,8 +39,6 @@ MAX_DEPTH = 64
 """Bounces followed; roulette ends nearly all paths long before."""
 ROULETTE_DEPTH = 4
 RAYS_AT_ONCE = 4_000_000
-BEHIND_M = 1e-3
-PANE_FACES = np.array([[0, 1, 2], [0, 2, 3]])
 OFFSET_M = 1e-4
 """Rays start this far off their surface."""
 
@@ -224,57 +223,6 @@ def _follow(glowing: Any, sampler: Any, ray: Any) -> Any:
 
 def _points(points_m: Array) -> "mi.Point3f":
     return mi.Point3f(*points_m.T.astype(np.float32))
-
-
-def room_shape(mesh: Mesh, glow_cd_m2: Array) -> "mi.Mesh":
-    """The room's mesh for Mitsuba, diffuse, with albedo and glow at its corners."""
-    albedo = {"type": "mesh_attribute", "name": "vertex_albedo"}
-    bsdf: dict[str, object] = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": albedo}}
-    shape = _shape("room", mesh.vertices_m, mesh.faces, bsdf, glow_cd_m2)
-    shape.add_attribute("vertex_albedo", 1, mesh.albedo.astype(np.float32).tolist())
-    return shape
-
-
-def pane_shape(pane: Pane) -> "mi.Mesh":
-    """A window pane for Mitsuba: thin glass by Fresnel's law."""
-    return _shape(pane.name, pane.corners_m, PANE_FACES, pane_bsdf(pane), np.zeros(4))
-
-
-def outside_shape(pane: Pane) -> "mi.Mesh":
-    """What is seen through a pane: black where it does not glow, just behind it and a little larger."""
-    middle = pane.corners_m.mean(axis=0)
-    corners = middle + (1 + BEHIND_M) * (pane.corners_m - middle) - BEHIND_M * pane.normal
-    black = {"type": "diffuse", "reflectance": 0.0}
-    return _shape(f"outside {pane.name}", corners, PANE_FACES, black, np.full(4, pane.luminance_cd_m2))
-
-
-def pane_bsdf(pane: Pane) -> dict[str, object]:
-    """Thin glass: mirrors by Fresnel's law at both faces and lets the rest through."""
-    return {"type": "thindielectric", "int_ior": pane.refractive_index, "ext_ior": 1.0}
-
-
-def _shape(
-    name: str, vertices_m: Array, faces: NDArray[np.int64], bsdf: Mapping[str, object], glow_cd_m2: Array
-) -> "mi.Mesh":
-    properties = mi.Properties()
-    properties["bsdf"] = mi.load_dict(dict(bsdf))
-    shape = mi.Mesh(name, len(vertices_m), len(faces), props=properties)
-    parameters = mi.traverse(shape)
-    parameters["vertex_positions"] = vertices_m.astype(np.float32).ravel()
-    parameters["faces"] = faces.astype(np.uint32).ravel()
-    parameters.update()
-    shape.add_attribute("vertex_glow", 1, glow_cd_m2.astype(np.float32).tolist())
-    return shape
-
-
-def mitsuba_scene(mesh: Mesh, glow_cd_m2: Array, panes: tuple[Pane, ...], panes_glow: bool) -> Any:
-    """Mesh and panes as a Mitsuba scene whose every shape has an attribute `vertex_glow`, in cd/m2."""
-    shapes = {"room": room_shape(mesh, glow_cd_m2)}
-    for i, pane in enumerate(panes):
-        shapes[f"pane{i}"] = pane_shape(pane)
-        if panes_glow:
-            shapes[f"outside{i}"] = outside_shape(pane)
-    return mi.load_dict({"type": "scene", **shapes}, optimize=False)
 
 
 def _compute(scene: Scene, mesh: Mesh, progress: Progress) -> tuple[Array, Array, Array]:

@@ -18,8 +18,8 @@ from vlcrender.camera import (
     Pose,
     image_of_points,
     pixel_on_sensor,
-    ray_of_pixel,
     ray_of_sensor,
+    ray_world,
     transform,
 )
 from vlcrender.distortion import fold_radius2
@@ -165,7 +165,7 @@ def _coverage(camera: Camera, pose: Pose, center_m: Array, shape: Disc | Rectang
 def _coverage_of_band(
     camera: Camera, pose: Pose, center_m: Array, shape: Disc | Rectangle, u: Array, v: Array
 ) -> Array:
-    x, y = _on_plane(camera, pose, center_m, u, v)
+    x, y = places_on_plane(camera, pose, center_m, u[None, :], v[:, None])
     whole, mixed = shape.whole_and_mixed(x, y)
     coverage = whole.astype(float)
     row, column = np.nonzero(mixed)
@@ -176,10 +176,12 @@ def _coverage_of_band(
     return coverage
 
 
-def _on_plane(camera: Camera, pose: Pose, center_m: Array, u: Array, v: Array) -> tuple[Array, Array]:
-    """Where the rays of the pixel positions u (columns,) by v (rows,) meet the LED's plane, from its centre."""
-    ray = ray_of_pixel(camera, u[None, :], v[:, None])
-    x, y, z = (ray[0] * r[0] + ray[1] * r[1] + ray[2] * r[2] for r in pose.rotation.T)
+def places_on_plane(camera: Camera, pose: Pose, center_m: Array, u: Array, v: Array) -> tuple[Array, Array]:
+    """Where rays of pixel positions u and v, which broadcast, meet an LED's plane: (x, y) in metres from its centre.
+
+    center_m: (3,), world. Rays that do not go up meet it beyond BEYOND_HORIZON_M.
+    """
+    x, y, z = ray_world(camera, pose, u, v)
     above = z > 1e-9
     everywhere = bool(above.all())
     height = center_m[2] - pose.position_m[2]

@@ -1,6 +1,7 @@
 """Shapes of LED faces in their own plane, and the exact area each shares with a polygon."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,14 +78,20 @@ class Rectangle:
 
     def whole_and_mixed(self, x: Array, y: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Which cells of a grid of corners (rows + 1, columns + 1) are inside whole, which others may be in part."""
-        own = self._turned(np.stack([x, y], axis=-1), -1)
+        if self.yaw_deg != 0:
+            x, y = np.moveaxis(self._turned(np.stack([x, y], axis=-1), -1), -1, 0)
         whole = np.ones((x.shape[0] - 1, x.shape[1] - 1), dtype=bool)
         mixed = whole.copy()
-        for axis, half in enumerate(self.size_m):
-            low, high = (_corner_extreme(own[..., axis], of) for of in (np.minimum, np.maximum))
-            whole &= (low >= -half / 2) & (high <= half / 2)
-            mixed &= (high > -half / 2) & (low < half / 2) & (high - low < BEYOND_HORIZON_M / 2)
-        return whole, mixed & ~whole
+        for own, size in zip((x, y), self.size_m, strict=True):
+            whole &= ~_corner_extreme((own < -size / 2) | (own > size / 2), np.logical_or)
+            for beyond in (own <= -size / 2, own >= size / 2):
+                mixed &= ~_corner_extreme(beyond, np.logical_and)
+        mixed &= ~whole
+        row, column = np.nonzero(mixed)
+        for own in (x, y):  # no cell is as large as that, but where a corner is beyond the horizon
+            corners = np.stack([own[row + i, column + j] for i in (0, 1) for j in (0, 1)])
+            mixed[row, column] &= np.ptp(corners, axis=0) < BEYOND_HORIZON_M / 2
+        return whole, mixed
 
     def shared_area(self, quads: Array) -> Array:
         """Area common to the face and each polygon (n, corners, 2) in its plane, (n,)."""
@@ -167,6 +174,7 @@ def _polygon_area(corners: Array) -> float:
     return abs(float(np.dot(u, np.roll(v, -1)) - np.dot(v, np.roll(u, -1)))) / 2
 
 
-def _corner_extreme(values: Array, of: np.ufunc) -> Array:
-    extreme: Array = of(of(values[:-1, :-1], values[:-1, 1:]), of(values[1:, :-1], values[1:, 1:]))
+def _corner_extreme(values: NDArray[Any], of: np.ufunc) -> NDArray[Any]:
+    """Of each cell's four corners, on a grid of corners (rows + 1, columns + 1)."""
+    extreme: NDArray[Any] = of(of(values[:-1, :-1], values[:-1, 1:]), of(values[1:, :-1], values[1:, 1:]))
     return extreme

@@ -16,7 +16,7 @@ from vlcrender.backend import dr, mi
 from vlcrender.camera import Camera, Pose, mitsuba_to_world, ray_of_pixel
 from vlcrender.errors import InputError
 from vlcrender.furniture import furniture_meshes
-from vlcrender.irradiance import BEHIND_M, pane_bsdf, room_shape
+from vlcrender.mitsuba_room import BEHIND_M, pane_bsdf, room_shape
 from vlcrender.scene import Scene
 from vlcrender.surfaces import TOUCH_M, Surface
 from vlcrender.texture import Texture

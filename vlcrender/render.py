@@ -1,71 +1,38 @@
 """The expected image of a view: electrons a second in every pixel, without noise.
 
-The room behind comes from `background`. LEDs lie on top, each a window with its exact pixel coverage (`led_image`). An
+The room behind comes from `background`. LEDs lie on top, each a window with its exact pixel coverage (`led_light`). An
 LED's face hides what is behind it and reflects the room's light: that is part of the background; its own light is a
 patch of its own, so that image = background + sum over LEDs of gain * patch, for any exposure and modulation. Of an LED
 behind a diffuser the patch is what it lights of the sheet, which is a surface of the room like others. An LED seen by
-way of a window pane is a patch too: the image that the camera's mirror image has of it. At last the lens spreads each
-of them by what it does at their depth.
+way of a window pane is a patch too (`false_image`). At last the lens spreads each of them by what it does at their
+depth.
 """
 
-import itertools
 import os
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vlcrender.backend import dr, exact_math, mi
-from vlcrender.background import Background, differs_from_neighbour, sub_pixels
-from vlcrender.camera import Camera, Pose, project, rays_world
+from vlcrender.backend import dr
+from vlcrender.background import Background
+from vlcrender.camera import Camera, Pose, project
 from vlcrender.errors import InputError
-from vlcrender.glass import pane_reflectance
+from vlcrender.false_image import blurred, false_images
 from vlcrender.irradiance import Light, bake
-from vlcrender.led_image import image_of_led, leds_that_may_be_seen
-from vlcrender.led_shape import Disc, Rectangle
-from vlcrender.lens import blur, blur_kernel, relative_illumination
+from vlcrender.led_blur import LedBlur, led_blur, radius_px
+from vlcrender.led_light import LedLight, led_lights
+from vlcrender.lens import blur
+from vlcrender.obstacles import Obstacles
 from vlcrender.photometry import Detector, Silicon, electron_rate_per_cd_m2
-from vlcrender.scene import Leds, Scene
+from vlcrender.scene import Scene
 from vlcrender.view import Image, LedPatch, Reflection, View, ViewPart
 from vlcrender.windows import LedWindows, Window, led_windows
 
-OVERSCAN_DEG = 75.0
-"""How far off the optical axis, across or down, windows may lie that reach beyond the sensor."""
 MOST_PIXELS = 16
 """How many times the sensor's pixels windows may hold."""
-SAME_PLACE = 1e-4
-"""Relative difference of two distances that are the same but for float32."""
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class MirroredPose(Pose):
-    """The camera's mirror image in a pane: what it sees directly is what the camera sees by way of the pane."""
-
-    mirror: tuple[tuple[float, ...], ...] = ()
-
-    @property
-    def rotation(self) -> Array:
-        """R_cam_world after the mirror: it takes the mirrored world to the camera."""
-        product: Array = super().rotation @ np.array(self.mirror)
-        return product
-
-
-@dataclass(frozen=True)
-class _Lit:
-    """An LED's image at one pose: coverage, and what a luminance is worth in each pixel of the window.
-
-    `pattern` is the luminance in each pixel over the LED's own along its normal.
-    """
-
-    window: Window
-    coverage: Array
-    weight: Array
-    pattern: Array | float
-    visible_fraction: float
-    imaged_fraction: float
 
 
 class Renderer:
@@ -77,15 +44,7 @@ class Renderer:
         self.detector = detector or Silicon()
         self._light = light or bake(scene)
         self._background = Background(scene, self._light)
-        self._faces = [_face(scene.leds, i) for i in range(len(scene.leds))]
-        panels = scene.settings.panels
-        undersides_m = [grid.first_center_m[2] for grid in panels]
-        # What may stand between camera and LED: furniture, frames, and panels that hang lower than an LED.
-        self._may_hide = (
-            bool(scene.settings.furniture)
-            or any(grid.frame is not None for grid in panels)
-            or min(undersides_m, default=np.inf) < scene.leds.centers_m[:, 2].max() * (1 - SAME_PLACE)
-        )
+        self._obstacles = Obstacles(scene, self._background)
 
     def view(
         self, camera: Camera, pose: Pose, windows: LedWindows | None = None, during: Sequence[Pose] | None = None
@@ -99,14 +58,13 @@ class Renderer:
         places = (pose,) if during is None else tuple(during)
         for place in places:
             check_inside(self.scene, place)
-        kernels = self._kernels(camera, pose)
-        spread = _spread(kernels)
-        images = [dict(self._led_images(camera, place, windows, spread)) for place in places]
-        lit = _lit_windows(camera, images, kernels, windows)
+        leds, blurs = self.scene.leds, led_blur(self.scene.leds, camera, pose)
+        lights = [led_lights(leds, self._obstacles, camera, place, windows, blurs.spread_px) for place in places]
+        lit = _lit_windows(camera, lights, blurs, windows)
         frames = (Window.of_sensor(camera),) if windows is None else led_windows(lit.values(), camera, windows)
         _check_size(frames, camera)
-        backgrounds, reflections = self._rooms(camera, places, frames, images, spread, kernels)
-        patches = self._patches(camera, pose, images, lit, kernels)
+        backgrounds, reflections = self._rooms(camera, places, frames, lights, blurs)
+        patches = self._patches(camera, pose, lights, lit, blurs)
         return View(
             tuple(
                 ViewPart(
@@ -126,9 +84,9 @@ class Renderer:
 
         Blurred as at the pose `blurred_at` where given: kernels change in steps of depth, which differences would see.
         """
-        kernels = self._kernels(camera, blurred_at or pose)
-        images = [dict(self._led_images(camera, pose, windows, _spread(kernels)))]
-        return self._patches(camera, pose, images, _lit_windows(camera, images, kernels, windows), kernels, np.float64)
+        leds, blurs = self.scene.leds, led_blur(self.scene.leds, camera, blurred_at or pose)
+        lights = [led_lights(leds, self._obstacles, camera, pose, windows, blurs.spread_px)]
+        return self._patches(camera, pose, lights, _lit_windows(camera, lights, blurs, windows), blurs, np.float64)
 
     def background_cd_m2(self, camera: Camera, pose: Pose) -> Image:
         """Luminance of the room times relative illumination, mean over each pixel, (height, width); sharp, no LEDs."""
@@ -144,98 +102,82 @@ class Renderer:
         )
         return lamp, other
 
-    def _kernels(self, camera: Camera, pose: Pose) -> dict[int, Array | None]:
-        """By LED, what the lens makes of a point at its depth. One for all depths that differ by less than a part."""
-        leds = self.scene.leds
-        towards_m = leds.centers_m - np.array(pose.position_m)
-        # A fish-eye has no plane of focus: its depth is the distance.
-        fish_eye = camera.projection == "equidistant"
-        depths = np.linalg.norm(towards_m, axis=1) if fish_eye else _along(towards_m, pose.rotation[2])
-        candidates = leds_that_may_be_seen(camera, pose, self.scene.leds.centers_m, leds.reaches_m, BLUR_MARGIN_PX)
-        if camera.focus_distance_m is None and camera.psf == "none":
-            return dict.fromkeys(range(len(depths)))
-        near = np.maximum(depths, 0.05)
-        kernels: dict[int, Array | None] = dict.fromkeys(range(len(depths)))
-        made: dict[float, Array | None] = {}
-        for i in candidates:
-            depth = float(np.exp(np.round(np.log(near[i]) / DEPTH_STEP) * DEPTH_STEP))
-            if depth not in made:
-                made[depth] = blur_kernel(camera, depth)
-            kernels[int(i)] = made[depth]
-        return kernels
-
     def _rooms(
         self,
         camera: Camera,
         places: Sequence[Pose],
         frames: Sequence[Window],
-        images: Sequence[Mapping[int, _Lit]],
-        spread: int,
-        kernels: Mapping[int, Array | None],
+        lights: Sequence[Mapping[int, LedLight]],
+        blurs: LedBlur,
     ) -> tuple[list[Image], list[Reflection]]:
         """The windows without the LEDs' own light, and its reflections: means over the places, blurred."""
         sensor = Window.of_sensor(camera)
-        wide = [f.grown(spread).common(sensor) if sensor.holds(f) else f.grown(spread) for f in frames]
+        grown = [frame.grown(blurs.spread_px) for frame in frames]
+        wide = [w.common(sensor) if sensor.holds(f) else w for f, w in zip(frames, grown, strict=True)]
         rates = self._rates(camera)
         totals: list[Image] | None = None
         reflections: list[Reflection] = []
-        for place, seen in zip(places, images, strict=True):
+        for place, seen in zip(places, lights, strict=True):
             backgrounds, surfaces = self._background.images(camera, place, wide, rates)
             self._hide_behind_leds(wide, backgrounds, seen, rates)
             totals = backgrounds if totals is None else [t + b for t, b in zip(totals, backgrounds, strict=True)]
             for number in range(len(self.scene.panes)):
                 label = self._background.room.first_pane + number
                 if any((s == label).any() for s in surfaces):
-                    reflections += self._reflections(camera, place, number, wide, rates[0] / len(places))
+                    lamp = rates[0] / len(places)
+                    reflections += false_images(self.scene, self._obstacles, camera, place, number, wide, lamp)
         assert totals is not None  # there is at least one place
-        kernel = _typical(kernels)
         means = []
         for total, window, frame in zip(totals, wide, frames, strict=True):
             mean = total if len(places) == 1 else total / np.float32(len(places))
-            means.append(np.ascontiguousarray(blur(mean, kernel, "edge")[window.slices(frame)]))
-        blurred = [_blurred(reflection, kernel, sensor) for reflection in reflections]
-        return means, [cut for r in blurred if r is not None for cut in _cut(r, frames)]
+            means.append(np.ascontiguousarray(blur(mean, blurs.typical, "edge")[window.slices(frame)]))
+        return means, blurred(reflections, blurs.typical, frames, sensor)
 
     def _hide_behind_leds(
-        self, frames: Sequence[Window], backgrounds: list[Image], images: Mapping[int, _Lit], rates: tuple[float, float]
+        self,
+        frames: Sequence[Window],
+        backgrounds: list[Image],
+        lights: Mapping[int, LedLight],
+        rates: tuple[float, float],
     ) -> None:
         """LED faces cover what is behind them and reflect the room's light; changes the backgrounds."""
         corners = len(self._light.mesh.vertices_m)
         faces = rates[0] * self._light.led_cd_m2()[corners:] + rates[1] * self._light.surround_cd_m2()[corners:]
-        for i, image in images.items():
+        for i, light in lights.items():
             if self.scene.leds.sheets[i] is not None:
                 continue  # a diffuser is one of the room's surfaces
             for frame, background in zip(frames, backgrounds, strict=True):
-                if frame.overlaps(image.window):
-                    both = frame.common(image.window)
-                    here, there = frame.slices(both), image.window.slices(both)
-                    coverage = image.coverage[there]
+                if frame.overlaps(light.window):
+                    both = frame.common(light.window)
+                    here, there = frame.slices(both), light.window.slices(both)
+                    coverage = light.coverage[there]
                     hidden = background[here] * (1 - coverage)
-                    background[here] = hidden + faces[i] * coverage * image.weight[there]
+                    background[here] = hidden + faces[i] * coverage * light.weight[there]
 
     def _patches(
         self,
         camera: Camera,
         pose: Pose,
-        images: Sequence[Mapping[int, _Lit]],
+        lights: Sequence[Mapping[int, LedLight]],
         lit: Mapping[int, Window],
-        kernels: Mapping[int, Array | None],
+        blurs: LedBlur,
         precision: type[np.floating] = np.float32,
     ) -> tuple[LedPatch, ...]:
         """The LEDs' own light, the mean over the images at several poses."""
         leds = self.scene.leds
         lamp, _ = self._rates(camera)
         center_px, _ = project(camera, pose, leds.centers_m)
-        around = _around(images)
+        around = _around(lights)
         patches = []
         for i, window in lit.items():
             light = np.zeros((around[i].rows, around[i].columns))
-            seen = [of_pose[i] for of_pose in images if i in of_pose]
+            seen = [of_pose[i] for of_pose in lights if i in of_pose]
             for image in seen:
                 light[around[i].slices(image.window)] += (
                     lamp * leds.luminances_cd_m2[i] * image.coverage * image.weight * image.pattern
                 )
-            spread = blur(light / len(images), kernels[i])[around[i].grown(_radius(kernels[i])).slices(window)]
+            kernel = blurs.kernels[i]
+            spread = blur(light / len(lights), kernel)[around[i].grown(radius_px(kernel)).slices(window)]
             patches.append(
                 LedPatch(
                     led_id=int(leds.ids[i]),
@@ -243,247 +185,31 @@ class Renderer:
                     row=window.row,
                     column=window.column,
                     electrons_per_s=np.ascontiguousarray(spread, dtype=precision),
-                    visible_fraction=sum(image.visible_fraction for image in seen) / len(images),
-                    imaged_fraction=sum(image.imaged_fraction for image in seen) / len(images),
+                    visible_fraction=sum(image.visible_fraction for image in seen) / len(lights),
+                    imaged_fraction=sum(image.imaged_fraction for image in seen) / len(lights),
                 )
             )
         return tuple(patches)
 
-    def _pattern(self, camera: Camera, pose: Pose, i: int, window: Window) -> Array | float:
-        """Luminance over that of the bare LED along its normal, in each pixel of the window.
 
-        Of a bare LED cos^(m - 1); of a sheet the mean over the pixel, of 2 x 2 places (Gauss and Legendre) where a
-        pixel sees more than a part FINE of the LED's distance behind it.
-        """
-        sheet, order = self.scene.leds.sheets[i], float(self.scene.leds.orders[i])
-        if sheet is not None:
-            height = float(self.scene.leds.centers_m[i, 2] - pose.position_m[2])
-
-            def at(off: tuple[float, float]) -> tuple[Array, Array]:
-                rays = rays_world(camera, pose, _centers(window) + np.array(off))
-                reach = height / np.maximum(rays[..., 2], 1e-9)
-                return pose.position_m[0] + reach * rays[..., 0], pose.position_m[1] + reach * rays[..., 1]
-
-            middle = at((0.0, 0.0))
-            steps = [np.abs(np.diff(place, axis=axis)).max(initial=0.0) for place in middle for axis in (0, 1)]
-            if max(steps) < FINE * sheet.distance_m and min(window.rows, window.columns) > 1:
-                return sheet.luminance(*middle)
-            nodes = list(itertools.product((-GAUSS_PX, GAUSS_PX), repeat=2))
-            mean: Array = sum((sheet.luminance(*at(off)) for off in nodes), np.zeros(middle[0].shape)) / len(nodes)
-            return mean
-        if abs(order - 1.0) < 1e-12:
-            return 1.0
-        rays = rays_world(camera, pose, _centers(window))
-        cosine = np.maximum(rays[..., 2] / np.sqrt((rays**2).sum(axis=-1)), 0.0)
-        pattern: Array = cosine ** (order - 1.0)
-        return pattern
-
-    def _led_images(
-        self, camera: Camera, pose: Pose, windows: LedWindows | None, spread: int
-    ) -> Iterator[tuple[int, _Lit]]:
-        """Index and image of each LED that lights a pixel of the view, or by blur may."""
-        leds = self.scene.leds
-        overscan = windows is not None and windows.overscan
-        reach = _overscan_px(camera) if overscan else spread
-        for i in leds_that_may_be_seen(camera, pose, leds.centers_m, leds.reaches_m, reach):
-            center_m, shape = self._faces[i]
-            image = image_of_led(camera, pose, center_m, shape, reach)
-            if image is None:
-                continue
-            window = Window(image.row, image.column, *image.coverage.shape)
-            if overscan and not _inside(window, camera, reach):
-                continue  # an LED cut by the widest overscan is left out
-            coverage = image.coverage
-            seen = 1.0
-            if self._may_hide:
-                clear = self._clear_share(camera, pose, pose, None, float(leds.centers_m[i, 2]), window, coverage > 0)
-                seen = float((coverage * clear).sum() / coverage.sum())
-                coverage = coverage * clear
-            if seen > 0:
-                imaged = 1.0 if overscan else image.visible_fraction
-                weight = relative_illumination(camera, *np.moveaxis(_centers(window), -1, 0))
-                pattern = self._pattern(camera, pose, int(i), window)
-                yield int(i), _Lit(window, coverage, weight, pattern, seen * image.visible_fraction, seen * imaged)
-
-    def _clear_share(
-        self,
-        camera: Camera,
-        pose: Pose,
-        seen_from: Pose,
-        pane: int | None,
-        height_m: float,
-        window: Window,
-        lit: NDArray[np.bool_],
-    ) -> Array:
-        """Share of each lit pixel from which nothing hides the plane of an LED at this height, (rows, columns).
-
-        `seen_from` is the camera's own pose, or its mirror image in the pane of that number, which has to be met.
-        """
-        rows, columns = np.nonzero(lit)
-        clear = np.ones(lit.shape)
-        with exact_math():
-            u, v = (
-                mi.Float((columns + window.column + 0.5).astype(np.float32)),
-                mi.Float((rows + window.row + 0.5).astype(np.float32)),
-            )
-            clear[rows, columns] = self._reaches(camera, pose, seen_from, pane, height_m, u, v)
-            rows, columns = np.nonzero(lit & differs_from_neighbour(np.where(lit, clear, OUTSIDE)))
-            if 0 < clear[lit].sum() < lit.sum():  # an edge crosses the LED
-                u, v = sub_pixels(rows + window.row, columns + window.column)
-                each = self._reaches(camera, pose, seen_from, pane, height_m, u, v)
-                clear[rows, columns] = each.reshape(len(rows), -1).mean(axis=1)
-        return clear
-
-    def _reaches(
-        self,
-        camera: Camera,
-        pose: Pose,
-        seen_from: Pose,
-        pane: int | None,
-        height_m: float,
-        u: "mi.Float",
-        v: "mi.Float",
-    ) -> Array:
-        """1 where the ray of a pixel position gets to this height, 0 where something is in its way."""
-        hit = self._background.look(camera, pose, u, v)
-        way_m = hit.distance_m if pane is None else dr.select(hit.surface == pane, hit.path_m, 0.0)
-        pixels = np.stack([u.numpy(), v.numpy()], axis=-1).astype(np.float64)
-        rays = rays_world(camera, seen_from, pixels)
-        to_plane = (height_m - pose.position_m[2]) / rays[:, 2] * np.sqrt((rays**2).sum(axis=1))
-        dr.eval(way_m)
-        reached: Array = (way_m.numpy() > to_plane * (1 - SAME_PLACE)).astype(np.float64)
-        return reached
-
-    def _reflections(
-        self, camera: Camera, pose: Pose, number: int, frames: Sequence[Window], lamp: float
-    ) -> list[Reflection]:
-        """LEDs in a pane, as far as it reaches and nothing stands in the way to it or from it."""
-        leds, pane = self.scene.leds, self.scene.panes[number]
-        mirror = np.eye(3) - 2 * np.outer(pane.normal, pane.normal)
-        behind = pane.mirrored(np.array(pose.position_m))
-        mirrored = MirroredPose(
-            (float(behind[0]), float(behind[1]), float(behind[2])),
-            pose.tilt_x_deg,
-            pose.tilt_y_deg,
-            pose.yaw_deg,
-            tuple(map(tuple, mirror.tolist())),
-        )
-        label = self._background.room.first_pane + number
-        found = []
-        for i in leds_that_may_be_seen(camera, mirrored, leds.centers_m, leds.reaches_m):
-            center_m, shape = self._faces[i]
-            image = image_of_led(camera, mirrored, center_m, shape)
-            if image is None:
-                continue
-            window = Window(image.row, image.column, *image.coverage.shape)
-            if not any(frame.overlaps(window) for frame in frames):
-                continue
-            height_m = float(leds.centers_m[i, 2])
-            clear = self._clear_share(camera, pose, mirrored, label, height_m, window, image.coverage > 0)
-            centers = _centers(window)
-            rays = rays_world(camera, mirrored, centers)
-            cosine = np.abs(_along(rays, pane.normal)) / np.sqrt((rays**2).sum(axis=-1))
-            weight = relative_illumination(camera, centers[..., 0], centers[..., 1])
-            weight = weight * pane_reflectance(cosine, pane.refractive_index, np.sqrt)
-            pattern = self._pattern(camera, mirrored, int(i), window)
-            light = lamp * leds.luminances_cd_m2[i] * image.coverage * clear * weight * pattern
-            for frame in frames:
-                if frame.overlaps(window):
-                    both = frame.common(window)
-                    part = light[window.slices(both)]
-                    if part.any():
-                        found.append(Reflection(int(leds.ids[i]), both.row, both.column, part.astype(np.float32)))
-        return found
-
-
-OUTSIDE = 2.0
-"""Label of pixels that an LED does not light, where others are 0 and 1."""
-GAUSS_PX = 0.5 / np.sqrt(3.0)
-FINE = 0.02
-"""Of a pixel that sees less the middle is the mean, to 2 (m + 3) * 0.02^2 / 24: 3e-4 for an order m of 5."""
-BLUR_MARGIN_PX = 500
-"""How far beside the sensor LEDs may be whose blur reaches it."""
-DEPTH_STEP = 0.005
-"""Depths that differ by less than this part share a kernel: 0.2 px of a defocus disc of 35."""
-
-
-def _face(leds: Leds, i: int) -> tuple[Array, Disc | Rectangle]:
-    """Centre and shape of what is seen to shine: the LED's face, or what it lights of a sheet."""
-    sheet, radius = leds.sheets[i], float(leds.radii_m[i])
-    if sheet is not None:
-        x0, y0, x1, y1 = sheet.lit_m
-        center: Array = np.array([(x0 + x1) / 2, (y0 + y1) / 2, leds.centers_m[i, 2]])
-        return center, Rectangle((x1 - x0, y1 - y0))
-    return leds.centers_m[i], Rectangle((2 * radius, 2 * radius)) if leds.squares[i] else Disc(radius)
-
-
-def _along(vectors: Array, direction: Array) -> Array:
-    """Dot products of vectors (..., 3) with one direction; written out as `camera.transform` is."""
-    product: Array = vectors[..., 0] * direction[0] + vectors[..., 1] * direction[1] + vectors[..., 2] * direction[2]
-    return product
-
-
-def _centers(window: Window) -> Array:
-    """(u, v) of a window's pixel centres, (rows, columns, 2)."""
-    u = np.arange(window.column, window.end_column) + 0.5
-    v = np.arange(window.row, window.end_row) + 0.5
-    return np.stack(np.meshgrid(u, v), axis=-1)
-
-
-def _around(images: Sequence[Mapping[int, _Lit]]) -> dict[int, Window]:
+def _around(lights: Sequence[Mapping[int, LedLight]]) -> dict[int, Window]:
     """Around all that each LED lights, by the LED's index."""
     lit: dict[int, Window] = {}
-    for of_pose in images:
-        for i, image in of_pose.items():
-            lit[i] = lit[i].around(image.window) if i in lit else image.window
+    for of_pose in lights:
+        for i, light in of_pose.items():
+            lit[i] = lit[i].around(light.window) if i in lit else light.window
     return dict(sorted(lit.items()))
 
 
 def _lit_windows(
-    camera: Camera,
-    images: Sequence[Mapping[int, _Lit]],
-    kernels: Mapping[int, Array | None],
-    windows: LedWindows | None,
+    camera: Camera, lights: Sequence[Mapping[int, LedLight]], blurs: LedBlur, windows: LedWindows | None
 ) -> dict[int, Window]:
     """The pixels of the view that each LED lights, blur included, by the LED's index."""
-    lit = {i: window.grown(_radius(kernels[i])) for i, window in _around(images).items()}
+    lit = {i: window.grown(radius_px(blurs.kernels[i])) for i, window in _around(lights).items()}
     if windows is not None and windows.overscan:
         return lit
     sensor = Window.of_sensor(camera)
     return {i: window.common(sensor) for i, window in lit.items() if sensor.overlaps(window)}
-
-
-def _spread(kernels: Mapping[int, Array | None]) -> int:
-    """How far light is blurred at most, pixels."""
-    return max(map(_radius, kernels.values()), default=0)
-
-
-def _radius(kernel: Array | None) -> int:
-    return 0 if kernel is None else kernel.shape[0] // 2
-
-
-def _typical(kernels: Mapping[int, Array | None]) -> Array | None:
-    """The kernel of median size: the room behind is blurred as at the LEDs' usual depth."""
-    made = sorted((k for k in kernels.values() if k is not None), key=lambda k: k.shape[0])
-    return made[len(made) // 2] if made else None
-
-
-def _blurred(reflection: Reflection, kernel: Array | None, sensor: Window) -> Reflection | None:
-    window = reflection.window.grown(_radius(kernel))
-    if not sensor.overlaps(window):
-        return None
-    both = sensor.common(window)
-    light = blur(reflection.electrons_per_s, kernel)[window.slices(both)]
-    return Reflection(reflection.led_id, both.row, both.column, light)
-
-
-def _cut(reflection: Reflection, frames: Sequence[Window]) -> Iterator[Reflection]:
-    """The parts of a reflection in each of the windows."""
-    for frame in frames:
-        if frame.overlaps(reflection.window):
-            both = frame.common(reflection.window)
-            light = reflection.electrons_per_s[reflection.window.slices(both)]
-            yield Reflection(reflection.led_id, both.row, both.column, light)
 
 
 def _check_size(frames: Sequence[Window], camera: Camera) -> None:
@@ -494,15 +220,6 @@ def _check_size(frames: Sequence[Window], camera: Camera) -> None:
             f"windows: overscan makes {pixels} pixels of LED windows; at most {most}, {MOST_PIXELS} times the "
             "sensor's, are allowed: lower margin_px, or leave overscan out"
         )
-
-
-def _overscan_px(camera: Camera) -> int:
-    """How far beyond the sensor windows may lie."""
-    return int(np.ceil(np.tan(np.radians(OVERSCAN_DEG)) * camera.focal_px))
-
-
-def _inside(window: Window, camera: Camera, reach: int) -> bool:
-    return Window.of_sensor(camera).grown(reach - 1).holds(window)
 
 
 def share_cores(workers: int) -> None:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from vlcrender.camera import Camera
@@ -50,6 +51,12 @@ class Window:
         """Number of pixels."""
         return self.rows * self.columns
 
+    def centers_px(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """u (1, columns) and v (rows, 1) of the pixels' centres, which broadcast."""
+        u = np.arange(self.column, self.end_column, dtype=np.float64) + 0.5
+        v = np.arange(self.row, self.end_row, dtype=np.float64) + 0.5
+        return u[None, :], v[:, None]
+
     def grown(self, by_px: int) -> "Window":
         """The window with `by_px` pixels more on each side."""
         return Window(self.row - by_px, self.column - by_px, self.rows + 2 * by_px, self.columns + 2 * by_px)
@@ -91,10 +98,10 @@ def led_windows(lit: Iterable[Window], camera: Camera, settings: LedWindows) -> 
     margin = int(np.ceil(settings.margin_px))
     # What is whole on the sensor is read out as by the real one, overscan or not.
     grown = [w.grown(margin).common(sensor) if sensor.holds(w) else w.grown(margin) for w in lit]
-    return tuple(sorted(_merged(grown), key=lambda w: (w.row, w.column))) or (Window(0, 0, 1, 1),)
+    return tuple(sorted(merged(grown), key=lambda w: (w.row, w.column))) or (Window(0, 0, 1, 1),)
 
 
-def _merged(windows: Iterable[Window]) -> list[Window]:
+def merged(windows: Iterable[Window]) -> list[Window]:
     """Windows that overlap become the one around them, until none do."""
     apart: list[Window] = []
     for window in windows:
