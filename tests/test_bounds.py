@@ -42,7 +42,14 @@ def bound_m2(
     expected = renderer.view(camera, POSE).expected_electrons(exposure_s)
     variance = [(Window.of_sensor(camera), variance_e2(Sensor(full_well_e=1e6), expected))]
     return position_bound_m2(
-        camera, POSE, lambda p: renderer.led_patches(camera, p), exposure_s, variance, led_ids, 2.6, sigma_deg
+        camera,
+        POSE,
+        lambda p: renderer.led_patches(camera, p),
+        exposure_s,
+        variance,
+        led_ids,
+        2.6,
+        (sigma_deg, sigma_deg),
     )
 
 
@@ -123,6 +130,22 @@ def test_gravity_and_more_leds_lower_it(renderer: Renderer, small_camera: Camera
         sizes.append(float(np.trace(bound)))
     assert sizes == sorted(sizes)
     assert sizes[0] < 0.5 * sizes[2] < 0.9 * sizes[3]
+
+
+def test_each_tilt_has_its_own_error(renderer: Renderer, small_camera: Camera) -> None:
+    """Little known of one tilt costs more than as little known of none, and less than as little known of both."""
+    expected = renderer.view(small_camera, POSE).expected_electrons(EXPOSURE_S)
+    variance = [(Window.of_sensor(small_camera), variance_e2(Sensor(full_well_e=1e6), expected))]
+    sizes = [
+        position_bound_m2(
+            small_camera, POSE, lambda p: renderer.led_patches(small_camera, p), EXPOSURE_S, variance, [0, 1], 2.6, s
+        )
+        for s in ((0.1, 0.1), (0.1, 5.0), (5.0, 0.1), (5.0, 5.0))
+    ]
+    none, y, x, both = (float(np.trace(bound)) for bound in sizes if bound is not None)
+    assert none < x < both
+    assert none < y < both
+    assert x != pytest.approx(y, rel=0.01)
 
 
 def test_a_frame_that_determines_nothing_has_none(renderer: Renderer, small_camera: Camera) -> None:
