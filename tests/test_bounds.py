@@ -148,6 +148,40 @@ def test_each_tilt_has_its_own_error(renderer: Renderer, small_camera: Camera) -
     assert x != pytest.approx(y, rel=0.01)
 
 
+def test_on_a_rig_it_is_of_the_cameras_own_position(renderer: Renderer, small_camera: Camera) -> None:
+    """A camera mounted 0.3 m beside another, with its axes: the bound of a lone camera where it is.
+
+    Of two LEDs alone, with 0.5 deg of tilt, the two places differ by what the lever makes of the tilts. Slopes are
+    exact to 1e-7; the lever's differences, of 1e-8 m, to 1e-8 of rounding.
+    """
+    offset_m = np.array([0.3, 0.0, 0.0])
+
+    def mounted(main: Pose) -> Pose:
+        x, y, z = np.array(main.position_m) + main.rotation.T @ offset_m
+        return Pose((x, y, z), main.tilt_x_deg, main.tilt_y_deg, main.yaw_deg)
+
+    x, y, z = np.array(POSE.position_m) - POSE.rotation.T @ offset_m
+    main = Pose((x, y, z), POSE.tilt_x_deg, POSE.tilt_y_deg, POSE.yaw_deg)
+    variance = [
+        (
+            Window.of_sensor(small_camera),
+            variance_e2(Sensor(full_well_e=1e6), renderer.view(small_camera, POSE).expected_electrons(EXPOSURE_S)),
+        )
+    ]
+    bound = position_bound_m2(
+        small_camera,
+        main,
+        lambda pose: renderer.led_patches(small_camera, mounted(pose)),
+        EXPOSURE_S,
+        variance,
+        [0, 1],
+        2.6,
+        (0.5, 0.5),
+        mounted=mounted,
+    )
+    assert bound == pytest.approx(bound_m2(renderer, small_camera, [0, 1], 0.5), rel=1e-4, abs=1e-12)
+
+
 def test_a_frame_that_determines_nothing_has_none(renderer: Renderer, small_camera: Camera) -> None:
     """A disc alone looks the same for any yaw; identities nobody knows tell nothing."""
     assert bound_m2(renderer, small_camera, [0], 0.5) is None

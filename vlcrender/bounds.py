@@ -48,10 +48,12 @@ def position_bound_m2(
     distance_m: float,
     tilt_sigmas_deg: tuple[float, float],
     overscan: bool = False,
+    mounted: Callable[[Pose], Pose] = lambda pose: pose,
 ) -> Array | None:
-    """Bound of the position's covariance, (3, 3), world axes; None where the frame does not determine it.
+    """Bound of the covariance of the camera's position, (3, 3), world axes; None where the frame does not determine it.
 
-    render: the LEDs' own light at a pose near `pose`, electrons a second. variance_e2: the windows read out, each
+    pose: of what the accelerometer is fixed to; `mounted` makes the camera's of it, which is another on a rig. render:
+    the LEDs' own light at such a pose near `pose`, electrons a second. variance_e2: the windows read out, each
     (rows, columns), with the variance of each pixel, inf where it tells nothing (a saturated one). led_ids: LEDs whose
     identity is known. distance_m: roughly, from the camera to the LEDs. tilt_sigmas_deg: of the accelerometer, on
     tilt_x and tilt_y; 0 means that the tilts are known. overscan: whether LEDs count beyond the sensor.
@@ -85,7 +87,14 @@ def position_bound_m2(
                 nuisances.append(np.ones((here.rows, here.columns)))
                 weight = 1 / variance[window.slices(here)].astype(np.float64)
                 information += _marginal(slopes, np.stack(nuisances), weight)
-    return _position_covariance(information, np.radians(tilt_sigmas_deg), steps)
+    lever = np.stack(
+        [
+            np.subtract(*(mounted(_moved(pose, i, sign * step)).position_m for sign in (1, -1))) / (2 * step)
+            for i, step in enumerate(steps)
+        ],
+        axis=1,
+    )
+    return _position_covariance(information, np.radians(tilt_sigmas_deg), steps, lever)
 
 
 def _moved(pose: Pose, unknown: int, by: float) -> Pose:
@@ -120,7 +129,8 @@ def _marginal(slopes: Array, nuisances: Array, weight: Array) -> Array:
     return product
 
 
-def _position_covariance(information: Array, tilt_sigmas: Array, steps: Sequence[float]) -> Array | None:
+def _position_covariance(information: Array, tilt_sigmas: Array, steps: Sequence[float], lever: Array) -> Array | None:
+    """Covariance of what moves by `lever` (3, 6) with the unknowns."""
     free = [0, 1, 2, 5] if not tilt_sigmas.any() else [0, 1, 2, 3, 4, 5]
     total = information.copy()
     if tilt_sigmas.any():
@@ -130,5 +140,5 @@ def _position_covariance(information: Array, tilt_sigmas: Array, steps: Sequence
     if not np.isfinite(scaled).all() or np.linalg.cond(scaled) > WORST_CONDITION:
         return None
     covariance = np.linalg.inv(scaled) * np.outer(units, units)
-    bound: Array = (covariance + covariance.T)[:3, :3] / 2
-    return bound
+    bound: Array = lever[:, free] @ covariance @ lever[:, free].T
+    return (bound + bound.T) / 2

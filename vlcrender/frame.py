@@ -125,6 +125,7 @@ def _bound_m2(
         float(np.median(np.linalg.norm(renderer.scene.leds.centers_m - position, axis=1))),
         recipe.accelerometer.tilt_errors_deg(main),
         recipe.windows is not None and recipe.windows.overscan,
+        mounted.pose,
     )
     return None if bound is None else bound.ravel().tolist()
 
