@@ -87,13 +87,8 @@ def position_bound_m2(
                 nuisances.append(np.ones((here.rows, here.columns)))
                 weight = 1 / variance[window.slices(here)].astype(np.float64)
                 information += _marginal(slopes, np.stack(nuisances), weight)
-    lever = np.stack(
-        [
-            np.subtract(*(mounted(_moved(pose, i, sign * step)).position_m for sign in (1, -1))) / (2 * step)
-            for i, step in enumerate(steps)
-        ],
-        axis=1,
-    )
+    ends = [[mounted(_moved(pose, i, sign * step)).position_m for sign in (1, -1)] for i, step in enumerate(steps)]
+    lever = np.diff(ends, axis=1)[:, 0].T / (-2 * np.array(steps))
     return _position_covariance(information, np.radians(tilt_sigmas_deg), steps, lever)
 
 
