@@ -1,5 +1,6 @@
 """A recipe: all that a dataset is made from. TOML in, checked model and scene out."""
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +11,7 @@ from pydantic import Field, model_validator
 from vlcrender.camera import Camera
 from vlcrender.errors import InputError
 from vlcrender.inertial import Accelerometer, TiltError
-from vlcrender.metering import Metering
+from vlcrender.metering import Metering, NoiseLevelMetering
 from vlcrender.motion import Motion
 from vlcrender.poses import AimedPoses, Poses
 from vlcrender.presets import with_presets
@@ -180,6 +181,11 @@ def scaled(recipe: Recipe, by: int, mode: ScaleMode) -> Recipe:
             )
     else:
         changes["sensor"] = recipe.sensor.binned(by)
+        if isinstance(
+            recipe.exposure, NoiseLevelMetering
+        ):  # of more electrons; a share of a full well scales by itself
+            level_db = recipe.exposure.level_db - 10 * math.log10(by**2)
+            changes["exposure"] = recipe.exposure.model_copy(update={"level_db": level_db})
     return check(recipe.model_copy(update=changes).model_dump(mode="json"), Recipe, f"--scale {by}")
 
 
