@@ -13,6 +13,7 @@ from vlcrender.errors import InputError
 from vlcrender.inertial import Accelerometer, TiltError
 from vlcrender.metering import Metering, NoiseLevelMetering
 from vlcrender.motion import Motion
+from vlcrender.photometry import WAVELENGTHS_NM, detectors
 from vlcrender.poses import AimedPoses, Poses
 from vlcrender.presets import with_presets
 from vlcrender.rig import MAIN, Mounted, RigCamera, mounted_cameras
@@ -63,6 +64,12 @@ class Recipe(Settings):
             raise ValueError("exposure_s: has to be given, or the table exposure in its place, and not both")
         if self.exposure is not None and self.motion is not None:
             raise ValueError("exposure: cannot be chosen with motion, whose blur needs the time first; give exposure_s")
+        return self
+
+    @model_validator(mode="after")
+    def _sensor_is_not_blind(self) -> Self:
+        if not any(detector.quantum_efficiency(WAVELENGTHS_NM).any() for detector in detectors(self.sensor)):
+            raise ValueError("sensor.quantum_efficiency: is 0 from 380 to 780 nm, where all the light is")
         return self
 
     @model_validator(mode="after")
