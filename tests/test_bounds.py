@@ -1,6 +1,6 @@
 """The Cramér-Rao bound against the information that moving edges carry, and what light, LEDs and gravity do to it."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
@@ -37,16 +37,23 @@ def renderer() -> Renderer:
     return Renderer(build_scene(check({**tree, "led": leds}, SceneSettings, "bound"), "bound"))
 
 
+def light_of(
+    renderer: Renderer, camera: Camera, led_ids: Sequence[int], mounted: Callable[[Pose], Pose] = lambda pose: pose
+) -> Callable[[Pose], list[LedPatch]]:
+    def patches(pose: Pose) -> list[LedPatch]:
+        return [patch for patch in renderer.led_patches(camera, mounted(pose)) if patch.led_id in led_ids]
+
+    return patches
+
+
 def bound_m2(
     renderer: Renderer, camera: Camera, led_ids: Sequence[int], sigma_deg: float, exposure_s: float = EXPOSURE_S
 ) -> np.ndarray | None:
     expected = renderer.view(camera, POSE).expected_electrons(exposure_s)
-
-    def patches(pose: Pose) -> list[LedPatch]:
-        return [patch for patch in renderer.led_patches(camera, pose) if patch.led_id in led_ids]
-
     variance = [(Window.of_sensor(camera), variance_e2(Sensor(full_well_e=1e6), expected))]
-    return position_bound_m2(camera, POSE, patches, exposure_s, variance, 2.6, sigma_deg)
+    return position_bound_m2(
+        camera, POSE, light_of(renderer, camera, led_ids), exposure_s, variance, 2.6, (sigma_deg, sigma_deg)
+    )
 
 
 def moved(unknown: int, by: float) -> Pose:
@@ -126,6 +133,53 @@ def test_gravity_and_more_leds_lower_it(renderer: Renderer, small_camera: Camera
         sizes.append(float(np.trace(bound)))
     assert sizes == sorted(sizes)
     assert sizes[0] < 0.5 * sizes[2] < 0.9 * sizes[3]
+
+
+def test_each_tilt_has_its_own_error(renderer: Renderer, small_camera: Camera) -> None:
+    """Little known of one tilt costs more than as little known of none, and less than as little known of both."""
+    expected = renderer.view(small_camera, POSE).expected_electrons(EXPOSURE_S)
+    variance = [(Window.of_sensor(small_camera), variance_e2(Sensor(full_well_e=1e6), expected))]
+    sizes = [
+        position_bound_m2(small_camera, POSE, light_of(renderer, small_camera, [0, 1]), EXPOSURE_S, variance, 2.6, s)
+        for s in ((0.1, 0.1), (0.1, 5.0), (5.0, 0.1), (5.0, 5.0))
+    ]
+    none, y, x, both = (float(np.trace(bound)) for bound in sizes if bound is not None)
+    assert none < x < both
+    assert none < y < both
+    assert x != pytest.approx(y, rel=0.01)
+
+
+def test_on_a_rig_it_is_of_the_cameras_own_position(renderer: Renderer, small_camera: Camera) -> None:
+    """A camera mounted 0.3 m beside another, with its axes: the bound of a lone camera where it is.
+
+    Of two LEDs alone, with 0.5 deg of tilt, the two places differ by what the lever makes of the tilts. Slopes are
+    exact to 1e-7; the lever's differences, of 1e-8 m, to 1e-8 of rounding.
+    """
+    offset_m = np.array([0.3, 0.0, 0.0])
+
+    def mounted(main: Pose) -> Pose:
+        x, y, z = np.array(main.position_m) + main.rotation.T @ offset_m
+        return Pose((x, y, z), main.tilt_x_deg, main.tilt_y_deg, main.yaw_deg)
+
+    x, y, z = np.array(POSE.position_m) - POSE.rotation.T @ offset_m
+    main = Pose((x, y, z), POSE.tilt_x_deg, POSE.tilt_y_deg, POSE.yaw_deg)
+    variance = [
+        (
+            Window.of_sensor(small_camera),
+            variance_e2(Sensor(full_well_e=1e6), renderer.view(small_camera, POSE).expected_electrons(EXPOSURE_S)),
+        )
+    ]
+    bound = position_bound_m2(
+        small_camera,
+        main,
+        light_of(renderer, small_camera, [0, 1], mounted),
+        EXPOSURE_S,
+        variance,
+        2.6,
+        (0.5, 0.5),
+        mounted=mounted,
+    )
+    assert bound == pytest.approx(bound_m2(renderer, small_camera, [0, 1], 0.5), rel=1e-4, abs=1e-12)
 
 
 def test_a_frame_that_determines_nothing_has_none(renderer: Renderer, small_camera: Camera) -> None:

@@ -1,6 +1,7 @@
 """The commands as a user meets them: every mistake is one line that names it, and exit code 2."""
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -182,3 +183,54 @@ def test_the_whole_chain_on_small_frames_without_the_truth(dataset: Path, tmp_pa
     page = report.read_text()
     assert "huynh2016-as-printed" in page
     assert not [word for word in ('src="http', 'href="http', "url(http") if word in page], "the page has to stand alone"
+
+
+def run_here(*arguments: str, **variables: str) -> subprocess.CompletedProcess[str]:
+    """The command line of this tree with some environment variables."""
+    code = "from vlcrender.cli import main; main()"
+    return subprocess.run(
+        [sys.executable, "-c", code, *arguments],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        env={**os.environ, **variables},
+    )
+
+
+def test_a_terminal_without_degree_signs_gets_question_marks(tmp_path: Path) -> None:
+    page = tmp_path / "ünï.html"
+    result = run_here("datasheet", "ideal", "--side-px", "32", "--out", str(page), PYTHONIOENCODING="ascii")
+    assert result.returncode == 0, result.stderr
+    assert "25 ?C" in result.stdout
+    assert page.exists()
+
+
+def test_a_page_that_cannot_be_written_costs_no_measurement(tmp_path: Path) -> None:
+    """A folder is refused before the measurement; a full disk, which no check foresees, comes after what was found."""
+    assert_refused(run_here("datasheet", "ideal", "--out", str(tmp_path)), f"--out {tmp_path}: is a folder")
+    result = run_here("datasheet", "ideal", "--side-px", "32", "--out", "/dev/full")
+    assert_refused(result, "No space left")
+    assert "system gain" in result.stdout
+
+
+def test_messages_with_line_breaks_are_one_line(tmp_path: Path) -> None:
+    for assignment in ('sensor.preset="a\\nb"', "a\nb=1"):
+        assert_refused(run_here("generate", RECIPE, "--out", str(tmp_path / "x"), "--set", assignment), "b")
+
+
+def test_a_folder_whose_name_is_no_text_is_refused(tmp_path: Path) -> None:
+    out = os.fsencode(tmp_path) + b"/x\xff"
+    code = "from vlcrender.cli import main; main()"
+    command = [sys.executable, "-c", code, "generate", RECIPE, "--out", out, *SETS]
+    assert_refused(subprocess.run(command, cwd=ROOT, capture_output=True, text=True), "--out", "UTF-8")
+
+
+def test_who_reads_no_further_is_no_error(tmp_path: Path) -> None:
+    code = "from vlcrender.cli import main; main()"
+    page = str(tmp_path / "page.html")
+    command = [sys.executable, "-c", code, "datasheet", "ideal", "--side-px", "32", "--json", "--out", page]
+    reading, writing = os.pipe()
+    os.close(reading)
+    result = subprocess.run(command, cwd=ROOT, stdout=writing, stderr=subprocess.PIPE, text=True)
+    os.close(writing)
+    assert (result.returncode, result.stderr) == (0, "")

@@ -2,10 +2,14 @@
 
 import hashlib
 import json
+import multiprocessing
 import os
 import shutil
+import signal
 import subprocess
 import sys
+import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -291,3 +295,61 @@ def test_a_camera_that_cannot_be_is_refused_in_one_line(
         problems_of(changed(made, tmp_path / "set", **entry))
     assert "\n" not in str(refusal.value)
     assert "dataset.json" in str(refusal.value)
+
+
+def test_a_worker_that_dies_is_a_line_and_the_run_goes_on_later(made: Path, tmp_path: Path) -> None:
+    def kill_one(done: int, total: int) -> None:
+        if done == 1:
+            os.kill(multiprocessing.active_children()[0].pid or 0, signal.SIGKILL)
+
+    with pytest.raises(InputError, match="a worker process died"):
+        generate(small_plan("expected=true"), tmp_path / "set", workers=2, progress=kill_one)
+    counts: list[int] = []
+    generate(small_plan("expected=true"), tmp_path / "set", progress=lambda done, total: counts.append(done))
+    assert counts[0] >= 1
+    assert digests(tmp_path / "set") == digests(made)
+
+
+def started_with_workers(directory: Path) -> subprocess.Popen[str]:
+    """A command line in a session of its own, as a terminal starts one, that makes many frames with two workers."""
+    code = "from vlcrender.cli import main; main()"
+    sets = [part for assignment in (*SMALL, "poses.count=300") for part in ("--set", assignment)]
+    return subprocess.Popen(
+        [sys.executable, "-c", code, "generate", RECIPE, "--out", directory, "--workers", "2", *sets],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+        cwd=ROOT,
+    )
+
+
+def wait_for(path: Path, within_s: float = 60.0) -> None:
+    end = time.monotonic() + within_s
+    while not (path.exists() and path.stat().st_size):
+        assert time.monotonic() < end, f"{path} never came"
+        time.sleep(0.02)
+
+
+def test_an_interrupt_while_workers_start_is_one_line(tmp_path: Path) -> None:
+    """Ctrl-C goes to the whole group of processes, also to children that are still importing."""
+    process = started_with_workers(tmp_path / "set")
+    wait_for(tmp_path / "set/plan.json")
+    time.sleep(1.0)
+    os.killpg(process.pid, signal.SIGINT)
+    output, _ = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "interrupted" in output
+    assert "Traceback" not in output, output
+
+
+def test_workers_end_with_their_parent(tmp_path: Path) -> None:
+    """A kill that cannot be caught. They share its output, which ends with the last of them."""
+    process = started_with_workers(tmp_path / "set")
+    wait_for(tmp_path / "set/journal.jsonl")
+    process.kill()
+    try:
+        process.communicate(timeout=20)
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)

@@ -164,6 +164,23 @@ def test_the_stated_error_is_the_scatter_of_tilts_over_devices(name: str) -> Non
     assert spread == pytest.approx(device.error_deg, rel=FIVE_SIGMA + 2e-4)
 
 
+def test_on_a_tilted_device_tilt_x_is_off_by_more() -> None:
+    """Offset and misalignment, the same either way, at tilt_y = -60 deg: twice as much on tilt_x.
+
+    Second order is (0.3 deg tan(60 deg))^2 = 8e-5 of a spread, far below its standard error, FIVE_SIGMA / 5.
+    """
+    pose = Pose(HERE, tilt_x_deg=40.0, tilt_y_deg=-60.0)
+    device = Imu(**FINE, bias_m_s2=0.03, misalignment_deg=0.25)
+    errors = []
+    for serial in range(DEVICES):
+        x, y, z = read(device.model_copy(update={"serial": serial}), pose, serial)
+        errors.append(np.degrees([np.arctan2(y, z), -np.arctan2(x, np.hypot(y, z))]) - [40.0, -60.0])
+    spread = np.std(errors, axis=0, ddof=1)
+    assert spread == pytest.approx(np.array(device.tilt_errors_deg(pose)), rel=FIVE_SIGMA + 1e-3)
+    assert device.tilt_errors_deg(LEVEL) == pytest.approx((device.error_deg, device.error_deg))
+    assert TiltError(error_deg=0.3).tilt_errors_deg(pose) == (0.3, 0.3)
+
+
 def test_every_term_is_in_the_stated_error() -> None:
     """In quadrature, each as an angle; the scale has no part in it at level."""
     settings: dict[str, float] = {

@@ -88,6 +88,14 @@ REFUSED = {
         ["sensor.quantum_efficiency", "red, green and blue"],
     ),
     "qe word": (["sensor.quantum_efficiency=gold"], ['"gold"', '"silicon"', "wavelengths_nm"]),
+    "qe of no visible light": (
+        ["sensor.quantum_efficiency={wavelengths_nm=[100, 200], values=[0.5, 0.5]}"],
+        ["sensor.quantum_efficiency", "380 to 780 nm"],
+    ),
+    "qe of nothing": (
+        ["sensor.quantum_efficiency={wavelengths_nm=[400, 700], values=[0, 0]}"],
+        ["sensor.quantum_efficiency", "380 to 780 nm"],
+    ),
     "mosaic without colours": (["sensor.mosaic=rggb"], ['mosaic = "rggb"', "red, green and blue"]),
     "mosaic": (["sensor.mosaic=gbbr"], ["sensor.mosaic", "rggb"]),
     "two exposures": (["exposure_s=1e-4", "exposure.kind=noise-level", "exposure.level_db=-9"], ["exposure_s", "both"]),

@@ -45,6 +45,28 @@ def test_keys_in_pixels_are_scaled_and_the_light_is_as_the_mode_says() -> None:
     assert same.sensor == full.sensor
 
 
+def test_a_metered_exposure_is_the_full_cameras(office: Scene) -> None:
+    """Binned pixels gather a hundred times the light in one time, by either metering; else a quick look is too dark.
+
+    In the middle of an image of an LED, 4 of the large pixels wide; across one light changes by the cos^4 of 10 of the
+    small ones, below 4 tan(17 deg) 10 / 3000 = 0.4 %.
+    """
+    pose = Pose((3.15, 3.1, 0.6), 6, -8, 20)
+    kinds = {
+        "peak": ["exposure.kind=peak", "exposure.share_of_full_well=0.6", "exposure.longest_s=1.0"],
+        "noise-level": ["exposure.kind=noise-level", "exposure.level_db=-30"],
+    }
+    for metering in kinds.values():
+        of_camera = ("camera.width_px=2000", "camera.height_px=1500", "camera.pixel_pitch_um=2.4")
+        full, small = (recipe(*of_camera, *metering, scale=scale) for scale in (1, 10))
+        views = [Renderer(office).view(r.camera, pose) for r in (full, small)]
+        times = [r.time_s(view) for r, view in zip((full, small), views, strict=True)]
+        assert max(patch.window.columns for patch in views[1].patches) > 4
+        assert times[1] == pytest.approx(times[0], rel=4e-3)
+        same = recipe(*of_camera, *metering, scale=10, mode="same-photons")
+        assert same.time_s(views[1]) == pytest.approx(times[0] / 100, rel=4e-3)
+
+
 @pytest.mark.parametrize("skewed", [(), SKEWED], ids=["plain", "skewed"])
 @pytest.mark.parametrize("pose", [Pose((3.15, 3.1, 0.6), 6, -8, 20), Pose((3.5, 3.2, 0.8), 40, 10, 30)])
 def test_a_binned_pixel_holds_the_sum_of_its_pixels(office: Scene, pose: Pose, skewed: tuple[str, ...]) -> None:

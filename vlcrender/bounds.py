@@ -11,7 +11,7 @@ of pixel p, the information about unknowns i and j is
 
 exact for Poisson counts (var = mu); for a sensor with more noise than that it is what the mean alone tells, and less by
 the information in the variance, which goes as 1 / mu. The derivatives over the pose are central differences of images
-whose edges are exact. The accelerometer adds 1 / sigma^2 to the two tilts.
+whose edges are exact. The accelerometer adds 1 / sigma^2 to each of the two tilts.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -46,15 +46,17 @@ def position_bound_m2(
     exposure_s: float,
     variance_e2: Variance,
     distance_m: float,
-    tilt_sigma_deg: float,
+    tilt_sigmas_deg: tuple[float, float],
     overscan: bool = False,
+    mounted: Callable[[Pose], Pose] = lambda pose: pose,
 ) -> Array | None:
-    """Bound of the position's covariance, (3, 3), world axes; None where the frame does not determine it.
+    """Bound of the covariance of the camera's position, (3, 3), world axes; None where the frame does not determine it.
 
-    render: the LEDs' own light at a pose near `pose`, electrons a second. variance_e2: the windows read out, each
+    pose: of what the accelerometer is fixed to; `mounted` makes the camera's of it, which is another on a rig. render:
+    the LEDs' own light at such a pose near `pose`, electrons a second. variance_e2: the windows read out, each
     (rows, columns), with the variance of each pixel, inf where it tells nothing (a saturated one). distance_m: roughly,
-    from the camera to the LEDs. tilt_sigma_deg: of the accelerometer, each axis; 0 means that the tilts are known.
-    overscan: whether LEDs count beyond the sensor.
+    from the camera to the LEDs. tilt_sigmas_deg: of the accelerometer, on tilt_x and tilt_y; 0 means that the tilts
+    are known. overscan: whether LEDs count beyond the sensor.
     """
     at_pose = render(pose)
     if not at_pose:
@@ -84,7 +86,9 @@ def position_bound_m2(
                 nuisances.append(np.ones((here.rows, here.columns)))
                 weight = 1 / variance[window.slices(here)].astype(np.float64)
                 information += _marginal(slopes, np.stack(nuisances), weight)
-    return _position_covariance(information, np.radians(tilt_sigma_deg), steps)
+    ends = [[mounted(_moved(pose, i, sign * step)).position_m for sign in (1, -1)] for i, step in enumerate(steps)]
+    lever = np.diff(ends, axis=1)[:, 0].T / (-2 * np.array(steps))
+    return _position_covariance(information, np.radians(tilt_sigmas_deg), steps, lever)
 
 
 def _moved(pose: Pose, unknown: int, by: float) -> Pose:
@@ -119,15 +123,16 @@ def _marginal(slopes: Array, nuisances: Array, weight: Array) -> Array:
     return product
 
 
-def _position_covariance(information: Array, tilt_sigma: float, steps: Sequence[float]) -> Array | None:
-    free = [0, 1, 2, 5] if tilt_sigma == 0 else [0, 1, 2, 3, 4, 5]
+def _position_covariance(information: Array, tilt_sigmas: Array, steps: Sequence[float], lever: Array) -> Array | None:
+    """Covariance of what moves by `lever` (3, 6) with the unknowns."""
+    free = [0, 1, 2, 5] if not tilt_sigmas.any() else [0, 1, 2, 3, 4, 5]
     total = information.copy()
-    if tilt_sigma > 0:
-        total[[3, 4], [3, 4]] += tilt_sigma**-2
+    if tilt_sigmas.any():
+        total[[3, 4], [3, 4]] += tilt_sigmas**-2
     units = np.array(steps)[free]
     scaled = total[np.ix_(free, free)] * np.outer(units, units)
     if not np.isfinite(scaled).all() or np.linalg.cond(scaled) > WORST_CONDITION:
         return None
     covariance = np.linalg.inv(scaled) * np.outer(units, units)
-    bound: Array = (covariance + covariance.T)[:3, :3] / 2
-    return bound
+    bound: Array = lever[:, free] @ covariance @ lever[:, free].T
+    return (bound + bound.T) / 2

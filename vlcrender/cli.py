@@ -1,10 +1,12 @@
 """The command line of vlcrender. Errors are one line; the exit code is 2 for bad input, 130 when interrupted."""
 
 import json
+import os
 import sys
 from dataclasses import asdict
+from io import TextIOWrapper
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, CycloptsError, Parameter
 from rich.console import Console
@@ -20,11 +22,15 @@ from vlcrender.scene import load_scene
 from vlcrender.verify import problems_of
 from vlcrender.visibility import ENOUGH_LEDS, level_coverage, tilted_coverage
 
+if TYPE_CHECKING:
+    from vlcrender.datasheet import Datasheet
+
 app = App(
     name="vlcrender",
     help="Render what a tilted camera sees of ceiling LED panels, with ground truth.",
     version=__version__,
     help_format="plaintext",
+    suppress_keyboard_interrupt=False,
 )
 HEIGHTS_M = (0.0, 0.75)
 """Floor and desk."""
@@ -106,7 +112,7 @@ def verify(directory: Path, /) -> None:
     dataset = read_dataset_file(directory)
     found = problems_of(directory)
     for problem in found:
-        print(f"vlcrender: {problem}", file=sys.stderr)
+        _complain(problem)
     if found:
         sys.exit(2)
     print(f"{directory}: {dataset.frame_count} frames, all there and intact")
@@ -181,7 +187,7 @@ def datasheet(
     json_
         Print JSON instead of a table.
     """
-    from vlcrender.datasheet import cells, load_sensor, make_datasheet  # starts Mitsuba
+    from vlcrender.datasheet import load_sensor, make_datasheet  # starts Mitsuba
     from vlcrender.datasheet_page import page
 
     if not 32 <= side_px <= 4096:
@@ -192,15 +198,25 @@ def datasheet(
     path = out or Path(f"{name}-datasheet.html")
     if not path.parent.is_dir():
         raise InputError(f"--out {path}: no such folder as {path.parent}")
+    if path.is_dir():
+        raise InputError(f"--out {path}: is a folder; the name of a file is needed")
     with Console(stderr=True).status("measuring") as status:
         sheet = make_datasheet(
             name, settings, wavelength_nm, side_px, lambda frames: status.update(f"measuring: {frames} frames")
         )
-    path.write_text(page(sheet), encoding="utf-8")
     if json_:
         rows = {row.key: {k: v for k, v in asdict(row).items() if k != "key"} for row in sheet.rows}
         print(json.dumps({"sensor": name, "conditions": sheet.conditions, "rows": rows}, indent=2, ensure_ascii=False))
-        return
+    else:
+        _print_datasheet(name, sheet)
+    path.write_text(page(sheet), encoding="utf-8")  # last: where it cannot be written, what was measured is shown
+    if not json_:
+        print(f"{path}: written")
+
+
+def _print_datasheet(name: str, sheet: "Datasheet") -> None:
+    from vlcrender.datasheet import cells
+
     table = Table(title=f"{name}: {'; '.join(sheet.conditions)}")
     for heading in ("", "", "set", "measured", "tolerance", "", ""):
         table.add_column(heading, justify="right" if heading else "left")
@@ -208,24 +224,33 @@ def datasheet(
         set_text, measured, tolerance, verdict = cells(row)
         table.add_row(row.key, row.name, set_text, measured, tolerance and f"± {tolerance}", row.unit, verdict)
     Console(width=max(Console().width, 100)).print(table)
-    print(f"{path}: written")
 
 
 def main() -> None:
     """Run the command line and exit."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal without a degree sign gets a question mark, not an error
     try:
         app(exit_on_error=False, print_error=False)
-    except CycloptsError as error:
-        _fail(" ".join(str(error).split()))
-    except InputError as error:
-        _fail(str(error))
+        sys.stdout.flush()
+    except (CycloptsError, InputError) as error:
+        _complain(str(error))
+        sys.exit(2)
+    except BrokenPipeError:
+        # Who read our output has gone (`| head`): end quietly, and keep Python from flushing into the closed pipe.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except OSError as error:
-        _fail(f"{error.filename or 'file system'}: {error.strerror or error}")
+        _complain(f"{error.filename or 'file system'}: {error.strerror or error}")
+        sys.exit(2)
     except KeyboardInterrupt:
-        print("vlcrender: interrupted; run the same command again to go on", file=sys.stderr)
+        _complain("interrupted; run the same command again to go on")
         sys.exit(130)
+    except Exception as error:
+        # A fault of this program's own; still not a traceback for somebody who cannot use one.
+        _complain(f"internal error, please report it: {type(error).__name__}: {error}")
+        sys.exit(1)
 
 
-def _fail(message: str) -> None:
-    print(f"vlcrender: {message}", file=sys.stderr)
-    sys.exit(2)
+def _complain(message: str) -> None:
+    print("vlcrender:", " ".join(message.split()), file=sys.stderr)

@@ -143,8 +143,9 @@ def _bound_m2(
         exposure_s,
         [(window, variance_e2(recipe.sensor, image, exposure_s)) for window, image in expected],
         float(np.median(np.linalg.norm(renderer.scene.leds.centers_m - position, axis=1))),
-        recipe.accelerometer.error_deg,
+        recipe.accelerometer.tilt_errors_deg(main),
         recipe.windows is not None and recipe.windows.overscan,
+        mounted.pose,
     )
     return None if bound is None else bound.ravel().tolist()
 

@@ -5,8 +5,10 @@ import multiprocessing
 import os
 import platform
 import signal
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -45,6 +47,10 @@ def generate(
     Goes on from an interrupted run of the same plan. `progress` is told (frames done, frames in all), `baking` (stage
     of the room's light, share done). Raises InputError where the folder holds anything else.
     """
+    try:
+        str(directory).encode()
+    except UnicodeEncodeError:
+        raise InputError(f"--out {directory}: is no UTF-8 name, which EXR files need") from None
     provenance = _provenance(plan)
     if (directory / "dataset.json").exists():
         _check_same(directory / "dataset.json", provenance, "a dataset of another recipe, scene or version")
@@ -90,26 +96,44 @@ def _records(job: Job, frames: list[int], workers: int, scheduler: str | None) -
 def _in_processes(job: Job, frames: list[int], workers: int) -> Iterator[Record]:
     # spawn: a forked child of a process that ran kernels is left with one thread
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(workers, len(frames)), context, _start_worker, (workers,)) as pool:
-        pending: set[Future[Record]] = set()
-        queue = iter(frames)
-        try:
-            while True:
+    pool = ProcessPoolExecutor(min(workers, len(frames)), context, _start_worker, (workers,))
+    pending: set[Future[Record]] = set()
+    queue = iter(frames)
+    try:
+        while True:
+            # Children start as tasks come. Interrupts are the parent's: they would otherwise each print a traceback.
+            # A mask is inherited; an interrupt that came meanwhile is delivered after.
+            before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+            try:
                 while len(pending) < 2 * workers and (frame := next(queue, None)) is not None:
                     pending.add(pool.submit(make_frame, job, frame))
-                if not pending:
-                    return
-                finished, pending = wait(pending, return_when=FIRST_COMPLETED)
-                for future in finished:
-                    yield future.result()
-        finally:
-            for future in pending:
-                future.cancel()
+            finally:
+                signal.pthread_sigmask(signal.SIG_SETMASK, before)
+            if not pending:
+                return
+            finished, pending = wait(pending, return_when=FIRST_COMPLETED)
+            for future in finished:
+                yield future.result()
+    except BrokenProcessPool:
+        raise InputError(
+            f"{job.directory}: a worker process died (out of memory?); run the same command again to go on, "
+            "with fewer --workers"
+        ) from None
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def _start_worker(workers: int) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # interrupts are the parent's
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     share_cores(workers)
+
+
+def _end_with_parent() -> None:
+    """Where the parent is killed, nobody would ever tell its children to stop."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _on_cluster(job: Job, frames: Iterable[int], address: str) -> Iterator[Record]:

@@ -23,6 +23,10 @@ class TiltError(Settings):
     error_deg: Annotated[float, Field(ge=0, le=45)] = 0.1
     """Standard deviation of the error on tilt_x and on tilt_y, which are independent and normal."""
 
+    def tilt_errors_deg(self, pose: Pose) -> tuple[float, float]:
+        """Standard deviations of the errors on tilt_x and tilt_y: the same in every pose."""
+        return self.error_deg, self.error_deg
+
     def reading_m_s2(self, pose: Pose, generator: np.random.Generator) -> NDArray[np.float64]:
         """Specific force at rest, shape (3,), camera axes: R_cam_world @ (0, 0, +g) of the tilts with their errors."""
         error_x, error_y = self.error_deg * generator.standard_normal(2)
@@ -98,6 +102,14 @@ class Imu(Settings):
         )
         turned_deg = np.degrees(np.linalg.norm(across_m_s2) / STANDARD_GRAVITY_M_S2)
         return float(np.hypot(turned_deg, self.misalignment_deg))
+
+    def tilt_errors_deg(self, pose: Pose) -> tuple[float, float]:
+        """Standard deviations over devices of the errors on tilt_x and tilt_y in a pose, to first order.
+
+        Gravity's direction in camera axes, (-sin y, sin x cos y, cos x cos y), is off by `error_deg` either way.
+        Raising tilt_x turns it by cos(tilt_y) alone, so that tilt_x is off by the more.
+        """
+        return self.error_deg / float(np.cos(np.radians(pose.tilt_y_deg))), self.error_deg
 
     def reading_m_s2(self, pose: Pose, generator: np.random.Generator) -> NDArray[np.float64]:
         """What the device reads at rest in this pose, shape (3,), in what it takes for camera axes."""

@@ -1,5 +1,6 @@
 """A recipe: all that a dataset is made from. TOML in, checked model and scene out."""
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,8 +11,9 @@ from pydantic import Field, model_validator
 from vlcrender.camera import Camera
 from vlcrender.errors import InputError
 from vlcrender.inertial import Accelerometer, TiltError
-from vlcrender.metering import Metering
+from vlcrender.metering import Metering, NoiseLevelMetering
 from vlcrender.motion import Motion
+from vlcrender.photometry import WAVELENGTHS_NM, detectors
 from vlcrender.poses import AimedPoses, Poses
 from vlcrender.presets import with_presets
 from vlcrender.rig import MAIN, Mounted, RigCamera, mounted_cameras
@@ -62,6 +64,12 @@ class Recipe(Settings):
             raise ValueError("exposure_s: has to be given, or the table exposure in its place, and not both")
         if self.exposure is not None and self.motion is not None:
             raise ValueError("exposure: cannot be chosen with motion, whose blur needs the time first; give exposure_s")
+        return self
+
+    @model_validator(mode="after")
+    def _sensor_is_not_blind(self) -> Self:
+        if not any(detector.quantum_efficiency(WAVELENGTHS_NM).any() for detector in detectors(self.sensor)):
+            raise ValueError("sensor.quantum_efficiency: is 0 from 380 to 780 nm, where all the light is")
         return self
 
     @model_validator(mode="after")
@@ -180,6 +188,11 @@ def scaled(recipe: Recipe, by: int, mode: ScaleMode) -> Recipe:
             )
     else:
         changes["sensor"] = recipe.sensor.binned(by)
+        if isinstance(
+            recipe.exposure, NoiseLevelMetering
+        ):  # of more electrons; a share of a full well scales by itself
+            level_db = recipe.exposure.level_db - 10 * math.log10(by**2)
+            changes["exposure"] = recipe.exposure.model_copy(update={"level_db": level_db})
     return check(recipe.model_copy(update=changes).model_dump(mode="json"), Recipe, f"--scale {by}")
 
 

@@ -33,29 +33,36 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: is not UTF-8 text; a TOML file is expected") from None
     try:
         return tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # ValueError also of a number of thousands of digits
         raise InputError(f"{path}: is not TOML: {error}") from None
 
 
 def override(tree: dict[str, Any], assignments: Iterable[str]) -> dict[str, Any]:
     """Return `tree` with `key=value` assignments applied; keys are dotted, values are TOML (or bare words)."""
-    result: dict[str, Any] = json.loads(json.dumps(tree, default=str))
+    result = dict(tree)
     for assignment in assignments:
         key, equals, text = assignment.partition("=")
         if not equals or not all(part.strip() for part in key.split(".")):
             raise InputError(f"--set {assignment}: is not key=value, as in --set camera.f_number=2.8")
-        try:
-            value = tomllib.loads(f"value = {text}")["value"]
-        except tomllib.TOMLDecodeError:
-            value = text.strip()  # a bare word: noise=none
         *parents, last = (part.strip() for part in key.split("."))
         table = result
         for parent in parents:
-            table = table.setdefault(parent, {})
-            if not isinstance(table, dict):
+            below = table.get(parent, {})
+            if not isinstance(below, dict):
                 raise InputError(f"--set {assignment}: {parent} is not a table of the recipe")
-        table[last] = value
+            table[parent] = dict(below)  # a copy: `tree` is left as it is
+            table = table[parent]
+        table[last] = _value(text)
     return result
+
+
+def _value(text: str) -> Any:
+    """What TOML has for a value, or a bare word, such as `none` in noise=none."""
+    try:
+        table = tomllib.loads(f"value = {text}")
+    except (ValueError, RecursionError):
+        return text.strip()
+    return table["value"] if len(table) == 1 else text.strip()  # a second line is no part of a value
 
 
 def check(tree: Mapping[str, Any], model: type[S], source: str) -> S:
