@@ -65,7 +65,7 @@ def _consensus(
     more_starts: Callable[[], Iterable[Pose]],
 ) -> Consensus:
     pixel_rad = 1 / seen.camera.K[0][0]
-    gravity = bool(np.isfinite(seen.tilt_sigma_rad))
+    gravity = bool(np.isfinite(seen.tilt_sigma_rad).all())
     everything = np.ones(len(seen.leds_m), dtype=bool)
     if len(everything) < FEWEST_WITHOUT_DOUBT:
         why = f"LEDs identified: {len(everything)}, needed: {FEWEST_WITHOUT_DOUBT}"

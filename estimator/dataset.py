@@ -169,8 +169,11 @@ class FrameRecord(Row):
         return file
 
 
-class _Accelerometer(Row):
-    error_deg: float = Field(ge=0)
+class Accelerometer(Row):
+    """What a device knows of its accelerometer's error: of each tilt, or of gravity's direction either way."""
+
+    kind: Literal["tilt-error", "imu"]
+    error_deg: NotNegative
 
 
 class _Description(Row):
@@ -182,7 +185,7 @@ class _Description(Row):
     frame_count: int = Field(ge=0, le=INT64_MAX)
     cameras: dict[str, Camera]
     sensor: Sensor
-    accelerometer: _Accelerometer
+    accelerometer: Accelerometer
     led_map: tuple[Led, ...]
     room_m: tuple[Positive, Positive, Positive]
 
@@ -202,7 +205,7 @@ class Dataset:
     name: str
     cameras: dict[str, Camera]
     sensor: Sensor
-    accelerometer_error_deg: float
+    accelerometer: Accelerometer
     leds: dict[int, Led]
     room_m: tuple[float, float, float]
     frames: tuple[FrameRecord, ...]
@@ -225,8 +228,7 @@ class DeviceFrame:
     camera: Camera
     sensor: Sensor
     accelerometer_m_s2: tuple[float, float, float]
-    accelerometer_error_deg: float
-    """Standard deviation of the tilt that the accelerometer shows, on each axis."""
+    accelerometer: Accelerometer
     exposure_s: float
     spots: tuple[DecodedSpot, ...]
     leds: dict[int, Led]
@@ -266,7 +268,7 @@ def read_dataset(folder: Path) -> Dataset:
         name=description.name,
         cameras=description.cameras,
         sensor=description.sensor,
-        accelerometer_error_deg=description.accelerometer.error_deg,
+        accelerometer=description.accelerometer,
         leds={led.id: led for led in description.led_map},
         room_m=description.room_m,
         frames=read_rows(folder / "frames.parquet", FRAME_COLUMNS, FrameRecord),
@@ -309,7 +311,7 @@ def read_frame(dataset: Dataset, record: FrameRecord) -> DeviceFrame:
         camera,
         dataset.sensor,
         record.accelerometer_m_s2,
-        dataset.accelerometer_error_deg,
+        dataset.accelerometer,
         record.exposure_s,
         record.spots,
         dataset.leds,

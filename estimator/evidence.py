@@ -80,8 +80,8 @@ def gather(frame: DeviceFrame, pose: TiltedPose, covariance: Floats) -> Evidence
     """What a frame shows of the LEDs of the map that are seen from a pose known to a covariance (6, 6).
 
     LEDs whose place is not sure to CERTAIN_PX are left out, and so are full pixels, pixels that another LED of the map
-    lights too, and LEDs whose inside is mostly full: where an edge is would hang on how bright they are, which nobody
-    saw. Raises EstimationFailure where nothing is left.
+    lights too. LEDs whose inside is mostly full are left out unless all are: how bright they are, on which hangs where
+    an edge is, only their dim rims can say. Raises EstimationFailure where nothing is left.
     """
     leds, seen, more = _in_view(frame, pose, covariance)
     lens = LensBlur(frame.camera, seen.depth_m)
@@ -90,13 +90,14 @@ def gather(frame: DeviceFrame, pose: TiltedPose, covariance: Floats) -> Evidence
     drawing = images.draw(pose)
     shares = [canvas.window(drawing.share, k) for k in range(len(leds))]
     near = [_near_edge_and_lit(of_led) for of_led in shares]
+    readings = [_readings(frame, canvas, k) for k in range(len(leds))]
+    full = np.array([_is_full(share, known) for share, (_, known) in zip(shares, readings, strict=True)])
     edges: list[tuple[Ints, Floats, Floats]] = []
     flats: list[tuple[int, float, float, float]] = []
     led_of_group: list[int] = []
     for k in range(len(leds)):
-        electrons, known = _readings(frame, canvas, k)
-        inside = shares[k] > 1 - FLAT
-        if inside.any() and not known[inside].mean() > LEAST_KNOWN:
+        electrons, known = readings[k]
+        if full[k] and not full.all():
             continue
         for other in _neighbours(canvas, k):
             here, there = _common(canvas, k, other)
@@ -121,7 +122,7 @@ def gather(frame: DeviceFrame, pose: TiltedPose, covariance: Floats) -> Evidence
                     flats.append((len(led_of_group), float(flat.sum()), total_e, total))
             led_of_group.append(k)
     if not edges:
-        raise EstimationFailure("fit", "no LED of the map is in view and not full")
+        raise EstimationFailure("fit", "no LED of the map is in view")
     cells, weights, electrons = (np.concatenate(column) for column in zip(*edges, strict=True))
     counts = np.array([len(edge[0]) for edge in edges])
     flat_group, flat_pixels, flat_electrons, flat_light = np.array(flats).reshape(-1, 4).T
@@ -209,6 +210,12 @@ def _readings(frame: DeviceFrame, canvas: Canvas, k: int) -> tuple[Floats, Mask]
             electrons[here] = frame.electrons(piece)
             known[here] = ~frame.clipped(piece)
     return electrons, known
+
+
+def _is_full(share: Floats, known: Mask) -> bool:
+    """Whether of the pixels that an LED fills, if there are any, most are not known."""
+    inside = share > 1 - FLAT
+    return bool(inside.any() and not known[inside].mean() > LEAST_KNOWN)
 
 
 def _neighbours(canvas: Canvas, k: int) -> Sequence[int]:

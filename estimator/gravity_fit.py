@@ -7,7 +7,6 @@ whole arc of them: both are fits that start from there, and gravity decides. Wro
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import combinations, islice
 
 import cv2
@@ -57,8 +56,7 @@ def agreement(seen: Observations) -> Consensus:
         if not fix_orientation(seen.leds_m):
             raise
         # The reading itself may be what is wrong.
-        without = replace(seen, tilt_sigma_rad=np.inf)
-        return consensus(without, starts, lambda: _from_triples(seen))
+        return consensus(seen.without_gravity(), starts, lambda: _from_triples(seen))
 
 
 def ambiguous(agreed: Consensus) -> bool:

@@ -22,7 +22,7 @@ from estimator.gravity_fit import agreement, ambiguous
 from estimator.pipeline import Estimate, Variant
 from estimator.pixel_likelihood import LedLight, Noise, led_light, misfit, score
 from estimator.projection import POSE_PARAMETERS, TiltedPose, pose_of_rotation, project
-from estimator.rectify import tilt_from_gravity
+from estimator.rectify import tilt_from_gravity, tilt_sigmas
 from estimator.reprojection import fit, observations
 from estimator.sighting import sightings
 from estimator.upright import upright_pose
@@ -36,8 +36,6 @@ MOST_STEPS = 40
 SMALL_STEP = 1e-2
 # No LED moves further in one step: edges are where the model holds to first order.
 LONGEST_STEP_PX = 1.0
-# An accelerometer said to be without error is taken to have this one: 0.06 um at 3.5 m.
-BEST_TILT_DEG = 1e-6
 # A step that makes the mean deviance of a reading this many times greater was too long. Less may come from readings
 # that are left out or let in as their pixels get near to full.
 WORSE = 1.01
@@ -111,23 +109,21 @@ def maximize(frame: DeviceFrame, gravity: "Gravity", start: TiltedPose, covarian
 
 @dataclass(frozen=True)
 class Gravity:
-    """A reading of the rig's tilts, in radians, and its standard deviation on each."""
+    """A reading of the rig's tilts, (2,) radians, and their standard deviations."""
 
-    tilt_x: float
-    tilt_y: float
-    sigma: float
+    tilts: Floats
+    sigma: Floats
 
     @staticmethod
     def of(frame: DeviceFrame) -> "Gravity":
         """What a frame's accelerometer says."""
         x, y, z = (np.array(frame.camera.R_cam_rig).T @ frame.accelerometer_m_s2).tolist()
-        return Gravity(
-            *tilt_from_gravity((x, y, z)), float(np.radians(max(frame.accelerometer_error_deg, BEST_TILT_DEG)))
-        )
+        tilts = tilt_from_gravity((x, y, z))
+        return Gravity(np.array(tilts), tilt_sigmas(frame.accelerometer, tilts[1]))
 
     def information(self) -> Floats:
         """About the pose, (6, 6)."""
-        return np.diag([0.0, 0.0, 0.0, self.sigma**-2, self.sigma**-2, 0.0])
+        return np.diag([0.0, 0.0, 0.0, *(self.sigma**-2), 0.0])
 
     def gradient(self, pose: TiltedPose) -> Floats:
         """Of the logarithm of its likelihood by the pose, (6,)."""
@@ -138,11 +134,11 @@ class Gravity:
         return float(((self._off(pose) / self.sigma) ** 2).sum())
 
     def _off(self, pose: TiltedPose) -> Floats:
-        off = np.array([self.tilt_x - pose.tilt_x, self.tilt_y - pose.tilt_y])
+        off = self.tilts - [pose.tilt_x, pose.tilt_y]
         return np.asarray(off - 2 * np.pi * np.round(off / (2 * np.pi)))
 
 
-NO_GRAVITY = Gravity(0.0, 0.0, np.inf)
+NO_GRAVITY = Gravity(np.zeros(2), np.full(2, np.inf))
 
 
 @dataclass(frozen=True, eq=False)

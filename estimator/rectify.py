@@ -3,10 +3,13 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.dataset import Accelerometer
 from estimator.errors import EstimationFailure
 
 # A ray lower than this above the horizon meets the ceiling some thousand room heights away.
 LOWEST_SINE = 1e-3
+# An accelerometer said to be without error is taken to have this one: 0.06 um at 3.5 m.
+BEST_TILT_DEG = 1e-6
 
 
 def tilt_from_gravity(accelerometer_m_s2: tuple[float, float, float]) -> tuple[float, float]:
@@ -20,6 +23,14 @@ def tilt_from_gravity(accelerometer_m_s2: tuple[float, float, float]) -> tuple[f
     if size == 0:
         raise EstimationFailure("rectify", "the accelerometer reads no gravity")
     return float(np.arctan2(y, z)), float(-np.arcsin(np.clip(x / size, -1, 1)))
+
+
+def tilt_sigmas(accelerometer: Accelerometer, tilt_y: float) -> NDArray[np.float64]:
+    """Standard deviations of the angles `tilt_from_gravity` gives, (2,), radians; never below BEST_TILT_DEG."""
+    sigma = np.radians(max(accelerometer.error_deg, BEST_TILT_DEG))
+    # tilt_x turns gravity's direction by cos(tilt_y) alone; where it is upright, tilt_x means nothing.
+    lever = max(np.cos(tilt_y), LOWEST_SINE) if accelerometer.kind == "imu" else 1.0
+    return np.array([sigma / lever, sigma])
 
 
 def rotation(tilt_x: float, tilt_y: float) -> NDArray[np.float64]:

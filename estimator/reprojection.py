@@ -26,15 +26,13 @@ from scipy.optimize import least_squares
 from estimator.dataset import Camera, DeviceFrame
 from estimator.errors import EstimationFailure
 from estimator.identify import Sighting
-from estimator.rectify import tilt_from_gravity
+from estimator.rectify import tilt_from_gravity, tilt_sigmas
 from estimator.undistort import lens_pixels, pinhole_pixels
 
 Floats = NDArray[np.float64]
 
 # No centroid is better: keeps a covariance of nothing, of a spot without noise, from weighing without end.
 BEST_CENTROID_PX = 1e-4
-# An accelerometer said to be without error is taken to have this one: 0.6 um at 3.5 m.
-BEST_TILT_DEG = 1e-5
 # Beyond so many standard deviations a robust fit weighs less and less.
 ROBUST_SIGMA = 3.0
 MOST_EVALUATIONS = 60
@@ -65,8 +63,12 @@ class Observations:
     """(n, 2, 2): takes an offset in the plane to one with unit covariance."""
     tilt_rad: Floats
     """The reading, (tilt_x, tilt_y)."""
-    tilt_sigma_rad: float
-    """Its standard deviation on each axis; infinite where gravity takes no part."""
+    tilt_sigma_rad: Floats
+    """Its standard deviations, (2,); infinite where gravity takes no part."""
+
+    def without_gravity(self) -> "Observations":
+        """The spots alone."""
+        return replace(self, tilt_sigma_rad=np.full(2, np.inf))
 
     def only(self, chosen: NDArray[np.bool_]) -> "Observations":
         """Those of the spots that are chosen, (n,)."""
@@ -119,15 +121,15 @@ def observations(frame: DeviceFrame, seen: Sequence[Sighting]) -> Observations:
     to_plane = from_pixels[:2, :2] @ slope
     covariance = to_plane @ (covariance_px2 + BEST_CENTROID_PX**2 * np.eye(2)) @ to_plane.transpose(0, 2, 1)
     lift = [led.radius_m**2 * (SQUARE_TO_DISC if led.shape == "square" else 1.0) for led in leds]
-    sigma_deg = max(frame.accelerometer_error_deg, BEST_TILT_DEG)
+    tilt = tilt_from_gravity(frame.accelerometer_m_s2)
     return Observations(
         leds_m=np.array([led.position_m for led in leds]),
         lift_m2=np.array(lift),
         camera=camera,
         plane=out @ from_pixels[:2, :2].T + from_pixels[:2, 2],
         whitening=np.linalg.inv(np.linalg.cholesky(covariance)),
-        tilt_rad=np.array(tilt_from_gravity(frame.accelerometer_m_s2)),
-        tilt_sigma_rad=float(np.radians(sigma_deg)),
+        tilt_rad=np.array(tilt),
+        tilt_sigma_rad=tilt_sigmas(frame.accelerometer, tilt[1]),
     )
 
 
@@ -253,7 +255,7 @@ def _tilt_slopes(x: Floats, seen: Observations) -> Floats:
     slopes = np.zeros((2, 6))
     slopes[0, :3] = (up_z * by_y - up_y * by_z) / across2
     slopes[1, :3] = -by_x / np.sqrt(across2)
-    return slopes / seen.tilt_sigma_rad
+    return slopes / seen.tilt_sigma_rad[:, None]
 
 
 def _position_covariance(x: Floats, covariance: Floats) -> Floats:

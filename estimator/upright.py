@@ -8,7 +8,6 @@ orientation (fewer than four, or on one line), it takes the tilt as read.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -53,7 +52,7 @@ def fit_sightings(frame: DeviceFrame, sighted: Sequence[Sighting]) -> Estimate:
     seen = observations(frame, sighted)
     starts = _from_pairs(seen)
     if fix_orientation(seen.leds_m):
-        seen = replace(seen, tilt_sigma_rad=np.inf)
+        seen = seen.without_gravity()
     agreed = consensus(seen, starts[:1], lambda: starts[1:])
     return Estimate(agreed.best.pose.position_m, covariance_m2=agreed.covariance_m2)
 
@@ -67,7 +66,7 @@ def _from_pairs(seen: Observations) -> list[Pose]:
     if len(pairs) > MOST_PAIRS:
         generator = np.random.Generator(np.random.Philox(key=len(pairs)))
         pairs = [pairs[k] for k in generator.choice(len(pairs), MOST_PAIRS, replace=False)]
-    gate = GATE_SIGMA * seen.tilt_sigma_rad + GATE_PX * pixel_rad
+    gate = GATE_SIGMA * float(seen.tilt_sigma_rad.max()) + GATE_PX * pixel_rad
     scored: list[tuple[float, int, Pose]] = []
     for pair in pairs:
         found = poselib.up2p(level[list(pair)] @ Y_UP.T, seen.leds_m[list(pair)] @ Y_UP.T)

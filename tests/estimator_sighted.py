@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from estimator_synthetic import Array, View, description
 
-from estimator.dataset import Camera, DeviceFrame, Led, Sensor
+from estimator.dataset import Accelerometer, Camera, DeviceFrame, Led, Sensor
 from estimator.detect import Spot
 from estimator.identify import Sighting
 
@@ -25,7 +25,7 @@ def device(view: View, error_deg: float, rng: np.random.Generator | None = None)
         camera=Camera.model_validate_json(json.dumps(of["cameras"]["main"])),  # type: ignore[index]
         sensor=Sensor.model_validate(of["sensor"]),
         accelerometer_m_s2=(x, y, z),
-        accelerometer_error_deg=error_deg,
+        accelerometer=Accelerometer(kind="tilt-error", error_deg=error_deg),
         exposure_s=1e-3,
         spots=(),
         leds={},

@@ -247,7 +247,7 @@ def description(view: View, frame_count: int, leds_m: Array, radius_m: float) ->
             **{"prnu": 0.0, "dark_current_e_s": 0.0, "dsnu_e": 0.0, "read_noise_e": 0.0, "adc_noise_dn": 0.0},
             **{"row_offset_e": 0.0, "column_offset_e": 0.0, "mosaic": "none"},
         },
-        "accelerometer": {"error_deg": 0.0},
+        "accelerometer": {"kind": "tilt-error", "error_deg": 0.0},
         "led_map": [
             {"id": 10 + k, "position_m": led.tolist(), "radius_m": radius_m, "shape": "disc"}
             for k, led in enumerate(np.asarray(leds_m))

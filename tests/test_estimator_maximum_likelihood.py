@@ -9,7 +9,7 @@ from estimator_synthetic import View, description, grid, poisson, render, view_o
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from estimator.dataset import Camera, DecodedSpot, DeviceFrame, Led, Part, Sensor
+from estimator.dataset import Accelerometer, Camera, DecodedSpot, DeviceFrame, Led, Part, Sensor
 from estimator.errors import EstimationFailure
 from estimator.maximum_likelihood import ml
 from estimator.rectify import rotation
@@ -31,7 +31,7 @@ def frame_of(view: View, leds_m: Floats, image_dn: NDArray[np.uint32], error_deg
         camera=Camera.model_validate_json(json.dumps(made["cameras"]["main"])),
         sensor=Sensor.model_validate_json(json.dumps(made["sensor"])),
         accelerometer_m_s2=tuple(view.gravity_m_s2.tolist()),
-        accelerometer_error_deg=error_deg,
+        accelerometer=Accelerometer(kind="tilt-error", error_deg=error_deg),
         exposure_s=1e-3,
         spots=tuple(DecodedSpot(led=10 + int(k), u_px=pixels[k, 0], v_px=pixels[k, 1]) for k in np.flatnonzero(inside)),
         leds={10 + k: Led(id=10 + k, position_m=led, radius_m=0.01, shape="disc") for k, led in enumerate(leds_m)},
@@ -196,8 +196,10 @@ def test_exact_gravity_is_taken_at_its_word() -> None:
     view = view_of(TARGET, 3.0, 10.0, 5.0, 30.0)
     frame = exact(view, SIX)
     off = rotation(np.radians(10.1), np.radians(5.0)) @ [0.0, 0.0, 9.80665]
-    wrong = replace(frame, accelerometer_m_s2=tuple(off.tolist()), accelerometer_error_deg=0.0)
-    right = replace(frame, accelerometer_error_deg=0.0)
+    wrong = replace(
+        frame, accelerometer_m_s2=tuple(off.tolist()), accelerometer=Accelerometer(kind="tilt-error", error_deg=0.0)
+    )
+    right = replace(frame, accelerometer=Accelerometer(kind="tilt-error", error_deg=0.0))
     assert off_m(right, view) < 1e-4
     assert 3e-3 < off_m(wrong, view) < 8e-3
 

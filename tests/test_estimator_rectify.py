@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from estimator_synthetic import GRAVITY_M_S2, View, grid, view_of
 
+from estimator.dataset import Accelerometer
 from estimator.errors import EstimationFailure
-from estimator.rectify import level, levelling_homography, printed_eq6, rotation, tilt_from_gravity
+from estimator.rectify import level, levelling_homography, printed_eq6, rotation, tilt_from_gravity, tilt_sigmas
 
 K = np.array([[1000.0, 0, 200], [0, 1000.0, 150], [0, 0, 1]])
 
@@ -78,3 +79,17 @@ def test_the_horizon_is_refused(v_px: float) -> None:
 def test_no_gravity_is_refused() -> None:
     with pytest.raises(EstimationFailure, match=r"rectify: .*gravity"):
         tilt_from_gravity((0.0, 0.0, 0.0))
+
+
+def test_a_real_part_is_less_sure_of_tilt_x_the_more_it_is_tilted_the_other_way() -> None:
+    """Gravity in camera axes is (-sin y, sin x cos y, cos x cos y): raising tilt_x turns it by cos(tilt_y) alone."""
+    real, papers = (Accelerometer(kind=kind, error_deg=1.0) for kind in ("imu", "tilt-error"))
+    level, aside = (np.degrees(tilt_sigmas(real, np.radians(tilt))) for tilt in (0.0, 60.0))
+    np.testing.assert_allclose(level, [1.0, 1.0])
+    np.testing.assert_allclose(aside, [2.0, 1.0])
+    np.testing.assert_allclose(np.degrees(tilt_sigmas(papers, np.radians(60.0))), [1.0, 1.0])
+    up = np.array([-np.sin(1.0), np.sin(0.3) * np.cos(1.0), np.cos(0.3) * np.cos(1.0)])
+    across = np.cross(up, [1.0, 0.0, 0.0])
+    turned = up + 1e-6 * across / np.linalg.norm(across)
+    x, _ = tilt_from_gravity(tuple((9.8 * turned).tolist()))
+    assert abs(abs(x - 0.3) / 1e-6 - tilt_sigmas(real, 1.0)[0] / np.radians(1.0)) < 1e-3

@@ -17,7 +17,17 @@ from conftest import ROOT
 from estimator_synthetic import Array, View, description, grid, poisson, render, small_dataset, view_of
 
 from estimator.batch import estimate_dataset, estimate_frame
-from estimator.dataset import Camera, DecodedSpot, DeviceFrame, Led, Part, Sensor, read_dataset, read_frame
+from estimator.dataset import (
+    Accelerometer,
+    Camera,
+    DecodedSpot,
+    DeviceFrame,
+    Led,
+    Part,
+    Sensor,
+    read_dataset,
+    read_frame,
+)
 from estimator.detect import Readout, detect
 from estimator.errors import InputError
 from estimator.estimates import EstimateRow
@@ -72,7 +82,7 @@ def frame_of(
         camera=Camera.model_validate_json(json.dumps(cameras["main"])),  # type: ignore[index]
         sensor=of_sensor or sensor(),
         accelerometer_m_s2=(x, y, z),
-        accelerometer_error_deg=0.1,
+        accelerometer=Accelerometer(kind="tilt-error", error_deg=0.1),
         exposure_s=1e-3,
         spots=tuple(DecodedSpot(led=10 + led, u_px=rough[k, 0], v_px=rough[k, 1]) for k, led in named.items()),
         leds={

@@ -103,6 +103,7 @@ class SensorEntry(Settings):
 class AccelerometerEntry(Settings):
     """The accelerometer in dataset.json."""
 
+    kind: Literal["tilt-error", "imu"]
     error_deg: float
 
 

@@ -221,7 +221,7 @@ def _finish(plan: Plan, directory: Path, provenance: dict[str, Any], records: li
         frame_count=len(records),
         cameras={mounted.name: camera_entry(mounted) for mounted in recipe.cameras},
         sensor=SensorEntry(**recipe.sensor.acting()),
-        accelerometer=AccelerometerEntry(error_deg=recipe.accelerometer.error_deg),
+        accelerometer=AccelerometerEntry(kind=recipe.accelerometer.kind, error_deg=recipe.accelerometer.error_deg),
         led_map=led_map(scene.leds),
         room_m=scene.settings.room.size_m,
         provenance=provenance,
