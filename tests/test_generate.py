@@ -353,3 +353,28 @@ def test_workers_end_with_their_parent(tmp_path: Path) -> None:
     finally:
         with suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
+
+
+def test_a_lost_preview_or_expected_image_is_found(made: Path, tmp_path: Path) -> None:
+    shutil.copytree(made, tmp_path / "set")
+    (tmp_path / "set/expected/000001.exr").unlink()
+    (tmp_path / "set/previews/000002.png").unlink()
+    names = ("expected/000001", "previews/000002")
+    assert sorted(problems_of(tmp_path / "set")) == [f"{tmp_path}/set/{name}: is missing" for name in names]
+
+
+def test_a_frame_whose_preview_was_lost_is_made_again(made: Path, tmp_path: Path) -> None:
+    """An unfinished run goes on: a journal of all three frames, and one preview gone."""
+    generate(small_plan("expected=true"), tmp_path / "set")
+    tables = [pq.read_table(tmp_path / "set" / name).to_pylist() for name in ("frames.parquet", "truth.parquet")]
+    rows = [{"frame": n, "device": d, "truth": t} for n, (d, t) in enumerate(zip(*tables, strict=True))]
+    provenance = json.loads((tmp_path / "set/dataset.json").read_text())["provenance"]
+    (tmp_path / "set/dataset.json").unlink()
+    (tmp_path / "set/plan.json").write_text(json.dumps({"provenance": provenance}))
+    (tmp_path / "set/journal.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    (tmp_path / "set/previews/000001.png").unlink()
+    done: list[int] = []
+    generate(small_plan("expected=true"), tmp_path / "set", progress=lambda ready, _: done.append(ready))
+    assert done == [2, 3]
+    assert problems_of(tmp_path / "set") == []
+    assert digests(tmp_path / "set") == digests(made)

@@ -29,7 +29,7 @@ def view_of(background: float, led: float) -> View:
 
 
 def test_the_peak_holds_the_share() -> None:
-    metering = PeakMetering(kind="peak", share_of_full_well=0.7, longest_s=10.0)
+    metering = PeakMetering(kind="peak", share_of_saturation=0.7, longest_s=10.0)
     view = view_of(100.0, 900.0)  # 5000 e/s in the corner
     assert metering.time_s(view, 6000.0) == pytest.approx(4200 / 5000)
     assert metering.time_s(view_of(1.0, 0.0), 6000.0) == 10.0, "84 s would be too long"
@@ -45,7 +45,7 @@ def test_the_noise_level_is_that_of_the_brightest_led_pixel() -> None:
 
 
 METERED = {
-    "peak": ["exposure.kind=peak", "exposure.share_of_full_well=0.6", "exposure.longest_s=1.0"],
+    "peak": ["exposure.kind=peak", "exposure.share_of_saturation=0.6", "exposure.longest_s=1.0"],
     "noise-level": ["exposure.kind=noise-level", "exposure.level_db=-9"],
 }
 
@@ -65,8 +65,8 @@ def test_frames_are_exposed_for_it(kind: str, tmp_path: Path) -> None:
         path = tmp_path / f"set/expected/{row['frame']:06d}.exr"
         with OpenEXR.File(str(path), separate_channels=True) as file:
             peak = float(file.channels()["Y"].pixels.max())
-        # The LEDs are what is brightest here; float32.
-        assert peak == pytest.approx({"peak": 3600.0, "noise-level": 10**0.9}[kind], rel=1e-6)
+        # The LEDs are what is brightest here; float32. The converter ends at 4095 DN of 1 e, before the well of 6000 e.
+        assert peak == pytest.approx({"peak": 0.6 * 4095, "noise-level": 10**0.9}[kind], rel=1e-6)
 
 
 def test_a_recipe_in_json_gives_the_same_metering() -> None:

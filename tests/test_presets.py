@@ -104,8 +104,8 @@ REFUSED = {
         ["exposure", "motion", "exposure_s"],
     ),
     "share": (
-        ["exposure.kind=peak", "exposure.share_of_full_well=1.5", "exposure.longest_s=1.0"],
-        ["exposure.share_of_full_well = 1.5"],
+        ["exposure.kind=peak", "exposure.share_of_saturation=1.5", "exposure.longest_s=1.0"],
+        ["exposure.share_of_saturation = 1.5"],
     ),
     "level": (["exposure.kind=noise-level", "exposure.level_db=nan"], ["exposure.level_db"]),
     "repeats": (["repeats=0"], ["repeats = 0"]),

@@ -53,7 +53,7 @@ def test_a_metered_exposure_is_the_full_cameras(office: Scene) -> None:
     """
     pose = Pose((3.15, 3.1, 0.6), 6, -8, 20)
     kinds = {
-        "peak": ["exposure.kind=peak", "exposure.share_of_full_well=0.6", "exposure.longest_s=1.0"],
+        "peak": ["exposure.kind=peak", "exposure.share_of_saturation=0.6", "exposure.longest_s=1.0"],
         "noise-level": ["exposure.kind=noise-level", "exposure.level_db=-30"],
     }
     for metering in kinds.values():

@@ -3,7 +3,8 @@
 import hashlib
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -23,6 +24,8 @@ from vlcrender.scene import Leds
 from vlcrender.settings import Settings, check
 from vlcrender.windows import Window
 
+FRAMES, EXPECTED, PREVIEWS, PROCESSED = "frames", "expected", "previews", "processed"
+"""Folders with a file of each frame; the last three where asked for."""
 PREVIEW_PX = 800
 Shown = tuple[Window, NDArray[np.uint32] | NDArray[np.float32]]
 """A window and its pixels (rows, columns)."""
@@ -254,17 +257,32 @@ def write_preview(path: Path, images: Sequence[Shown], sensor: Window, white_dn:
 
 
 def write_table(path: Path, rows: Sequence[Mapping[str, Any]], schema: pa.Schema) -> None:
-    """Write a Parquet table; it appears whole or not at all."""
-    partial = path.with_suffix(".partial")
-    pq.write_table(pa.Table.from_pylist(list(rows), schema=schema), partial)
-    os.replace(partial, path)
+    """Write a Parquet table; it appears whole or not at all. Raises InputError where it cannot be written."""
+    with _whole(path) as partial:
+        pq.write_table(pa.Table.from_pylist(list(rows), schema=schema), partial)
 
 
 def write_json(path: Path, tree: Mapping[str, Any]) -> None:
-    """Write JSON; it appears whole or not at all."""
+    """Write JSON; it appears whole or not at all. Raises InputError where it cannot be written."""
+    with _whole(path) as partial:
+        partial.write_text(json.dumps(tree, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+@contextmanager
+def _whole(path: Path) -> Iterator[Path]:
+    """Where to write a file that is then put in its place, or is gone where it could not be written."""
     partial = path.with_suffix(".partial")
-    partial.write_text(json.dumps(tree, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    os.replace(partial, path)
+    try:
+        yield partial
+        os.replace(partial, path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise InputError(f"{path}: cannot be written: {error.strerror or first_line(str(error))}") from None
+
+
+def first_line(text: str) -> str:
+    """The first line of a library's many."""
+    return (text.splitlines() or [""])[0]
 
 
 def sha256_of(path: Path) -> str:

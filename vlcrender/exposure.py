@@ -27,8 +27,7 @@ def variance_e2(sensor: Sensor, expected_e: NDArray[np.float32], exposure_s: flo
         variance += (sensor.prnu * mean) ** 2 + sum(sigma**2 for sigma in added)
     if full or gain != 1.0:
         variance += gain**2 / 12
-    top_e = min(sensor.full_well_e, (sensor.largest_dn - sensor.black_level_dn) * gain)
-    variance[level >= top_e] = np.inf
+    variance[level >= sensor.saturation_e] = np.inf
     return variance
 
 

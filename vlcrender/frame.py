@@ -10,7 +10,7 @@ import numpy as np
 
 from vlcrender.bounds import position_bound_m2
 from vlcrender.camera import Camera, Pose
-from vlcrender.dataset import exr_attributes, write_exr, write_preview
+from vlcrender.dataset import EXPECTED, FRAMES, PREVIEWS, PROCESSED, exr_attributes, write_exr, write_preview
 from vlcrender.downlink import decoded_spots
 from vlcrender.exposure import expose, variance_e2
 from vlcrender.irradiance import bake
@@ -27,8 +27,6 @@ from vlcrender.sensor import Sensor
 from vlcrender.streams import stream
 from vlcrender.view import Image, View
 from vlcrender.windows import Window
-
-FRAMES, EXPECTED, PREVIEWS, PROCESSED = "frames", "expected", "previews", "processed"
 
 Record = dict[str, Any]
 """One frame's rows: {"frame": n, "device": row of frames.parquet, "truth": row of truth.parquet}."""

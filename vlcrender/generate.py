@@ -15,6 +15,7 @@ from typing import Any
 
 from vlcrender import __version__
 from vlcrender.dataset import (
+    FRAMES,
     FRAMES_SCHEMA,
     TRUTH_SCHEMA,
     AccelerometerEntry,
@@ -27,11 +28,11 @@ from vlcrender.dataset import (
     write_table,
 )
 from vlcrender.errors import InputError
-from vlcrender.frame import EXPECTED, FRAMES, PREVIEWS, PROCESSED, Job, Record, make_frame, poses_of
+from vlcrender.frame import Job, Record, make_frame, poses_of
 from vlcrender.irradiance import bake, room_mesh
 from vlcrender.recipe import Plan, Recipe
 from vlcrender.render import check_inside, share_cores
-from vlcrender.verify import problems_of
+from vlcrender.verify import folders_of, missing_files, problems_of
 
 
 def generate(
@@ -68,7 +69,7 @@ def generate(
     job = Job(
         plan.recipe.model_dump_json(), plan.scene.settings.model_dump_json(), str(plan.scene.folder), str(directory)
     )
-    done = _journal(directory)
+    done = _journal(directory, plan.recipe)
     missing = [frame for frame in range(plan.recipe.frame_count) if frame not in done]
     if done:
         progress(len(done), plan.recipe.frame_count)
@@ -182,15 +183,14 @@ def _prepare(directory: Path, provenance: dict[str, Any], recipe: Recipe) -> Non
         _check_same(plan_file, provenance, "an unfinished dataset of another recipe, scene or version")
     elif directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
         raise InputError(f"{directory}: is not empty and not a dataset; nothing was changed; choose another --out")
-    asked_for = {FRAMES: True, PREVIEWS: True, EXPECTED: recipe.expected, PROCESSED: recipe.processed is not None}
-    for name in (name for name, wanted in asked_for.items() if wanted):
+    for name in [FRAMES, *folders_of(recipe.expected, recipe.processed is not None)]:
         (directory / name).mkdir(parents=True, exist_ok=True)
     for leftover in directory.rglob("*.partial"):
         leftover.unlink()
     write_json(plan_file, {"provenance": provenance})
 
 
-def _journal(directory: Path) -> dict[int, Record]:
+def _journal(directory: Path, recipe: Recipe) -> dict[int, Record]:
     """Frames that an interrupted run finished and whose files are still intact."""
     path = directory / "journal.jsonl"
     if not path.exists():
@@ -204,6 +204,9 @@ def _journal(directory: Path) -> dict[int, Record]:
                 done[int(record["frame"])] = record
         except (ValueError, KeyError, TypeError):
             continue  # the line a crash cut short: that frame is made again
+    folders = folders_of(recipe.expected, recipe.processed is not None)
+    for frame in missing_files(directory, folders, list(done)):
+        del done[frame]
     write_partial = path.with_suffix(".partial")
     write_partial.write_text("".join(json.dumps(record) + "\n" for record in done.values()), encoding="utf-8")
     os.replace(write_partial, path)

@@ -13,16 +13,16 @@ LongestTime = Annotated[float, Field(gt=0, le=100)]
 
 
 class PeakMetering(Settings):
-    """Expose until the brightest pixel of the noise-free image holds a share of the full well."""
+    """Expose until the brightest pixel of the noise-free image holds a share of what saturates it."""
 
     kind: Literal["peak"]
-    share_of_full_well: Annotated[float, Field(gt=0, le=1)]
+    share_of_saturation: Annotated[float, Field(gt=0, le=1)]
     longest_s: LongestTime
 
-    def time_s(self, view: View, full_well_e: float) -> float:
+    def time_s(self, view: View, saturation_e: float) -> float:
         """Exposure time of a view, seconds."""
         rate = max(float(part.expected_electrons(1.0).max()) for part in view.parts)
-        return _time_s(self.share_of_full_well * full_well_e, rate, self.longest_s)
+        return _time_s(self.share_of_saturation * saturation_e, rate, self.longest_s)
 
 
 class NoiseLevelMetering(Settings):
@@ -36,8 +36,8 @@ class NoiseLevelMetering(Settings):
     level_db: Annotated[float, Field(ge=-60, le=30)]
     longest_s: LongestTime = 1.0
 
-    def time_s(self, view: View, full_well_e: float) -> float:
-        """Exposure time of a view, seconds; the well's size does not matter."""
+    def time_s(self, view: View, saturation_e: float) -> float:
+        """Exposure time of a view, seconds; the sensor does not matter."""
         rate = 0.0
         for part in view.parts:
             image = part.expected_electrons(1.0)

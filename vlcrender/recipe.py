@@ -119,7 +119,7 @@ class Recipe(Settings):
     def time_s(self, view: View) -> float:
         """Exposure time of a view, seconds."""
         if self.exposure is not None:
-            return self.exposure.time_s(view, self.sensor.full_well_e)
+            return self.exposure.time_s(view, self.sensor.saturation_e)
         assert self.exposure_s is not None  # _one_way_to_expose
         return self.exposure_s
 

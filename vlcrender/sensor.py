@@ -113,6 +113,11 @@ class Sensor(Settings):
         return min(self.largest_dn, round(self.full_well_e / self.gain_at_iso_e_per_dn) + self.black_level_dn)
 
     @property
+    def saturation_e(self) -> float:
+        """Electrons at which a pixel saturates: the full well, or the converter's end where that comes first."""
+        return min(self.full_well_e, (self.largest_dn - self.black_level_dn) * self.gain_at_iso_e_per_dn)
+
+    @property
     def gain_at_iso_e_per_dn(self) -> float:
         """Electrons a digital number at the sensor's ISO: 1 / K of EMVA 1288."""
         return self.gain_e_per_dn * (self.base_iso / self.iso)

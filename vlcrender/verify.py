@@ -1,6 +1,6 @@
 """Whether a dataset on disk is all there and intact, and its truth agrees with itself."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +10,11 @@ import pyarrow.parquet as pq
 
 from vlcrender.camera import Camera, image_of_points, transform
 from vlcrender.dataset import (
+    EXPECTED,
     FRAMES_SCHEMA,
     MAY_BE_EMPTY,
+    PREVIEWS,
+    PROCESSED,
     TRUTH_SCHEMA,
     CameraEntry,
     DatasetFile,
@@ -39,10 +42,30 @@ def problems_of(directory: Path) -> list[str]:
     truth = _read_rows(directory / "truth.parquet", TRUTH_SCHEMA, dataset.frame_count, found)
     for row in frames:
         found += _problems_of_frame(directory, row, dataset)
+    recipe = dataset.provenance.get("recipe", {})
+    folders = folders_of(bool(recipe.get("expected")), recipe.get("processed") is not None)
+    found += [f"{path}: is missing" for path in missing_files(directory, folders, range(dataset.frame_count)).values()]
     for row in truth:
         camera = cameras.get(frames[row["frame"]]["camera"]) if frames else None
         found += _problems_of_truth(row, camera, dataset)
     return found
+
+
+def folders_of(expected: bool, processed: bool) -> list[str]:
+    """Folders that hold a file of each frame beside `frames`."""
+    return [PREVIEWS, *([EXPECTED] if expected else []), *([PROCESSED] if processed else [])]
+
+
+def missing_files(directory: Path, folders: Iterable[str], frames: Iterable[int]) -> dict[int, Path]:
+    """Frames that lack a file in one of the folders, each with the first that it lacks (less its ending)."""
+    missing: dict[int, Path] = {}
+    numbers = list(frames)
+    for folder in folders:
+        there = {path.stem for path in (directory / folder).glob("*") if path.suffix != ".partial"}
+        for frame in numbers:
+            if f"{frame:06d}" not in there:
+                missing.setdefault(frame, directory / folder / f"{frame:06d}")
+    return missing
 
 
 def _camera_of(entry: CameraEntry, source: str) -> Camera:
