@@ -18,6 +18,7 @@ from estimator.tables import NotNegative, Number, Positive, Row, Triple, first_l
 INT64_MAX = 2**63 - 1
 MOST_PIXELS = 16
 """How many times the sensor's pixels the windows of a frame may hold, which may reach beyond it."""
+FULL_SIGMA = 4.0
 LedId = Annotated[int, Field(ge=0, le=INT64_MAX)]
 # Within 1000 km of the origin: then no range, even a wrong one, is too large to be written down.
 Place = Annotated[float, Field(ge=-1e6, le=1e6)]
@@ -107,6 +108,25 @@ class Sensor(Row):
     def largest_dn(self) -> float:
         """The digital number of a pixel that holds all it can: the full well's, or the converter's last."""
         return min(2.0**self.bits - 1, float(np.rint(self.full_well_e / self.gain_e_per_dn)) + self.black_level_dn)
+
+    def full_dn(self) -> float:
+        """From here on a pixel may be full: what is read out of a full one has the noise of reading it.
+
+        Four standard deviations below the full well, of all that is added after it is clipped. The converter's last
+        number needs no such room: a pixel that reads less has not reached it.
+        """
+        added_e = float(np.hypot(self.read_noise_e, np.hypot(self.row_offset_e, self.column_offset_e)))
+        spread_dn = float(np.hypot(added_e / self.gain_e_per_dn, self.adc_noise_dn))
+        well_dn = float(np.rint(self.full_well_e / self.gain_e_per_dn)) + self.black_level_dn
+        return min(2.0**self.bits - 1, well_dn - FULL_SIGMA * spread_dn)
+
+    def floor_e2(self) -> float:
+        """Variance of a pixel, electrons squared, that does not grow with its light.
+
+        Offsets of whole rows and columns are left out: a spot's background takes most of them away.
+        """
+        rounding = self.gain_e_per_dn**2 / 12 if self.noise == "full" or self.gain_e_per_dn != 1 else 0.0
+        return self.dsnu_e**2 + self.read_noise_e**2 + (self.adc_noise_dn * self.gain_e_per_dn) ** 2 + rounding
 
 
 class Led(Row):
@@ -223,8 +243,9 @@ class DeviceFrame:
         return image
 
     def clipped(self, part: Part) -> NDArray[np.bool_]:
-        """Where a pixel of a part is full and its electrons are unknown, (rows, columns)."""
-        return part.image_dn >= self.sensor.largest_dn()
+        """Where a pixel of a part is full, or may be, and its electrons are unknown, (rows, columns)."""
+        # An integer: beside a float the whole image would be made one.
+        return part.image_dn >= int(np.ceil(self.sensor.full_dn()))
 
 
 def read_dataset(folder: Path) -> Dataset:

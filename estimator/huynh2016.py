@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.dataset import DeviceFrame, Sensor
+from estimator.dataset import DeviceFrame
 from estimator.denoise import DENOISERS
 from estimator.errors import EstimationFailure
 from estimator.identify import Sighting
@@ -63,7 +63,7 @@ class Huynh2016:
 
     def __call__(self, frame: DeviceFrame) -> Estimate:
         """Denoise, find the LEDs, take the lens and the tilt out, ranges, position. Raises EstimationFailure."""
-        denoiser, noise_e = DENOISERS[self.denoise], _read_noise_e(frame.sensor)
+        denoiser, noise_e = DENOISERS[self.denoise], float(np.sqrt(frame.sensor.floor_e2()))
         seen = sightings(frame, lambda raw_e: denoiser.apply(raw_e, noise_e), denoiser.reach_px)
         K, leds_m = frame.camera.matrix(), led_positions_m(seen)
         tilt = LEVELS[self.level](*tilt_from_gravity(frame.accelerometer_m_s2))
@@ -74,11 +74,6 @@ class Huynh2016:
             return Estimate(POSITIONS[self.position](leds_m, distances_m), ranges_m)
         except EstimationFailure as failure:
             raise EstimationFailure(failure.stage, failure.why, ranges_m) from None
-
-
-def _read_noise_e(sensor: Sensor) -> float:
-    """Standard deviation of a pixel's noise beside its shot noise, electrons: read-out and converter."""
-    return float(np.hypot(sensor.read_noise_e, sensor.adc_noise_dn * sensor.gain_e_per_dn))
 
 
 def huynh2016_with(name: str) -> Variant:

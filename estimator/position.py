@@ -1,6 +1,5 @@
-"""Distances, or the spots themselves, to the camera's position in the world."""
+"""Distances to the camera's position in the world, and which LEDs fix one at all."""
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
@@ -14,8 +13,7 @@ Floats = NDArray[np.float64]
 NARROWEST_PATTERN = 0.01
 # Rahman's "small value" by which LEDs are moved in z; theirs is not known. Well above what rounding does to a range.
 SHIFT_M = 0.01
-# Depth over length: from here on the planar solver starts from a wrong model.
-FLATTEST_PATTERN = 1e-3
+FEWEST_FOR_ORIENTATION = 4
 
 
 def position_from_ranges(leds_m: Floats, ranges_m: Floats) -> Floats:
@@ -84,58 +82,11 @@ def position_by_range_fit(leds_m: Floats, ranges_m: Floats) -> Floats:
     return np.asarray(fit.x, dtype=np.float64)
 
 
-def position_from_pixels(leds_m: Floats, pixels: Floats, K: Floats) -> Floats:
-    """The camera's position, (3,) metres, from LEDs (n, 3) and their pixels (n, 2), without any reading of gravity.
-
-    Perspective-n-point: candidates from SQPNP and, for LEDs in a plane, both of IPPE's; each refined by
-    Levenberg-Marquardt. Of those with every LED in front of the camera and above it, the one that projects best.
-    Raises EstimationFailure for fewer than four LEDs, LEDs on one line, and where no candidate is left.
-    """
-    check_pattern(leds_m, needed=4, flat=False)
-    centre_m = leds_m.mean(axis=0)
-    model = np.ascontiguousarray(leds_m - centre_m)
-    # OpenCV knows no skew, so K is taken out here; this also makes its pixel convention no matter.
-    rays = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(K).T
-    image = np.ascontiguousarray(rays[:, :2])
-    length, _, depth = np.linalg.svd(model, compute_uv=False)
-    methods = [cv2.SOLVEPNP_SQPNP] + ([cv2.SOLVEPNP_IPPE] if depth < FLATTEST_PATTERN * length else [])
-    best_error = np.inf
-    best: Floats | None = None
-    for method in methods:
-        for turn, shift in _candidates(model, image, method):
-            seen = model @ turn.T + shift
-            position_m = centre_m - turn.T @ shift
-            error = float(np.linalg.norm(seen[:, :2] / seen[:, 2:] - image))
-            fits = (seen[:, 2] > 0).all() and position_m[2] < leds_m[:, 2].min()
-            if fits and error < best_error:
-                best_error, best = error, position_m
-    if best is None:
-        raise EstimationFailure("position", "no pose has the camera below the LEDs and the LEDs in front of it")
-    return best
-
-
-def _candidates(model: Floats, image: Floats, method: int) -> list[tuple[Floats, Floats]]:
-    """Refined poses as (rotation (3, 3), translation (3,)), of a method that may find none."""
-    eye = np.eye(3)
-    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 50, 1e-14)
-    try:
-        _, turns, shifts, _ = cv2.solvePnPGeneric(model, image, eye, None, flags=method)
-        poses = []
-        for turn, shift in zip(turns, shifts, strict=True):
-            turn, shift = cv2.solvePnPRefineLM(model, image, eye, None, turn, shift, criteria)
-            poses.append((cv2.Rodrigues(turn)[0], shift.ravel()))
-    except cv2.error:
-        return []
-    return poses
-
-
 def check_pattern(leds_m: Floats, needed: int, flat: bool) -> None:
     """Refuse LEDs that do not fix a position: too few, or all on one line (looking at x and y alone where `flat`)."""
     if len(leds_m) < needed:
         raise EstimationFailure("position", f"LEDs identified: {len(leds_m)}, needed: {needed}")
-    points = leds_m[:, :2] if flat else leds_m
-    length, width = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[:2]
-    if width <= NARROWEST_PATTERN * length:
+    if on_one_line(leds_m[:, :2] if flat else leds_m):
         raise EstimationFailure("position", "the LEDs are on one line")
 
 
@@ -144,3 +95,14 @@ def _check_ceiling(leds_m: Floats, needed: int) -> None:
     check_pattern(leds_m, needed, flat=True)
     if np.ptp(leds_m[:, 2]) > COMMON_HEIGHT_M:
         raise EstimationFailure("position", "the LEDs are not at a common height")
+
+
+def on_one_line(points_m: Floats) -> bool:
+    """Whether points (n, 2) or (n, 3) are as good as on one line."""
+    length, width = np.linalg.svd(points_m - points_m.mean(axis=0), compute_uv=False)[:2]
+    return bool(width <= NARROWEST_PATTERN * length)
+
+
+def fix_orientation(leds_m: Floats) -> bool:
+    """Whether LEDs (n, 3) give the camera's orientation without gravity, and with one to spare."""
+    return len(leds_m) >= FEWEST_FOR_ORIENTATION and not on_one_line(leds_m)

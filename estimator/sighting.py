@@ -19,8 +19,11 @@ def sightings(frame: DeviceFrame, denoise: Callable[[Image], Image] | None = Non
     for part in frame.parts:
         raw = frame.electrons(part)
         image = raw if denoise is None else denoise(raw)
-        readouts.append(Readout(part.row, part.column, image, raw, frame.clipped(part)))
-    spots = detect(readouts, frame.camera.width_px * frame.camera.height_px, reach_px)
+        noise = {"floor_e2": frame.sensor.floor_e2(), "prnu": frame.sensor.prnu}
+        readouts.append(Readout(part.row, part.column, image, raw, frame.clipped(part), **noise))
+    decoded_px = np.array([(spot.u_px, spot.v_px) for spot in frame.spots]).reshape(-1, 2)
+    corners = any(frame.leds[spot.led].shape == "square" for spot in frame.spots)
+    spots = detect(readouts, frame.camera.width_px * frame.camera.height_px, reach_px, decoded_px, corners)
     return list(identify(spots, frame.spots, frame.leds))
 
 

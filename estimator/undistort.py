@@ -1,4 +1,4 @@
-"""The lens out: from pixels of a real lens to those of a pinhole with the same `K`."""
+"""The lens out: from pixels of a real lens to those of a pinhole with the same `K`, and back."""
 
 import cv2
 import numpy as np
@@ -32,6 +32,20 @@ def pinhole_pixels(pixels: Floats, camera: Camera) -> Floats:
     return np.asarray(plane @ K[:2, :2].T + K[:2, 2])
 
 
+def lens_pixels(pixels: Floats, camera: Camera) -> Floats:
+    """The way back: pixels (n, 2) of a pinhole with a camera's `K` as the camera itself has them, (n, 2)."""
+    if camera.projection == "perspective" and camera.distortion is None:
+        return pixels
+    K = camera.matrix()
+    plane = (np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(K).T)[:, :2]
+    if camera.distortion is None:
+        tangent = np.linalg.norm(plane, axis=1, keepdims=True)
+        plane = plane * np.divide(np.arctan(tangent), tangent, out=np.ones_like(tangent), where=tangent > 0)
+    else:
+        plane = _distorted(plane, _coefficients(camera.distortion))[0]
+    return np.asarray(plane @ K[:2, :2].T + K[:2, 2])
+
+
 def _from_angles(on_sensor: Floats) -> Floats:
     """Positions (n, 2) at a distance theta from the axis to those at tan(theta)."""
     theta = np.linalg.norm(on_sensor, axis=1, keepdims=True)
@@ -44,8 +58,7 @@ def _from_angles(on_sensor: Floats) -> Floats:
 
 def _undistorted(on_sensor: Floats, distortion: Distortion) -> Floats:
     """Distorted positions (n, 2) to undistorted ones, by Newton's method."""
-    d = distortion
-    coefficients = np.array([d.k1, d.k2, d.p1, d.p2, d.k3])
+    coefficients = _coefficients(distortion)
     plane = on_sensor
     with np.errstate(all="ignore"):
         for _ in range(MOST_STEPS):
@@ -58,6 +71,11 @@ def _undistorted(on_sensor: Floats, distortion: Distortion) -> Floats:
             except np.linalg.LinAlgError:
                 break
     raise EstimationFailure("undistort", "the distortion cannot be undone at a spot")
+
+
+def _coefficients(distortion: Distortion) -> Floats:
+    """As OpenCV orders them."""
+    return np.array([distortion.k1, distortion.k2, distortion.p1, distortion.p2, distortion.k3])
 
 
 def _distorted(plane: Floats, coefficients: Floats) -> tuple[Floats, Floats]:

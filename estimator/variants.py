@@ -1,24 +1,16 @@
 """The named pipelines: from what a device has, one frame, to where it is."""
 
-from estimator.dataset import DeviceFrame
 from estimator.errors import InputError
+from estimator.gravity_fit import GRAVITY_FIT
 from estimator.huynh2016 import HUYNH2016, HUYNH2016_AS_PRINTED, huynh2016_with
 from estimator.kim import KIM
+from estimator.maximum_likelihood import ML
 from estimator.nakazawa2013 import NAKAZAWA2013
-from estimator.pipeline import Estimate, Variant
-from estimator.position import position_from_pixels
+from estimator.pipeline import Variant
+from estimator.pnp import IPPE, PNP, SQPNP
 from estimator.rahman2011 import RAHMAN2011
-from estimator.sighting import centroids_px, led_positions_m, sightings
-from estimator.undistort import pinhole_pixels
+from estimator.upright import UP2P
 from estimator.yoshino2008 import YOSHINO2008
-
-
-def pnp(frame: DeviceFrame) -> Estimate:
-    """Perspective-n-point on centroids of the raw image; gravity is not used."""
-    seen = sightings(frame)
-    pixels = pinhole_pixels(centroids_px(seen), frame.camera)
-    return Estimate(position_from_pixels(led_positions_m(seen), pixels, frame.camera.matrix()))
-
 
 VARIANTS = {
     variant.name: variant
@@ -29,7 +21,12 @@ VARIANTS = {
         NAKAZAWA2013,
         RAHMAN2011,
         KIM,
-        Variant("pnp", "perspective-n-point (SQPNP, IPPE, Levenberg-Marquardt) on raw centroids, no gravity", pnp),
+        PNP,
+        IPPE,
+        SQPNP,
+        UP2P,
+        GRAVITY_FIT,
+        ML,
     )
 }
 STAGED = {"huynh2016": huynh2016_with}

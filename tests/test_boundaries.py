@@ -16,7 +16,7 @@ LIBRARY_ROOMS = {
     "cv2": {"estimator"},
     "colour": {"vlcrender/photometry.py"},
     "colour_demosaicing": {"vlcrender/tone.py"},
-    "PIL": {"vlcrender/tone.py"},
+    "PIL": {"vlcrender/texture.py", "vlcrender/tone.py"},
 }
 BACKEND_ROOMS = {
     *("backend", "background", "exposure", "furniture", "irradiance", "mitsuba_room"),

@@ -16,6 +16,7 @@ from vlcrender.scene import build_scene
 from vlcrender.scene_settings import SceneSettings
 from vlcrender.sensor import Sensor
 from vlcrender.settings import check, read_toml
+from vlcrender.view import LedPatch
 from vlcrender.windows import Window
 
 EXPOSURE_S = 1.6e-6
@@ -40,10 +41,12 @@ def bound_m2(
     renderer: Renderer, camera: Camera, led_ids: Sequence[int], sigma_deg: float, exposure_s: float = EXPOSURE_S
 ) -> np.ndarray | None:
     expected = renderer.view(camera, POSE).expected_electrons(exposure_s)
+
+    def patches(pose: Pose) -> list[LedPatch]:
+        return [patch for patch in renderer.led_patches(camera, pose) if patch.led_id in led_ids]
+
     variance = [(Window.of_sensor(camera), variance_e2(Sensor(full_well_e=1e6), expected))]
-    return position_bound_m2(
-        camera, POSE, lambda p: renderer.led_patches(camera, p), exposure_s, variance, led_ids, 2.6, sigma_deg
-    )
+    return position_bound_m2(camera, POSE, patches, exposure_s, variance, 2.6, sigma_deg)
 
 
 def moved(unknown: int, by: float) -> Pose:
@@ -126,7 +129,7 @@ def test_gravity_and_more_leds_lower_it(renderer: Renderer, small_camera: Camera
 
 
 def test_a_frame_that_determines_nothing_has_none(renderer: Renderer, small_camera: Camera) -> None:
-    """A disc alone looks the same for any yaw; identities nobody knows tell nothing."""
+    """A disc alone looks the same for any yaw, and nothing at all tells nothing."""
     assert bound_m2(renderer, small_camera, [0], 0.5) is None
     assert bound_m2(renderer, small_camera, [], 0.5) is None
     assert bound_m2(renderer, small_camera, [0, 1], 0.5) is not None

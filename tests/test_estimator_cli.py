@@ -153,7 +153,7 @@ ERRORS = [
     (["run", "{data}", "--workers", "many"], "--workers"),
     (["compare", "{data}", "pnp"], "B"),
     (["compare", "{data}", "pnp", "pnp"], "pnp and pnp: needed two different variants"),
-    (["compare", "{data}", "pnp", "best"], "none of variant best; there are: huynh2016, "),
+    (["compare", "{data}", "pnp", "best"], "none of variant best; there are: "),
     (["compare", "{tmp}/nowhere", "pnp", "huynh2016"], "nowhere: no such folder"),
     (["report", "--out", "{tmp}/x.html"], "DATASETS"),
     (["report", "{data}"], "--out"),

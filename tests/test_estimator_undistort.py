@@ -6,7 +6,7 @@ from estimator_synthetic import Array
 
 from estimator.dataset import Camera, Distortion
 from estimator.errors import EstimationFailure
-from estimator.undistort import pinhole_pixels
+from estimator.undistort import lens_pixels, pinhole_pixels
 
 
 def camera(projection: str = "perspective", skew_px: float = 0.0, **coefficients: float) -> Camera:
@@ -91,3 +91,17 @@ def test_a_place_that_the_lens_images_nothing_at_is_a_named_failure(coefficients
     """r (1 - r^2 / 2) does not reach beyond 0.55."""
     with pytest.raises(EstimationFailure, match=r"^undistort: the distortion cannot be undone at a spot$"):
         pinhole_pixels(pixels((200.0, 150.0), (260.0, 151.0)), camera(**coefficients))
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        camera(),
+        camera("equidistant", skew_px=5.0),
+        camera(k1=-0.12, k2=0.03, k3=-0.002, p1=0.004, p2=-0.003),
+    ],
+    ids=["pinhole", "fish-eye", "distortion"],
+)
+def test_there_and_back_is_where_one_was(lens: Camera) -> None:
+    given = pixels((120.0, 180.0), (200.0, 150.0), (250.3, 93.9), (290.0, 200.0))
+    np.testing.assert_allclose(lens_pixels(pinhole_pixels(given, lens), lens), given, atol=1e-9)

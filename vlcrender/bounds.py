@@ -3,8 +3,9 @@
 No unbiased estimator has a smaller covariance than the inverse of the Fisher information (S. M. Kay, Fundamentals of
 Statistical Signal Processing: Estimation Theory, 1993, chapter 3). The unknowns are the camera's position and its two
 tilts and yaw; for each LED how bright it is, and for each group of LEDs whose surroundings touch the level of the
-background, both nuisances. The LEDs' shapes, places and identities, the lens and the sensor are known. With the
-expected image mu(p) and its variance var(p) of pixel p, the information about unknowns i and j is
+background, both nuisances. The LEDs' shapes and places, the lens and the sensor are known, and so is which LED each
+image is of, decoded or not: a pose known to pixels says that too. With the expected image mu(p) and its variance var(p)
+of pixel p, the information about unknowns i and j is
 
     J_ij = sum over p of (d mu / d i) (d mu / d j) / var,
 
@@ -13,7 +14,7 @@ the information in the variance, which goes as 1 / mu. The derivatives over the 
 whose edges are exact. The accelerometer adds 1 / sigma^2 to the two tilts.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +45,6 @@ def position_bound_m2(
     render: Render,
     exposure_s: float,
     variance_e2: Variance,
-    led_ids: Iterable[int],
     distance_m: float,
     tilt_sigma_deg: float,
     overscan: bool = False,
@@ -52,12 +52,11 @@ def position_bound_m2(
     """Bound of the position's covariance, (3, 3), world axes; None where the frame does not determine it.
 
     render: the LEDs' own light at a pose near `pose`, electrons a second. variance_e2: the windows read out, each
-    (rows, columns), with the variance of each pixel, inf where it tells nothing (a saturated one). led_ids: LEDs whose
-    identity is known. distance_m: roughly, from the camera to the LEDs. tilt_sigma_deg: of the accelerometer, each
-    axis; 0 means that the tilts are known. overscan: whether LEDs count beyond the sensor.
+    (rows, columns), with the variance of each pixel, inf where it tells nothing (a saturated one). distance_m: roughly,
+    from the camera to the LEDs. tilt_sigma_deg: of the accelerometer, each axis; 0 means that the tilts are known.
+    overscan: whether LEDs count beyond the sensor.
     """
-    known = set(led_ids)
-    at_pose = [patch for patch in render(pose) if patch.led_id in known]
+    at_pose = render(pose)
     if not at_pose:
         return None
     # Of x, y, z in metres and tilt_x, tilt_y, yaw in radians: each moves images by some STEP_PX.

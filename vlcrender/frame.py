@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ from vlcrender.scene import Scene, build_scene
 from vlcrender.scene_settings import SceneSettings
 from vlcrender.sensor import Sensor
 from vlcrender.streams import stream
-from vlcrender.view import Image
+from vlcrender.view import Image, View
 from vlcrender.windows import Window
 
 FRAMES, EXPECTED, PREVIEWS, PROCESSED = "frames", "expected", "previews", "processed"
@@ -51,12 +51,9 @@ def make_frame(job: Job, frame: int) -> Record:
     pose_number, shot, which = recipe.place_of_frame(frame)
     mounted = recipe.cameras[which]
     camera, sensor = mounted.camera, Window.of_sensor(mounted.camera)
-    main, during = poses_of_frame(recipe, renderer.scene, frame)
-    pose = mounted.pose(main)
-    view = renderer.view(camera, pose, recipe.windows, during)
-    exposure_s = recipe.time_s(view)
+    seen = _seen(job, pose_number, which)
+    main, pose, view, exposure_s, expected = seen.main, seen.pose, seen.view, seen.exposure_s, seen.expected
     noise = f"{recipe.seed}/{frame}/shot-noise"
-    expected = [(part.window, part.expected_electrons(exposure_s)) for part in view.parts]
     dn = [
         (window, expose(recipe.sensor, image, noise, window.row, window.column, exposure_s, mounted.name))
         for window, image in expected
@@ -97,9 +94,34 @@ def make_frame(job: Job, frame: int) -> Record:
             {"led": p.led_id, "u_px": p.center_px[0], "v_px": p.center_px[1], "visible_fraction": p.visible_fraction}
             for p in sorted(view.patches, key=lambda p: p.led_id)
         ],
-        "bound_m2": _bound_m2(recipe, renderer, mounted, main, exposure_s, expected, device["spots"]),
+        "bound_m2": seen.bound_m2,
     }
     return {"frame": frame, "device": device, "truth": truth}
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """What all repeats of a pose share: all but noise."""
+
+    main: Pose
+    pose: Pose
+    view: View
+    exposure_s: float
+    expected: list[tuple[Window, Image]]
+    bound_m2: list[float] | None
+
+
+@lru_cache(maxsize=1)
+def _seen(job: Job, pose_number: int, which: int) -> _Seen:
+    """What a camera of the rig sees at a pose; kept for the next repeat."""
+    recipe, renderer = _renderer(job.recipe_json, job.scene_json, job.scene_folder)
+    mounted = recipe.cameras[which]
+    main, during = poses_of(recipe, renderer.scene, pose_number, which)
+    view = renderer.view(mounted.camera, mounted.pose(main), recipe.windows, during)
+    exposure_s = recipe.time_s(view)
+    expected = [(part.window, part.expected_electrons(exposure_s)) for part in view.parts]
+    bound = _bound_m2(recipe, renderer, mounted, main, exposure_s, expected)
+    return _Seen(main, mounted.pose(main), view, exposure_s, expected, bound)
 
 
 def _bound_m2(
@@ -109,7 +131,6 @@ def _bound_m2(
     main: Pose,
     exposure_s: float,
     expected: Sequence[tuple[Window, Image]],
-    spots: Sequence[dict[str, Any]],
 ) -> list[float] | None:
     """The frame's Cramér-Rao bound, row by row; None where it is not asked for or nothing is determined."""
     if not recipe.bound:
@@ -121,7 +142,6 @@ def _bound_m2(
         lambda pose: renderer.led_patches(mounted.camera, mounted.pose(pose), recipe.windows, mounted.pose(main)),
         exposure_s,
         [(window, variance_e2(recipe.sensor, image, exposure_s)) for window, image in expected],
-        [spot["led"] for spot in spots],
         float(np.median(np.linalg.norm(renderer.scene.leds.centers_m - position, axis=1))),
         recipe.accelerometer.error_deg,
         recipe.windows is not None and recipe.windows.overscan,
@@ -129,9 +149,8 @@ def _bound_m2(
     return None if bound is None else bound.ravel().tolist()
 
 
-def poses_of_frame(recipe: Recipe, scene: Scene, frame: int) -> tuple[Pose, tuple[Pose, ...]]:
-    """The pose of the camera `main` at mid-exposure, and those of the frame's own camera during the exposure."""
-    pose_number, _, which = recipe.place_of_frame(frame)
+def poses_of(recipe: Recipe, scene: Scene, pose_number: int, which: int) -> tuple[Pose, tuple[Pose, ...]]:
+    """The pose of the camera `main` at mid-exposure, and those of the camera number `which` during the exposure."""
     main = pose_of_frame(recipe.poses, pose_number, recipe.seed, recipe.camera, scene)
     # Without a time there is no motion, and the other way round: the recipe sees to it.
     return main, poses_during(recipe.motion, recipe.cameras[which], main, recipe.exposure_s or 0.0, scene)

@@ -25,7 +25,7 @@ from vlcrender.dataset import (
     write_table,
 )
 from vlcrender.errors import InputError
-from vlcrender.frame import EXPECTED, FRAMES, PREVIEWS, PROCESSED, Job, Record, make_frame, poses_of_frame
+from vlcrender.frame import EXPECTED, FRAMES, PREVIEWS, PROCESSED, Job, Record, make_frame, poses_of
 from vlcrender.irradiance import bake, room_mesh
 from vlcrender.recipe import Plan, Recipe
 from vlcrender.render import check_inside, share_cores
@@ -52,10 +52,11 @@ def generate(
         if damage:
             raise InputError(f"{directory}: is complete but damaged: {damage[0]}; delete it or choose another --out")
         return False
-    for frame in range(plan.recipe.frame_count):  # impossible poses are found before the first image
-        _, during = poses_of_frame(plan.recipe, plan.scene, frame)
-        check_inside(plan.scene, during[0])
-        check_inside(plan.scene, during[-1])
+    for pose_number in range(plan.recipe.poses.count):  # impossible poses are found before the first image
+        for which in range(len(plan.recipe.cameras)):
+            _, during = poses_of(plan.recipe, plan.scene, pose_number, which)
+            check_inside(plan.scene, during[0])
+            check_inside(plan.scene, during[-1])
     room_mesh(plan.scene)  # furniture that cannot be used is found before anything is written
     _prepare(directory, provenance, plan.recipe)
     job = Job(

@@ -1,0 +1,226 @@
+"""Maximum likelihood on pixels: exact without noise, as good as it says with noise, and robust where LEDs are not."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from estimator_synthetic import View, description, grid, poisson, render, view_of
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from estimator.dataset import Camera, DecodedSpot, DeviceFrame, Led, Part, Sensor
+from estimator.errors import EstimationFailure
+from estimator.maximum_likelihood import ml
+from estimator.rectify import rotation
+
+Floats = NDArray[np.float64]
+TARGET = (3.5, 3.6, 3.5)
+SAMPLES = 48
+"""On each side of an edge pixel: 0.3 / 48^1.5 = 0.1 % of an LED's light, 4 of 4000 e where the noise is some 45."""
+ERROR_DEG = 0.5
+
+
+def frame_of(view: View, leds_m: Floats, image_dn: NDArray[np.uint32], error_deg: float = ERROR_DEG) -> DeviceFrame:
+    """A frame of the whole sensor, gravity read without error though it is said to have one."""
+    made = json.loads(json.dumps(description(view, 1, leds_m, 0.01)))
+    pixels = view.project(leds_m)
+    inside = ((pixels > 0) & (pixels < [view.width_px, view.height_px])).all(axis=1)
+    return DeviceFrame(
+        parts=(Part(0, 0, image_dn),),
+        camera=Camera.model_validate_json(json.dumps(made["cameras"]["main"])),
+        sensor=Sensor.model_validate_json(json.dumps(made["sensor"])),
+        accelerometer_m_s2=tuple(view.gravity_m_s2.tolist()),
+        accelerometer_error_deg=error_deg,
+        exposure_s=1e-3,
+        spots=tuple(DecodedSpot(led=10 + int(k), u_px=pixels[k, 0], v_px=pixels[k, 1]) for k in np.flatnonzero(inside)),
+        leds={10 + k: Led(id=10 + k, position_m=led, radius_m=0.01, shape="disc") for k, led in enumerate(leds_m)},
+    )
+
+
+def misread(view: View, frame: DeviceFrame, generator: np.random.Generator) -> DeviceFrame:
+    """With the accelerometer's error."""
+    tilts = np.radians([view.tilt_x_deg, view.tilt_y_deg] + ERROR_DEG * generator.standard_normal(2))
+    return replace(frame, accelerometer_m_s2=tuple((rotation(*tilts) @ [0.0, 0.0, 9.80665]).tolist()))
+
+
+def off_m(frame: DeviceFrame, view: View) -> float:
+    return float(np.linalg.norm(ml(frame).position_m - view.position_m))
+
+
+def exact(view: View, leds_m: Floats) -> DeviceFrame:
+    return frame_of(view, leds_m, np.rint(render(view, leds_m, 0.01, samples=150)).astype(np.uint32))
+
+
+SIX = grid(3, 2, 0.14, TARGET)
+
+
+@pytest.mark.parametrize("tilt_deg", [(0.0, 0.0, 10.0), (30.0, -20.0, 40.0), (60.0, 0.0, 100.0)])
+def test_without_noise_it_errs_by_rounding_alone(tilt_deg: tuple[float, float, float]) -> None:
+    """The reference's edges err by 0.3 / 150^1.5 of 4000 e, and numbers round by 0.3 e: 0.7 e, where the dimmest edges
+    have a noise of 6 e. A tenth of the standard deviation that is reported, in each of three dimensions, and where all
+    LEDs fall alike on their pixels their errors are alike too.
+    """
+    view = view_of(TARGET, 3.0, *tilt_deg)
+    frame = exact(view, SIX)
+    estimate = ml(frame)
+    assert estimate.covariance_m2 is not None
+    error = estimate.position_m - view.position_m
+    assert error @ np.linalg.solve(estimate.covariance_m2, error) < 0.3**2
+    assert not estimate.ambiguous
+
+
+def nees_of_draws(view: View, leds_m: Floats, sensor: dict[str, object], draws: int) -> list[float]:
+    """Normalised squared errors over noise drawn as FORMAT.md and the sensor's keys say."""
+    generator = np.random.default_rng(7)
+    expected = render(view, leds_m, 0.01, 3000.0, samples=SAMPLES)
+    plain = frame_of(view, leds_m, np.zeros(expected.shape, dtype=np.uint32))
+    plain = replace(plain, sensor=plain.sensor.model_copy(update=sensor))
+    chip = plain.sensor
+    nees = []
+    for _ in range(draws):
+        prnu, dsnu = 1 + chip.prnu * generator.standard_normal(expected.shape), chip.dsnu_e
+        electrons = generator.poisson(np.maximum(expected * prnu, 0)).astype(float)
+        electrons += np.hypot(dsnu, chip.read_noise_e) * generator.standard_normal(expected.shape)
+        dn = np.rint(electrons / chip.gain_e_per_dn + chip.adc_noise_dn * generator.standard_normal(expected.shape))
+        image = np.clip(dn + chip.black_level_dn, 0, 2**chip.bits - 1).astype(np.uint32)
+        frame = misread(view, replace(plain, parts=(Part(0, 0, image),)), generator)
+        estimate = ml(frame)
+        error = estimate.position_m - view.position_m
+        assert estimate.covariance_m2 is not None
+        nees.append(float(error @ np.linalg.solve(estimate.covariance_m2, error)))
+    return nees
+
+
+SHOT: dict[str, object] = {}
+FULL: dict[str, object] = {
+    **{"noise": "full", "prnu": 0.05, "dsnu_e": 8.0, "read_noise_e": 20.0, "adc_noise_dn": 1.0},
+    **{"gain_e_per_dn": 6.0, "black_level_dn": 64.0, "bits": 12},
+}
+
+
+@pytest.mark.parametrize("leds", [6, 2])
+@pytest.mark.parametrize("sensor", [SHOT, FULL], ids=["shot", "full"])
+def test_errors_are_as_large_as_it_says(sensor: dict[str, object], leds: int) -> None:
+    """The sum of normalised squared errors is chi2 with three degrees a draw: within its 99.9 % interval.
+
+    Two LEDs need the reading of gravity, and their discs' shapes say more of the tilt than it does: far from linear.
+    """
+    view = view_of(TARGET, 3.0, 25.0, -15.0, 30.0, size=(320, 240, 1500.0))
+    draws = 40
+    chosen = SIX if leds == 6 else SIX[[0, 4]]
+    total = sum(nees_of_draws(view, chosen, sensor, draws))
+    low, high = chi2.ppf([0.0005, 0.9995], 3 * draws)
+    assert low < total < high
+
+
+def test_read_noise_makes_it_less_sure() -> None:
+    view = view_of(TARGET, 3.0, 25.0, -15.0, 30.0, size=(320, 240, 1500.0))
+    image = poisson(render(view, SIX, 0.01, 3000.0), 1)
+    quiet = frame_of(view, SIX, image)
+    loud = replace(quiet, sensor=quiet.sensor.model_copy(update={"noise": "full", "read_noise_e": 60.0}))
+    sure, unsure = (ml(frame).covariance_m2 for frame in (quiet, loud))
+    assert sure is not None
+    assert unsure is not None
+    # At edges a variance of some 1500 e^2 becomes 5100.
+    assert 1.5 < np.trace(unsure) / np.trace(sure) < 10
+
+
+def test_leds_cut_by_the_border_take_part() -> None:
+    """Twelve whole, eight cut in the middle by the left and right borders: with them the position is better known."""
+    view = view_of(TARGET, 3.0, size=(281, 300, 1500.0))
+    leds_m = grid(3, 4, 0.281, TARGET)
+    leds_m = leds_m[np.abs(view.project(leds_m)[:, 1] - 150) < 140]
+    pixels = view.project(leds_m)
+    cut = np.abs(pixels[:, 0] - 140.5) > 135
+    assert (cut.sum(), (~cut).sum()) == (4, 2)
+    wider = np.concatenate([leds_m, [[TARGET[0], TARGET[1], TARGET[2]], [TARGET[0] + 0.1, TARGET[1] + 0.1, TARGET[2]]]])
+    frame = frame_of(view, wider, poisson(render(view, wider, 0.01, samples=SAMPLES), 3))
+    uncut = replace(frame, leds={key: led for key, led in frame.leds.items() if key - 10 not in np.flatnonzero(cut)})
+    uncut = replace(uncut, spots=tuple(spot for spot in frame.spots if spot.led in uncut.leds))
+    with_cut, without = ml(frame), ml(uncut)
+    assert with_cut.covariance_m2 is not None
+    assert without.covariance_m2 is not None
+    assert np.trace(with_cut.covariance_m2) < 0.8 * np.trace(without.covariance_m2)
+    error = with_cut.position_m - view.position_m
+    assert error @ np.linalg.solve(with_cut.covariance_m2, error) < chi2.ppf(0.9999, 3)
+
+
+def test_saturated_leds_tell_by_their_dim_edges() -> None:
+    """All LEDs three times over the full well: their edges below it are still where they are, and known less well."""
+    view = view_of(TARGET, 3.0, 25.0, -15.0, 30.0)
+    expected = render(view, SIX, 0.01, 9000.0, samples=SAMPLES)
+    frame = frame_of(view, SIX, np.minimum(poisson(expected, 5), 3000).astype(np.uint32))
+    frame = replace(frame, sensor=frame.sensor.model_copy(update={"full_well_e": 3000.0}))
+    estimate = ml(frame)
+    assert estimate.covariance_m2 is not None
+    error = estimate.position_m - view.position_m
+    assert error @ np.linalg.solve(estimate.covariance_m2, error) < chi2.ppf(0.9999, 3)
+    # Cutting readings without leaving them out moves edges by half their width: metres off in units of the error.
+    assert np.linalg.norm(error) < 1e-3
+
+
+def test_leds_that_do_not_look_like_themselves_are_left_out() -> None:
+    """One dark, one half hidden: the answer is that of the others."""
+    view = view_of(TARGET, 3.0, 25.0, -15.0, 30.0)
+    leds_m = grid(4, 3, 0.14, TARGET)
+    clean = frame_of(view, leds_m, poisson(render(view, leds_m, 0.01, 4000.0, samples=SAMPLES), 9))
+    image = clean.parts[0].image_dn.copy()
+    u, v = np.floor(view.project(leds_m)).astype(int).T
+    image[v[0] - 12 : v[0] + 12, u[0] - 12 : u[0] + 12] = 40
+    image[v[1] - 12 : v[1] + 12, u[1] - 12 : u[1]] = 40
+    spoilt = ml(replace(clean, parts=(Part(0, 0, image),)))
+    others = {key: led for key, led in clean.leds.items() if key not in (10, 11)}
+    spots = tuple(spot for spot in clean.spots if spot.led in others)
+    np.testing.assert_allclose(spoilt.position_m, ml(replace(clean, leds=others, spots=spots)).position_m, atol=2e-6)
+
+
+def test_gravity_and_two_leds_fix_a_position_and_one_does_not() -> None:
+    """The reading's 0.5 deg make 26 mm at 3 m along each axis; what the discs' shapes say of the tilt makes it less."""
+    view = view_of(TARGET, 3.0, 10.0, 5.0, 30.0)
+    leds_m = SIX[:2] + [0.07, 0.07, 0.0]
+    image = poisson(render(view, leds_m, 0.01, 4000.0, samples=SAMPLES), 2)
+    estimate = ml(misread(view, frame_of(view, leds_m, image), np.random.default_rng(1)))
+    assert estimate.covariance_m2 is not None
+    sigma = np.sqrt(np.diag(estimate.covariance_m2))
+    assert 1e-3 < sigma[:2].max() < 0.026
+    error = estimate.position_m - view.position_m
+    assert error @ np.linalg.solve(estimate.covariance_m2, error) < chi2.ppf(0.9999, 3)
+    one = frame_of(view, leds_m[:1], poisson(render(view, leds_m[:1], 0.01), 2))
+    with pytest.raises(EstimationFailure, match=r"^position: "):
+        ml(one)
+
+
+def test_exact_gravity_is_taken_at_its_word() -> None:
+    """Said to be without error, a reading that is off by 0.1 deg moves the answer by 3 m times that, 5 mm."""
+    view = view_of(TARGET, 3.0, 10.0, 5.0, 30.0)
+    frame = exact(view, SIX)
+    off = rotation(np.radians(10.1), np.radians(5.0)) @ [0.0, 0.0, 9.80665]
+    wrong = replace(frame, accelerometer_m_s2=tuple(off.tolist()), accelerometer_error_deg=0.0)
+    right = replace(frame, accelerometer_error_deg=0.0)
+    assert off_m(right, view) < 1e-4
+    assert 3e-3 < off_m(wrong, view) < 8e-3
+
+
+def test_windows_are_as_good_as_the_whole() -> None:
+    view = view_of(TARGET, 3.0, 25.0, -15.0, 30.0)
+    whole = frame_of(view, SIX, poisson(render(view, SIX, 0.01, samples=SAMPLES), 4))
+    image = whole.parts[0].image_dn
+    parts = []
+    for u, v in np.floor(view.project(SIX)).astype(int):
+        top, left = max(v - 30, 0), max(u - 30, 0)
+        parts.append(Part(top, left, image[top : v + 30, left : u + 30]))
+    assert np.linalg.norm(ml(replace(whole, parts=tuple(parts))).position_m - ml(whole).position_m) < 1e-6
+
+
+def test_a_mosaic_has_a_light_of_its_own_in_each_colour() -> None:
+    view = view_of(TARGET, 3.0, 25.0, -15.0, 30.0)
+    expected = render(view, SIX, 0.01, 4000.0, samples=SAMPLES)
+    passed = np.array([[0.9, 1.0], [1.0, 0.8]])
+    tiles = np.tile(passed, (expected.shape[0] // 2, expected.shape[1] // 2))
+    frame = frame_of(view, SIX, poisson(expected * tiles, 6))
+    frame = replace(frame, sensor=frame.sensor.model_copy(update={"mosaic": "rggb"}))
+    estimate = ml(frame)
+    assert estimate.covariance_m2 is not None
+    error = estimate.position_m - view.position_m
+    assert error @ np.linalg.solve(estimate.covariance_m2, error) < chi2.ppf(0.9999, 3)

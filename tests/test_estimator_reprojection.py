@@ -1,0 +1,152 @@
+"""Where a lamp's image has its centroid, and what a fit does of it."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from estimator_sighted import device, sighted
+from estimator_synthetic import Array, grid, view_of
+
+from estimator.dataset import Distortion
+from estimator.errors import EstimationFailure
+from estimator.reprojection import SQUARE_TO_DISC, Pose, fit, observations, projected, straightened
+
+RADIUS_M = 0.03
+LED_M = np.array([[3.0, 3.2, 3.4]])
+
+
+def face(shape: str) -> Array:
+    """Points that stand for equal areas of a face of radius or half side 1, (n, 2): midpoints of 300 x 300 cells."""
+    side = (np.arange(300) + 0.5) / 150 - 1
+    points = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+    return points if shape == "square" else points[(points**2).sum(axis=1) <= 1]
+
+
+@pytest.mark.parametrize("shape", ["disc", "square"])
+@pytest.mark.parametrize("tilts", [(0.0, 0.0), (35.0, 0.0), (20.0, -50.0), (60.0, 60.0)])
+@pytest.mark.parametrize("aside", [(0.0, 0.0), (0.2, -0.15)])
+def test_the_centroid_of_a_face_is_the_image_of_a_point_above_it(
+    shape: str, tilts: tuple[float, float], aside: tuple[float, float]
+) -> None:
+    """By the pixels' own law: radiance times the solid angle dA h / d^3 an area of the face lights, times cos^4 over
+    the cos^3 that the plane is turned away by. The next order is some 10 (r / h)^4 h of the world's 2 m, 5e-7 at a
+    height of 2 m, that is 2e-7 on the plane; the effect itself is (r / h)^2 = 2e-4.
+    """
+    view = view_of((3.0 + aside[0], 3.2 + aside[1], 3.4), 2.0, *tilts)
+    offsets = face(shape) * RADIUS_M
+    points = LED_M + np.column_stack([offsets, np.zeros(len(offsets))]) - view.position_m
+    seen = points @ view.R_cam_world.T
+    distance = np.linalg.norm(seen, axis=1)
+    cosine = seen[:, 2] / distance
+    light = points[:, 2] / distance**3 * cosine**4 / cosine**3
+    centroid = (light[:, None] * seen[:, :2] / seen[:, 2:]).sum(axis=0) / light.sum()
+    lift = np.array([RADIUS_M**2 * (SQUARE_TO_DISC if shape == "square" else 1)])
+    pose = Pose(view.R_cam_world, np.array(view.position_m))
+    (found,), _ = projected(pose, LED_M, lift)
+    assert np.abs(found - centroid).max() < 2e-7
+
+
+def test_the_light_in_the_test_is_that_of_an_even_image() -> None:
+    """dA h / d^3 is a solid angle: over a face that is half of the sky it adds up to 2 pi."""
+    r = (np.arange(200_000) + 0.5) * 0.01
+    assert (2 * np.pi * r * 0.01 / (r**2 + 1) ** 1.5).sum() == pytest.approx(2 * np.pi, rel=1e-3)
+
+
+@pytest.mark.parametrize("gravity", [True, False])
+def test_exact_points_are_fitted_exactly_from_a_rough_start(gravity: bool) -> None:
+    leds = grid(5, 4, 0.14, (3, 2, 2.7))
+    view = view_of((3, 2, 2.7), 2.6, 30, -20, 140)
+    seen = observations(device(view, 0.1 if gravity else 1e9), sighted(view, leds))
+    start = Pose(view_of((3, 2, 2.7), 2.6, 25, -14, 130).R_cam_world, np.array(view.position_m) + [0.2, -0.1, 0.3])
+    found = fit(seen, start)
+    # Double precision of 2.6 m, made some thousands of times more by the pattern.
+    np.testing.assert_allclose(found.pose.position_m, view.position_m, atol=1e-9)
+    np.testing.assert_allclose(found.pose.R_cam_world, view.R_cam_world, atol=1e-9)
+
+
+def test_the_covariance_is_that_of_small_errors() -> None:
+    """Linear propagation by hand: move each pixel by a thousandth of its sigma and see where the fit goes."""
+    leds = grid(3, 2, 0.2, (3, 2, 2.7))
+    view = view_of((3, 2, 2.7), 2.6, 30, -20, 140)
+    frame = device(view, 0.2)
+    start = Pose(view.R_cam_world, np.array(view.position_m))
+    sigma_px, share = 0.05, 1e-3
+    spots = sighted(view, leds, sigma_px)
+    seen = observations(frame, spots)
+    moved = []
+    for k in range(len(leds)):
+        for axis in range(2):
+            plane = seen.plane.copy()
+            plane[k, axis] += share * sigma_px / 1500
+            moved.append(fit(replace(seen, plane=plane), start).pose.position_m)
+    for axis in range(2):
+        tilt = seen.tilt_rad.copy()
+        tilt[axis] += share * np.radians(0.2)
+        moved.append(fit(replace(seen, tilt_rad=tilt), start).pose.position_m)
+    steps = (np.array(moved) - view.position_m) / share
+    # Second order is a share of the first, the steps' size; digits are lost to 1e-9 m of 1e-3 sigma, 5e-6 m.
+    np.testing.assert_allclose(fit(seen, start).covariance_m2, steps.T @ steps, rtol=5e-3, atol=1e-12)
+
+
+def test_leds_all_in_one_place_fix_nothing() -> None:
+    view = view_of((3, 2, 2.7), 2.6)
+    leds = np.tile([[3.0, 2.0, 2.7]], (4, 1))
+    seen = observations(device(view, 0.1), sighted(view, leds, 0.05))
+    with pytest.raises(EstimationFailure, match="position: what is seen does not fix a pose"):
+        fit(seen, Pose(view.R_cam_world, np.array(view.position_m)))
+
+
+def fish_eye(rays: Array) -> Array:
+    """FORMAT.md's equidistant projection, units of the image distance."""
+    across = np.linalg.norm(rays[..., :2], axis=-1, keepdims=True)
+    return np.asarray(np.arctan2(across, rays[..., 2:]) * rays[..., :2] / across)
+
+
+def barrel(rays: Array) -> Array:
+    """FORMAT.md's distortion with k1 alone, -0.12."""
+    plane = rays[..., :2] / rays[..., 2:]
+    return np.asarray(plane * (1 - 0.12 * (plane**2).sum(axis=-1, keepdims=True)))
+
+
+BARREL = Distortion(k1=-0.12, k2=0.0, k3=0.0, p1=0.0, p2=0.0)
+
+
+@pytest.mark.parametrize(
+    ("lens", "changes"),
+    [
+        pytest.param(fish_eye, {"projection": "equidistant"}, id="fish-eye"),
+        pytest.param(barrel, {"distortion": BARREL}, id="barrel"),
+    ],
+)
+def test_what_a_lens_bends_within_a_spot_is_taken_off(
+    lens: Callable[[Array], Array], changes: dict[str, object]
+) -> None:
+    """Centroids on the sensor, summed up over discs of 2 cm, 2 m away, by the light that a cosine of the axis times a
+    solid angle gathers. What is left goes with (r / h)^4 = 1e-8 of 2 m, which the pattern makes some hundred times
+    more: 2 um. Left alone, (r / h)^2 = 1e-4 of a plane that is bent by a tenth makes some tens of micrometres.
+    """
+    leds = grid(3, 3, 0.6, (3, 3.2, 3.4))
+    view = view_of((3, 3.2, 3.4), 2.0, 15, -10, 30, (4000, 3000, 1500.0))
+    offsets = np.column_stack([face("disc")[::4], np.zeros(len(face("disc")[::4]))])
+    offsets[:, :2] -= offsets[:, :2].mean(axis=0)
+    points = leds[:, None] + 0.02 * offsets - view.position_m
+    rays = points @ view.R_cam_world.T
+    light = rays[..., 2] / (rays**2).sum(axis=2) ** 2
+    pixels = (light[..., None] * lens(rays)).sum(axis=1) / light.sum(axis=1)[:, None] @ view.K[:2, :2].T + view.K[:2, 2]
+    frame = device(view, 0.1)
+    frame = replace(frame, camera=frame.camera.model_copy(update=changes))
+    seen = [
+        replace(
+            one,
+            led=one.led.model_copy(update={"radius_m": 0.02}),
+            spot=replace(one.spot, u_px=float(u), v_px=float(v)),
+        )
+        for one, (u, v) in zip(sighted(view, leds, 0.01), pixels, strict=True)
+    ]
+    observed = observations(frame, seen)
+    start = Pose(view.R_cam_world, np.array(view.position_m))
+    bent = fit(observed, start).pose
+    assert np.linalg.norm(bent.position_m - view.position_m) > 1e-5
+    straight = fit(straightened(observed, bent), start).pose
+    assert np.linalg.norm(straight.position_m - view.position_m) < 2e-6
