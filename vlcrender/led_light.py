@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlcrender.camera import Camera, Pose, rays_world
+from vlcrender.led_blur import LedBlur
+from vlcrender.led_edges import LedEdges, edges_of_led
 from vlcrender.led_image import image_of_led, leds_that_may_be_seen
 from vlcrender.led_shape import Disc, Rectangle
 from vlcrender.lens import relative_illumination
@@ -31,7 +33,8 @@ Array = NDArray[np.float64]
 class LedLight:
     """An LED's image at one pose: coverage, and what a luminance is worth in each pixel of the window.
 
-    `pattern` is the luminance in each pixel over the LED's own along its normal.
+    `pattern` is the luminance in each pixel over the LED's own along its normal. `edges` is there where a narrow blur
+    needs parts of pixels, times weight and pattern; what hides a pixel in part hides its parts alike.
     """
 
     window: Window
@@ -40,33 +43,39 @@ class LedLight:
     pattern: Array | float
     visible_fraction: float
     imaged_fraction: float
+    edges: LedEdges | None
 
 
 def led_lights(
-    leds: Leds, obstacles: Obstacles, camera: Camera, pose: Pose, windows: LedWindows | None, spread_px: int
+    leds: Leds, obstacles: Obstacles, camera: Camera, pose: Pose, windows: LedWindows | None, blurs: LedBlur
 ) -> dict[int, LedLight]:
-    """By index, each LED that lights a pixel of the view, or by a blur of up to `spread_px` may."""
+    """By index, each LED that lights a pixel of the view, or by its blur may."""
     overscan = windows is not None and windows.overscan
-    reach = _overscan_px(camera) if overscan else spread_px
+    reach = _overscan_px(camera) if overscan else blurs.spread_px
     lights = {}
     for i in leds_that_may_be_seen(camera, pose, leds.centers_m, leds.reaches_m, reach).tolist():
-        image = image_of_led(camera, pose, *face_of_led(leds, i), reach)
+        face = face_of_led(leds, i)
+        image = image_of_led(camera, pose, *face, reach)
         if image is None:
             continue
         window = Window(image.row, image.column, *image.coverage.shape)
         if overscan and not Window.of_sensor(camera).grown(reach - 1).holds(window):
             continue  # an LED cut by the widest overscan is left out
         coverage = image.coverage
+        split = blurs.split(i)
+        edges = edges_of_led(camera, pose, *face, image, split) if split > 1 else None
         seen = 1.0
         if obstacles.there_are_some:
             clear = obstacles.clear_share(camera, pose, float(leds.centers_m[i, 2]), window, coverage > 0)
             seen = float((coverage * clear).sum() / coverage.sum())
             coverage = coverage * clear
+            edges = edges and edges.times(clear, window)
         if seen > 0:
             imaged = 1.0 if overscan else image.visible_fraction
             weight = relative_illumination(camera, *np.moveaxis(window.centers_px(), -1, 0))
             pattern = luminance_pattern(leds, i, camera, pose, window)
-            lights[i] = LedLight(window, coverage, weight, pattern, seen * image.visible_fraction, seen * imaged)
+            edges = edges and edges.times(weight * pattern, window)
+            lights[i] = LedLight(window, coverage, weight, pattern, seen * image.visible_fraction, seen * imaged, edges)
     return lights
 
 
