@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from conftest import ROOT
 
+from vlcrender import lens
 from vlcrender.camera import Camera, Pose, project
 from vlcrender.errors import InputError
 from vlcrender.lens import relative_illumination
@@ -178,6 +179,34 @@ def test_agrees_with_mitsubas_own_integrator(name: str, office_renderer: Rendere
     assert np.abs(z).max() < 7.9
     noise = np.sqrt(means[:, 2].mean() / len(means))
     assert abs((means[:, 0] - means[:, 1]).mean()) < 5 * noise + 0.0034 * means[:, 1].mean()
+
+
+def test_narrow_discs_are_mitsubas_and_those_of_whole_pixels_are_not(
+    office_renderer: Renderer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """How much of what blurring whole pixels would add is in ours, by least squares: none of it."""
+    # D f_i / (z pitch) = 8.2 mm * 18 mm / (2.95 m * 40 um) = 1.25 px
+    camera, samples = Camera(**SMALL_VIEW, focus_distance_m="infinity"), 64
+    reference, variance = reference_cd_m2(office_renderer.scene, camera, STRAIGHT, samples)
+    rate = electron_rate_per_cd_m2(camera, "LED-B3", Silicon())
+    u, v = np.meshgrid(np.arange(camera.width_px) + 0.5, np.arange(camera.height_px) + 0.5)
+    per_cd = rate * relative_illumination(camera, u, v)
+    view = office_renderer.view(camera, STRAIGHT)
+    ours = view.expected_electrons(1.0) / per_cd
+    monkeypatch.setattr(lens, "MOST_PARTS", 1)
+    whole_pixels = office_renderer.view(camera, STRAIGHT).expected_electrons(1.0) / per_cd
+    lit = np.zeros(ours.shape, dtype=bool)
+    for patch in view.patches:
+        lit[view.parts[0].window.slices(patch.window)] |= patch.electrons_per_s > 0
+    added = (whole_pixels - ours)[lit]
+    assert np.abs(added).max() > 0.02 * 16000
+    # the bounds of each pixel's variance are those of `test_agrees_with_mitsubas_own_integrator`
+    bound = np.maximum(variance, np.abs(ours - np.median(reference)) * 16000 / samples)[lit] + 1.0 + (0.013 * 110) ** 2
+    sigma = (added**2 / bound).sum() ** -0.5
+    share = (added * (ours - reference)[lit] / bound).sum() * sigma**2
+    print(f"{share:.3f} +- {sigma:.3f} of what whole pixels would add")
+    assert sigma < 0.15  # all of it would be seen
+    assert abs(share) < 4 * sigma
 
 
 def test_two_renderings_are_identical(office_renderer: Renderer, office: Scene, small_camera: Camera) -> None:

@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlcrender.camera import Camera, Pose, ray_world
+from vlcrender.led_blur import LedBlur
+from vlcrender.led_edges import LedEdges, edges_of_led
 from vlcrender.led_image import image_of_led, leds_that_may_be_seen, places_on_plane
 from vlcrender.led_shape import Disc, Rectangle
 from vlcrender.lens import relative_illumination
@@ -36,7 +38,8 @@ Array = NDArray[np.float64]
 class LedLight:
     """An LED's image at one pose: coverage, and what a luminance is worth in each pixel of the window.
 
-    `pattern` is the luminance in each pixel over the LED's own along its normal.
+    `pattern` is the luminance in each pixel over the LED's own along its normal. `edges` is there where a narrow blur
+    needs parts of pixels, times weight and pattern; what hides a pixel in part hides its parts alike.
     """
 
     window: Window
@@ -45,14 +48,15 @@ class LedLight:
     pattern: Array | float
     visible_fraction: float
     imaged_fraction: float
+    edges: LedEdges | None
 
 
 def led_lights(
-    leds: Leds, obstacles: Obstacles, camera: Camera, pose: Pose, windows: LedWindows | None, spread_px: int
+    leds: Leds, obstacles: Obstacles, camera: Camera, pose: Pose, windows: LedWindows | None, blurs: LedBlur
 ) -> dict[int, LedLight]:
-    """By index, each LED that lights a pixel of the view, or by a blur of up to `spread_px` may."""
+    """By index, each LED that lights a pixel of the view, or by its blur may."""
     overscan = windows is not None and windows.overscan
-    reach = _overscan_px(camera) if overscan else spread_px
+    reach = _overscan_px(camera) if overscan else blurs.spread_px
     images = []
     for i in leds_that_may_be_seen(camera, pose, leds.centers_m, leds.reaches_m, reach).tolist():
         image = image_of_led(camera, pose, *face_of_led(leds, i), reach)
@@ -69,14 +73,18 @@ def led_lights(
     lights = {}
     for (i, window, image), share in zip(images, clear, strict=True):
         coverage, seen = image.coverage, 1.0
+        split = blurs.split(i)
+        edges = edges_of_led(camera, pose, *face_of_led(leds, i), image, split) if split > 1 else None
         if not isinstance(share, float):
             coverage = image.coverage * share
             seen = float(coverage.sum() / image.coverage.sum())
+            edges = edges and edges.times(share, window)
         if seen > 0:
             imaged = 1.0 if overscan else image.visible_fraction
             weight = _in_bands(window, partial(relative_illumination, camera))
             pattern = luminance_pattern(leds, i, camera, pose, window)
-            lights[i] = LedLight(window, coverage, weight, pattern, seen * image.visible_fraction, seen * imaged)
+            edges = edges and edges.times(weight * pattern, window)
+            lights[i] = LedLight(window, coverage, weight, pattern, seen * image.visible_fraction, seen * imaged, edges)
     return lights
 
 

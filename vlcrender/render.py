@@ -59,7 +59,7 @@ class Renderer:
         for place in places:
             check_inside(self.scene, place)
         leds, blurs = self.scene.leds, led_blur(self.scene.leds, camera, pose)
-        lights = [led_lights(leds, self._obstacles, camera, place, windows, blurs.spread_px) for place in places]
+        lights = [led_lights(leds, self._obstacles, camera, place, windows, blurs) for place in places]
         lit = _lit_windows(camera, lights, blurs, windows)
         frames = (Window.of_sensor(camera),) if windows is None else led_windows(lit.values(), camera, windows)
         _check_size(frames, camera)
@@ -85,7 +85,7 @@ class Renderer:
         Blurred as at the pose `blurred_at` where given: kernels change in steps of depth, which differences would see.
         """
         leds, blurs = self.scene.leds, led_blur(self.scene.leds, camera, blurred_at or pose)
-        lights = [led_lights(leds, self._obstacles, camera, pose, windows, blurs.spread_px)]
+        lights = [led_lights(leds, self._obstacles, camera, pose, windows, blurs)]
         return self._patches(camera, pose, lights, _lit_windows(camera, lights, blurs, windows), blurs, np.float64)
 
     def background_cd_m2(self, camera: Camera, pose: Pose) -> Image:
@@ -176,8 +176,10 @@ class Renderer:
                 light[around[i].slices(image.window)] += (
                     lamp * leds.luminances_cd_m2[i] * image.coverage * image.weight * image.pattern
                 )
-            kernel = blurs.kernels[i]
-            spread = blur(light / len(lights), kernel)[around[i].grown(radius_px(kernel)).slices(window)]
+            edges = [image.edges for image in seen if image.edges is not None]
+            worth = lamp * float(leds.luminances_cd_m2[i]) / len(lights)
+            spread = blurs.blurred(i, light / len(lights), around[i], edges, worth)
+            spread = spread[around[i].grown(radius_px(blurs.kernels[i])).slices(window)]
             patches.append(
                 LedPatch(
                     led_id=int(leds.ids[i]),
