@@ -17,17 +17,21 @@ Floats = NDArray[np.float64]
 
 # A disc this small moves no light that could be seen: an edge's step by some 0.05^2 / 48 of a pixel.
 SMALLEST_DISC_PX = 0.05
-# The Airy pattern is followed to here, in units of lambda N: beyond are 2 % of the light, spread like background.
-AIRY_REACH = 10.0
+# The Airy pattern is followed to here, in units of lambda N: beyond is 1 % of the light, spread like background.
+AIRY_REACH = 20.5
 AIRY_SAMPLES = 8
 # As wide as a disc that blurs as much, for a kernel's pixels.
 AIRY_WIDTH = 2.0
-# A kernel has so many pixels across, see `LensBlur`; but pixels are split at most 2^MOST_DOUBLINGS times either way.
-CELLS_ACROSS = 8.0
-MOST_DOUBLINGS = 2
-FINE_ENOUGH_FOR_SLOPES = 2
+# A kernel has so many pixels across, see `LensBlur`; pixels are split at most 2^MOST_DOUBLINGS times either way, and
+# 2^AIRY_DOUBLINGS times for the Airy pattern, which is smooth and wide.
+CELLS_ACROSS = 20.0
+MOST_DOUBLINGS = 4
+AIRY_DOUBLINGS = 2
+# Slopes need not be so good: pixels split so many times are enough.
+DISC_SLOPES = 4
+AIRY_SLOPES = 2
 # LEDs whose discs differ by less than this many pixels share a kernel.
-DISC_STEP_PX = 0.02
+DISC_STEP_PX = 0.005
 
 
 class LensBlur:
@@ -37,7 +41,7 @@ class LensBlur:
 
     Images hold averages over pixels, and a kernel does too, so that to convolve them counts a pixel's square twice. The
     step at a sharp straight edge is wrong by 0.2 / (pixels across a disc)^1.5 at the most, which `finer` makes small:
-    0.8 % of the LED's light from 1 px on (tested), where whole pixels would have 11 %.
+    below 0.8 % of the LED's light from 1 px on (tested), where whole pixels would have 11 %.
     `reach_px` is the half width of the widest kernel, 0 where there is no blur; then there are no kernels either.
     """
 
@@ -54,17 +58,18 @@ class LensBlur:
             return
         wide = np.maximum(discs_px, AIRY_WIDTH * airy_px)
         narrow = wide > SMALLEST_DISC_PX
-        doublings = np.clip(np.ceil(np.log2(CELLS_ACROSS / np.where(narrow, wide, CELLS_ACROSS))), 0, MOST_DOUBLINGS)
+        most, slopes = (AIRY_DOUBLINGS, AIRY_SLOPES) if airy_px > 0 else (MOST_DOUBLINGS, DISC_SLOPES)
+        doublings = np.clip(np.ceil(np.log2(CELLS_ACROSS / np.where(narrow, wide, CELLS_ACROSS))), 0, most)
         self.finer = 2 ** doublings.astype(np.int64)
         made: dict[tuple[int, int], Floats] = {}
         for disc_px, finer in zip(discs_px.tolist(), self.finer.tolist(), strict=True):
             step = round(disc_px / DISC_STEP_PX)
-            coarser = min(finer, FINE_ENOUGH_FOR_SLOPES)
+            coarser = min(finer, slopes)
             for times, kernels in ((coarser, self.slope_kernels), (finer, self.kernels)):
                 if (step, times) not in made:
                     made[step, times] = _kernel(camera, step * DISC_STEP_PX, airy_px, times)
                 kernels.append(made[step, times])
-        self.slope_finer = np.minimum(self.finer, FINE_ENOUGH_FOR_SLOPES)
+        self.slope_finer = np.minimum(self.finer, slopes)
         widths = np.array([[len(k) for k in kernels] for kernels in (self.slope_kernels, self.kernels)])
         self.reach_px = int(np.ceil((widths / np.stack([self.slope_finer, self.finer])).max() / 2))
 

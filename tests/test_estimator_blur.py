@@ -93,7 +93,7 @@ def test_a_measured_kernel_is_taken_as_it_is() -> None:
     blurred = focused_for(2.0, 3.0).model_copy(update={"psf": "measured", "psf_kernel": tuple(map(tuple, rows))})
     both = LensBlur(blurred, np.array([3.0]))
     finer = int(both.finer[0])
-    assert finer == 4
+    assert finer == 16
     fine, size = both.kernels[0], len(both.kernels[0])
     v, u = (np.mgrid[:size, :size] - size // 2) / finer
     # Its mean is the measured one's: (0.1 - 0.2, 0.2 - 0.1).
