@@ -365,7 +365,7 @@ def _check_headers(record: FrameRecord, headers: list[dict[str, object]], camera
         box = np.array(header["dataWindow"], dtype=np.int64)
         if record.capturable and ((box[0] < sensor[0]) | (box[1] > sensor[1])).any():
             raise InputError(f"{record.file}: dataWindow {box.tolist()} reaches beyond the sensor, but is capturable")
-        if any(((box[0] <= other[1]) & (other[0] <= box[1])).all() for other in boxes):
+        if boxes and ((box[0] <= np.array(boxes)[:, 1]) & (np.array(boxes)[:, 0] <= box[1])).all(axis=1).any():
             raise InputError(f"{record.file}: dataWindow {box.tolist()} overlaps another part's")
         boxes.append(box)
     pixels = sum(int((box[1] - box[0] + 1).prod()) for box in boxes)

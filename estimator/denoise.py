@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 Image = NDArray[np.float32]
 
 NEIGHBOURHOOD_PX = 11
+PIXELS_AT_ONCE = 50_000
 REACH_PX = NEIGHBOURHOOD_PX // 2
 NEIGHBOURS = NEIGHBOURHOOD_PX**2 - 1
 BILATERAL_PX = 5
@@ -45,9 +46,11 @@ def neighbourhood_mean(image: Image) -> Image:
     result = cv2.boxFilter(image, cv2.CV_32F, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
     result -= image
     rows, columns = _counts(height_px), _counts(width_px)
-    for row in range(height_px):
-        # A row at a time: the whole image of counts would cost as much memory as the image itself.
-        result[row] /= np.maximum(rows[row] * columns - 1, 1)
+    band = max(1, PIXELS_AT_ONCE // max(width_px, 1))
+    for start in range(0, height_px, band):
+        # Not all at once: the whole image of counts would cost as much memory as the image itself.
+        rows_here = slice(start, start + band)
+        result[rows_here] /= np.maximum(rows[rows_here, None] * columns - 1, 1)
     return np.asarray(result, dtype=np.float32)
 
 
