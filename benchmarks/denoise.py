@@ -12,7 +12,7 @@ import time
 import cv2
 import numpy as np
 
-from estimator.denoise import DENOISERS, NEIGHBOURHOOD_PX
+from estimator.spots.denoise import DENOISERS, NEIGHBOURHOOD_PX
 
 HEIGHT_PX, WIDTH_PX = 3000, 4000
 ALLOWED = 6.0

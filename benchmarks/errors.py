@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 
 from vlcrender import background as background_module
-from vlcrender.backend import dr
-from vlcrender.camera import Camera, Pose
-from vlcrender.irradiance import bake
-from vlcrender.led_image import image_of_led, leds_that_may_be_seen
-from vlcrender.led_shape import Disc
-from vlcrender.render import Renderer
-from vlcrender.scene import load_scene
+from vlcrender.camera.intrinsics import Camera, Pose
+from vlcrender.core.backend import dr
+from vlcrender.core.planar_shapes import Disc
+from vlcrender.light.lightmap import bake
+from vlcrender.rendering.led_coverage import image_of_led, leds_that_may_be_seen
+from vlcrender.rendering.renderer import Renderer
+from vlcrender.scene.loader import load_scene
 
 PEAK_E = 4000.0
 POSES = [

@@ -24,10 +24,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-import estimator.sighting
-from estimator.batch import estimate_frame
-from estimator.dataset import read_dataset, read_frame
-from estimator.variants import VARIANTS
+import estimator.spots.correspondences
+from estimator.evaluate.batch import estimate_frame
+from estimator.io.dataset import read_dataset, read_frame
+from estimator.variants.catalogue import VARIANTS
 
 WORKERS = 2
 TRIES = 3
@@ -53,7 +53,7 @@ class Clock:
 def stages_ms(folder: Path, name: str) -> np.ndarray:
     """Read, detect and all else, (3,) milliseconds a frame."""
     dataset = read_dataset(folder)
-    clock = Clock(estimator.sighting.detect)
+    clock = Clock(estimator.spots.correspondences.detect)
     rows = []
     for record in dataset.frames[:MOST_FRAMES]:
         tries = []
@@ -62,11 +62,11 @@ def stages_ms(folder: Path, name: str) -> np.ndarray:
             frame = read_frame(dataset, record)
             read_s = time.process_time() - start
             clock.seconds = 0.0
-            estimator.sighting.detect = clock
+            estimator.spots.correspondences.detect = clock
             start = time.process_time()
             estimate_frame(VARIANTS[name], frame, record.frame)
             total_s = time.process_time() - start
-            estimator.sighting.detect = clock.function
+            estimator.spots.correspondences.detect = clock.function
             tries.append((read_s, clock.seconds, total_s - clock.seconds))
         rows.append(np.min(tries, axis=0))
     return 1e3 * np.median(rows, axis=0)

@@ -14,15 +14,15 @@ from pathlib import Path
 
 import numpy as np
 
-from vlcrender.backend import dr, mi
-from vlcrender.camera import Camera, Pose
-from vlcrender.dataset import exr_attributes, write_exr, write_preview
-from vlcrender.exposure import expose
-from vlcrender.reference import scene_dict
-from vlcrender.render import Renderer
-from vlcrender.scene import load_scene
-from vlcrender.sensor import Sensor
-from vlcrender.windows import Window
+from vlcrender.camera.intrinsics import Camera, Pose
+from vlcrender.camera.roi import Window
+from vlcrender.core.backend import dr, mi
+from vlcrender.dataset.files import exr_attributes, write_exr, write_preview
+from vlcrender.rendering.path_traced import scene_dict
+from vlcrender.rendering.renderer import Renderer
+from vlcrender.scene.loader import load_scene
+from vlcrender.sensor.sensor import Sensor
+from vlcrender.sensor.signal_chain import expose
 
 POSE = Pose((3.15, 3.1, 0.6), tilt_x_deg=6.0, tilt_y_deg=-8.0, yaw_deg=20.0)
 EXPOSURE_S = 160e-6

@@ -8,8 +8,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-from vlcrender.frame import EXPECTED, FRAMES, PREVIEWS, Job, make_frame
-from vlcrender.recipe import load_plan
+from vlcrender.dataset.frame_job import EXPECTED, FRAMES, PREVIEWS, Job, make_frame
+from vlcrender.dataset.recipe import load_plan
 
 
 def peak_gib() -> float:

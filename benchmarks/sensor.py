@@ -12,10 +12,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from vlcrender.backend import dr
-from vlcrender.exposure import expose
-from vlcrender.poisson import poisson
-from vlcrender.sensor import Sensor
+from vlcrender.core.backend import dr
+from vlcrender.sensor.poisson import poisson
+from vlcrender.sensor.sensor import Sensor
+from vlcrender.sensor.signal_chain import expose
 
 ROWS, COLUMNS = 3000, 4000
 RUNS = 5

@@ -13,13 +13,13 @@ from functools import cache
 from multiprocessing import get_context
 from pathlib import Path
 
-from vlcrender.backend import dr
-from vlcrender.camera import Camera, Pose
-from vlcrender.exposure import expose
-from vlcrender.render import Renderer
-from vlcrender.scene import load_scene
-from vlcrender.sensor import Sensor
-from vlcrender.windows import LedWindows
+from vlcrender.camera.intrinsics import Camera, Pose
+from vlcrender.camera.roi import LedWindows
+from vlcrender.core.backend import dr
+from vlcrender.rendering.renderer import Renderer
+from vlcrender.scene.loader import load_scene
+from vlcrender.sensor.sensor import Sensor
+from vlcrender.sensor.signal_chain import expose
 
 EXPOSURE_S = 160e-6
 WORKERS = 2

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.stats import skellam
 
-from vlcrender.camera import Camera, Pose
-from vlcrender.exposure import expose
-from vlcrender.render import Renderer
-from vlcrender.scene import load_scene
-from vlcrender.sensor import Sensor
-from vlcrender.tone import Processed
+from vlcrender.camera.intrinsics import Camera, Pose
+from vlcrender.rendering.renderer import Renderer
+from vlcrender.scene.loader import load_scene
+from vlcrender.sensor.isp import Processed
+from vlcrender.sensor.sensor import Sensor
+from vlcrender.sensor.signal_chain import expose
 
 ROOT = Path(__file__).parent.parent
 POSE = Pose((3.5, 1.5, 0.3), tilt_x_deg=-50.0)

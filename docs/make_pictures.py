@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from vlcrender.camera import Camera, Pose, rays_world
-from vlcrender.motion import Motion, poses_during
-from vlcrender.render import Renderer
-from vlcrender.rig import mounted_cameras
-from vlcrender.scene import Scene, build_scene, load_scene
-from vlcrender.scene_settings import SceneSettings
-from vlcrender.settings import check, read_toml
+from vlcrender.camera.intrinsics import Camera, Pose, rays_world
+from vlcrender.camera.rig import mounted_cameras
+from vlcrender.config.toml_model import check, read_toml
+from vlcrender.dataset.motion import Motion, poses_during
+from vlcrender.rendering.renderer import Renderer
+from vlcrender.scene.loader import Scene, build_scene, load_scene
+from vlcrender.scene.schema import SceneSettings
 
 ROOT = Path(__file__).parent.parent
 OUT = ROOT / "docs/pictures"

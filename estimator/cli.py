@@ -14,15 +14,10 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from estimator.comparison import compare as compare_variants
-from estimator.dataset import read_dataset
 from estimator.errors import InputError
-from estimator.estimates import write_estimates
-from estimator.files import write_atomically
-from estimator.registry import Registry
-from estimator.report import page
-from estimator.score import Scores, read_or_score, score_dataset
-from estimator.score_table import (
+from estimator.evaluate.comparison import compare as compare_variants
+from estimator.evaluate.score import Scores, read_or_score, score_dataset
+from estimator.evaluate.score_table import (
     ERROR_HEADERS,
     ERROR_NOTE,
     LIMIT_HEADERS,
@@ -33,7 +28,12 @@ from estimator.score_table import (
     limit_cells,
     pair_cells,
 )
-from estimator.workers import estimate_with_workers
+from estimator.evaluate.workers import estimate_with_workers
+from estimator.io.atomic import write_atomically
+from estimator.io.dataset import read_dataset
+from estimator.io.estimates import write_estimates
+from estimator.report.report import page
+from estimator.variants.registry import Registry
 
 INTERNAL_ERROR = 1
 USER_ERROR = 2

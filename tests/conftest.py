@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vlcrender.camera import Camera
-from vlcrender.scene import Scene, load_scene
+from vlcrender.camera.intrinsics import Camera
+from vlcrender.scene.loader import Scene, load_scene
 
 os.environ.setdefault("VLCRENDER_CACHE", tempfile.mkdtemp(prefix="vlcrender-tests-"))
 # No bake of an earlier run is taken, and processes that tests start share this one's.

@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 from estimator_synthetic import Array, View, description
 
-from estimator.dataset import Accelerometer, Camera, DeviceFrame, Led, Sensor
-from estimator.detect import Spot
-from estimator.identify import Sighting
+from estimator.io.dataset import Accelerometer, Camera, DeviceFrame, Led, Sensor
+from estimator.spots.detect import Spot
+from estimator.spots.identify import Sighting
 
 POINT_M = 1e-6
 """A radius whose eccentricity is nothing: at 3 m it lifts an LED by 3e-13 m."""

@@ -7,14 +7,14 @@ import pyarrow.parquet as pq
 import pytest
 from conftest import ROOT
 
-from estimator.dataset import Dataset, read_dataset, read_frame
-from estimator.position import position_from_ranges
-from estimator.ranging import law_of_sines, led_ranges
-from estimator.rectify import level, rotation, tilt_from_gravity
-from estimator.variants import VARIANTS, variant_named
-from vlcrender.camera import Camera
-from vlcrender.generate import generate
-from vlcrender.recipe import load_plan
+from estimator.camera.leveling import level, rotation, tilt_from_gravity
+from estimator.io.dataset import Dataset, read_dataset, read_frame
+from estimator.solvers.ranging import law_of_sines, led_ranges
+from estimator.solvers.trilateration import position_from_ranges
+from estimator.variants.catalogue import VARIANTS, variant_named
+from vlcrender.camera.intrinsics import Camera
+from vlcrender.dataset.generate import generate
+from vlcrender.dataset.recipe import load_plan
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from vlcrender import backend
+from vlcrender.core import backend
 from vlcrender.errors import InputError
 
 
@@ -81,7 +81,7 @@ def test_a_variant_that_cannot_be_used_is_one_line_and_exit_code_2(tmp_path: Pat
 
 def test_llvm_is_not_looked_for_where_another_variant_is_chosen(tmp_path: Path) -> None:
     """With an LLVM that cannot be loaded the refusal is CUDA's, or none where there is a CUDA device."""
-    code = "from vlcrender.errors import InputError\ntry:\n import vlcrender.backend as b; print(b.VARIANT)\n"
+    code = "from vlcrender.errors import InputError\ntry:\n import vlcrender.core.backend as b; print(b.VARIANT)\n"
     run = subprocess.run(
         [sys.executable, "-c", code + "except InputError as e:\n print(e)"],
         env={**os.environ, "VLCRENDER_VARIANT": "cuda_ad_mono", "DRJIT_LIBLLVM_PATH": str(tmp_path / "none.so")},

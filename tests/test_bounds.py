@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 from conftest import ROOT
 
-from vlcrender.bounds import MARGIN_PX, position_bound_m2
-from vlcrender.camera import Camera, Pose, project
+from vlcrender.camera.intrinsics import Camera, Pose, project
+from vlcrender.camera.roi import Window
+from vlcrender.config.toml_model import check, read_toml
+from vlcrender.dataset.recipe import load_plan
 from vlcrender.errors import InputError
-from vlcrender.exposure import variance_e2
-from vlcrender.recipe import load_plan
-from vlcrender.render import Renderer
-from vlcrender.scene import build_scene
-from vlcrender.scene_settings import SceneSettings
-from vlcrender.sensor import Sensor
-from vlcrender.settings import check, read_toml
-from vlcrender.view import LedPatch
-from vlcrender.windows import Window
+from vlcrender.rendering.crlb import MARGIN_PX, position_bound_m2
+from vlcrender.rendering.expected_image import LedPatch
+from vlcrender.rendering.renderer import Renderer
+from vlcrender.scene.loader import build_scene
+from vlcrender.scene.schema import SceneSettings
+from vlcrender.sensor.sensor import Sensor
+from vlcrender.sensor.signal_chain import variance_e2
 
 EXPOSURE_S = 1.6e-6
 POSE = Pose((3.1, 3.2, 1.0), tilt_x_deg=8.0, tilt_y_deg=-12.0, yaw_deg=20.0)

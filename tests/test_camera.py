@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from vlcrender.backend import dr, mi
-from vlcrender.camera import (
+from vlcrender.camera.distortion import Distortion, distort_with_slope
+from vlcrender.camera.intrinsics import (
     Camera,
     Pose,
     image_of_points,
@@ -16,9 +16,9 @@ from vlcrender.camera import (
     rays_world,
     rotation_cam_world,
 )
-from vlcrender.distortion import Distortion, distort_with_slope
+from vlcrender.config.toml_model import check
+from vlcrender.core.backend import dr, mi
 from vlcrender.errors import InputError
-from vlcrender.settings import check
 
 LAMP = np.array([3.0, 4.0, 3.5])
 

@@ -6,10 +6,10 @@ import pytest
 from conftest import ROOT, SMALL
 from distributed import LocalCluster
 
-from vlcrender.dataset import sha256_of
+from vlcrender.dataset.files import sha256_of
+from vlcrender.dataset.generate import generate
+from vlcrender.dataset.recipe import load_plan
 from vlcrender.errors import InputError
-from vlcrender.generate import generate
-from vlcrender.recipe import load_plan
 
 
 def digests(directory: Path) -> dict[str, str]:

@@ -8,19 +8,19 @@ import pyarrow.parquet as pq
 import pytest
 from conftest import ROOT, SMALL
 
-from estimator.dataset import Camera as DeviceCamera
-from estimator.dataset import DeviceFrame, read_dataset, read_frame
-from estimator.rectify import level, rotation, tilt_from_gravity
-from estimator.undistort import WIDEST_DEG, pinhole_pixels
-from estimator.variants import VARIANTS
-from vlcrender.camera import Camera, Pose, image_of_points, project
-from vlcrender.dataset import camera_entry
-from vlcrender.distortion import Distortion
-from vlcrender.generate import generate
-from vlcrender.inertial import TiltError
-from vlcrender.recipe import load_plan
-from vlcrender.rig import mounted_cameras
-from vlcrender.streams import stream
+from estimator.camera.leveling import level, rotation, tilt_from_gravity
+from estimator.camera.undistort import WIDEST_DEG, pinhole_pixels
+from estimator.io.dataset import Camera as DeviceCamera
+from estimator.io.dataset import DeviceFrame, read_dataset, read_frame
+from estimator.variants.catalogue import VARIANTS
+from vlcrender.camera.distortion import Distortion
+from vlcrender.camera.intrinsics import Camera, Pose, image_of_points, project
+from vlcrender.camera.rig import mounted_cameras
+from vlcrender.core.random_keys import stream
+from vlcrender.dataset.files import camera_entry
+from vlcrender.dataset.generate import generate
+from vlcrender.dataset.recipe import load_plan
+from vlcrender.sensor.accelerometer import TiltError
 
 
 @pytest.fixture(scope="module")

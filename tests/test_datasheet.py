@@ -11,14 +11,14 @@ import pytest
 from numpy.typing import NDArray
 
 from vlcrender.cli import main
-from vlcrender.datasheet import LABELS, SIGMAS, Datasheet, Row, cells, compare, load_sensor, make_datasheet
-from vlcrender.datasheet_page import page
+from vlcrender.core.quantity import Quantity, line
+from vlcrender.emva1288.datasheet import LABELS, SIGMAS, Datasheet, Row, cells, compare, load_sensor, make_datasheet
+from vlcrender.emva1288.page import page
+from vlcrender.emva1288.photon_transfer import Measurement, Shoot, measure, take_pair
 from vlcrender.errors import InputError
-from vlcrender.nonuniformity import patterns, response_variance
-from vlcrender.photon_transfer import Measurement, Shoot, measure, take_pair
-from vlcrender.quantity import Quantity, line
-from vlcrender.saturation import clipped, full_well_e, saturation_e
-from vlcrender.sensor import Sensor
+from vlcrender.sensor.nonuniformity import patterns, response_variance
+from vlcrender.sensor.saturation import clipped, full_well_e, saturation_e
+from vlcrender.sensor.sensor import Sensor
 
 FULL: dict[str, Any] = {
     "noise": "full",

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from test_reference import SMALL_VIEW, blocks, both_ways, scene_of
 
-from vlcrender.background import differs_from_neighbour
-from vlcrender.camera import Camera, Pose, project
-from vlcrender.diffuser import DIM_SHARE, Sheet
+from vlcrender.camera.intrinsics import Camera, Pose, project
+from vlcrender.camera.roi import Window
 from vlcrender.errors import InputError
-from vlcrender.photometry import Silicon, electron_rate_per_cd_m2
-from vlcrender.render import Renderer
-from vlcrender.scene import Scene
-from vlcrender.windows import Window
+from vlcrender.rendering.background import differs_from_neighbour
+from vlcrender.rendering.renderer import Renderer
+from vlcrender.scene.diffuser import DIM_SHARE, Sheet
+from vlcrender.scene.loader import Scene
+from vlcrender.sensor.radiometry import Silicon, electron_rate_per_cd_m2
 
 SHEET = Sheet((0.03, -0.01), 0.04, 0.6, np.pi * 0.005**2, 1.0, (-0.1, -0.05, 0.2, 0.15))
 DIFFUSER = {"distance_m": 0.03, "transmittance": 0.6}

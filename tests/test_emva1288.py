@@ -14,8 +14,8 @@ from emva1288.process.parser import ParseEmvaDescriptorFile
 from emva1288.process.results import Results1288
 from PIL import Image
 
-from vlcrender.datasheet import bench
-from vlcrender.sensor import Sensor
+from vlcrender.emva1288.datasheet import bench
+from vlcrender.sensor.sensor import Sensor
 
 SIDE = 320
 PIXELS = SIDE**2

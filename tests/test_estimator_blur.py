@@ -8,8 +8,8 @@ from estimator_synthetic import description, view_of
 from numpy.typing import NDArray
 from scipy.special import j0, j1
 
-from estimator.blur import LensBlur, airy_scale_px, disc_diameter_px
-from estimator.dataset import Camera
+from estimator.io.dataset import Camera
+from estimator.pixels.psf import LensBlur, airy_scale_px, disc_diameter_px
 
 Floats = NDArray[np.float64]
 VIEW = view_of((3.5, 3.6, 3.5), 3.0, size=(400, 300, 15000.0))

@@ -14,8 +14,8 @@ from estimator_synthetic import small_dataset
 
 from estimator import cli
 from estimator.cli import main
-from estimator.estimates import EstimateRow, write_estimates
-from estimator.variants import VARIANTS
+from estimator.io.estimates import EstimateRow, write_estimates
+from estimator.variants.catalogue import VARIANTS
 
 
 @pytest.fixture(scope="module")

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from estimator_synthetic import Array, View, grid, view_of
 
-from estimator.collinearity import Projection, gauss_newton, image_of, position_by_collinearity
 from estimator.errors import EstimationFailure
+from estimator.solvers.collinearity import Projection, gauss_newton, image_of, position_by_collinearity
 
 CEILING_M = 2.7
 PANEL = grid(5, 4, 0.14, (3, 2, CEILING_M))

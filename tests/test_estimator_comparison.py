@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from test_estimator_score import LEDS, TRUTH, failed, ok, truths
 
-from estimator.comparison import best, compare
-from estimator.score import VariantScore, score_variant
+from estimator.evaluate.comparison import best, compare
+from estimator.evaluate.score import VariantScore, score_variant
 
 
 def scored(name: str, errors_m: Sequence[float | None]) -> VariantScore:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from estimator.coverage import LONGEST_EDGE_PX, Canvas, Outlines, cover
+from estimator.pixels.polygon_raster import LONGEST_EDGE_PX, Canvas, Outlines, cover
 
 Floats = NDArray[np.float64]
 

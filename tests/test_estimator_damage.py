@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from estimator.cli import main
 from estimator.errors import InputError
-from estimator.estimates import write_estimates
+from estimator.io.estimates import write_estimates
 
 
 @pytest.fixture(scope="module")

@@ -19,9 +19,9 @@ from estimator_synthetic import FRAMES_SCHEMA, small_dataset, write_exr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from estimator.dataset import FrameRecord, read_dataset, read_frame
 from estimator.errors import InputError
-from estimator.estimates import EstimateRow, LedRange, estimates_path, read_estimates, write_estimates
+from estimator.io.dataset import FrameRecord, read_dataset, read_frame
+from estimator.io.estimates import EstimateRow, LedRange, estimates_path, read_estimates, write_estimates
 
 Rows = list[dict[str, Any]]
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from estimator.denoise import (
+from estimator.spots.denoise import (
     DENOISERS,
     algorithm_1,
     box_mean,

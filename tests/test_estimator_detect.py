@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from estimator_synthetic import Array, View, grid, poisson, render, view_of
 
-from estimator.denoise import REACH_PX, neighbourhood_mean
-from estimator.detect import Readout, Spot, detect
 from estimator.errors import EstimationFailure
+from estimator.spots.denoise import REACH_PX, neighbourhood_mean
+from estimator.spots.detect import Readout, Spot, detect
 
 SMALL = (400, 300, 1500.0)
 # A tenth of the full frame's width with the full frame's pixels.

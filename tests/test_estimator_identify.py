@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from estimator.dataset import DecodedSpot, Led
-from estimator.detect import Spot
 from estimator.errors import EstimationFailure
-from estimator.identify import GATE_PX, identify
+from estimator.io.dataset import DecodedSpot, Led
+from estimator.spots.detect import Spot
+from estimator.spots.identify import GATE_PX, identify
 
 LEDS = {k: Led(id=k, position_m=(0.1 * k, 0.0, 3.0), radius_m=0.01, shape="disc") for k in range(10)}
 

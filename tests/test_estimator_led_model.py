@@ -7,11 +7,11 @@ import pytest
 from estimator_synthetic import View, description, view_of
 from numpy.typing import NDArray
 
-from estimator.blur import LensBlur, disc_diameter_px
-from estimator.coverage import Canvas
-from estimator.dataset import Camera, Led
-from estimator.led_model import LedImages, rim, views
-from estimator.projection import TiltedPose, pose_of_rotation
+from estimator.camera.projection import TiltedPose, pose_of_rotation
+from estimator.io.dataset import Camera, Led
+from estimator.pixels.led_model import LedImages, rim, views
+from estimator.pixels.polygon_raster import Canvas
+from estimator.pixels.psf import LensBlur, disc_diameter_px
 
 Floats = NDArray[np.float64]
 TARGET = (3.5, 3.6, 3.5)

@@ -9,10 +9,10 @@ from estimator_synthetic import View, description, grid, poisson, render, view_o
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from estimator.dataset import Accelerometer, Camera, DecodedSpot, DeviceFrame, Led, Part, Sensor
+from estimator.camera.leveling import rotation
 from estimator.errors import EstimationFailure
-from estimator.maximum_likelihood import ml
-from estimator.rectify import rotation
+from estimator.io.dataset import Accelerometer, Camera, DecodedSpot, DeviceFrame, Led, Part, Sensor
+from estimator.variants.maximum_likelihood import ml
 
 Floats = NDArray[np.float64]
 TARGET = (3.5, 3.6, 3.5)

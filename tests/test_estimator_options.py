@@ -5,9 +5,9 @@ import itertools
 import pytest
 
 from estimator.errors import InputError
-from estimator.huynh2016 import AS_PRINTED, DEFAULTS, STAGES, Huynh2016
-from estimator.options import read_options
-from estimator.variants import VARIANTS, variant_named
+from estimator.variants.catalogue import VARIANTS, variant_named
+from estimator.variants.huynh2016 import AS_PRINTED, DEFAULTS, STAGES, Huynh2016
+from estimator.variants.options import read_options
 
 COLOURS = {"hue": ("red", "blue"), "shade": ("light", "dark")}
 

@@ -6,10 +6,10 @@ from estimator_synthetic import grid, poisson, render, view_of
 from numpy.typing import NDArray
 from test_estimator_maximum_likelihood import frame_of
 
-from estimator.dataset import DeviceFrame
-from estimator.evidence import CERTAIN_PX, Evidence, gather
-from estimator.pixel_likelihood import LedLight, Noise, led_light, misfit, score
-from estimator.projection import TiltedPose, pose_of_rotation, project
+from estimator.camera.projection import TiltedPose, pose_of_rotation, project
+from estimator.io.dataset import DeviceFrame
+from estimator.pixels.likelihood import LedLight, Noise, led_light, misfit, score
+from estimator.pixels.measurements import CERTAIN_PX, Evidence, gather
 
 Floats = NDArray[np.float64]
 TARGET = (3.5, 3.6, 3.5)

@@ -5,7 +5,12 @@ import pytest
 from estimator_synthetic import Array, grid
 
 from estimator.errors import EstimationFailure
-from estimator.position import SHIFT_M, position_by_range_fit, position_by_shifted_leds, position_from_ranges
+from estimator.solvers.trilateration import (
+    SHIFT_M,
+    position_by_range_fit,
+    position_by_shifted_leds,
+    position_from_ranges,
+)
 
 TABLE_1 = np.array([[0.5, 1.5, 3.5], [0.3, 1.9, 3.5], [0.8, 1.2, 3.5], [0.9, 1.1, 3.5]])
 TRIANGLE = np.array([[0.0, 0, 4], [3.0, 0, 4], [0, 3.0, 4]])

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from estimator_synthetic import description, view_of
 
-from estimator.dataset import Camera
-from estimator.projection import TiltedPose, pose_of_rotation, project
+from estimator.camera.projection import TiltedPose, pose_of_rotation, project
+from estimator.io.dataset import Camera
 
 VIEW = view_of((3.5, 3.6, 3.5), 3.0, 25.0, -15.0, 40.0)
 POINTS = np.array([[3.5, 3.6, 3.5], [3.7, 3.5, 3.5], [3.3, 3.65, 3.45], [3.52, 3.4, 3.2]])

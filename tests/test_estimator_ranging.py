@@ -5,7 +5,7 @@ import pytest
 from estimator_synthetic import Array, View, grid
 
 from estimator.errors import EstimationFailure
-from estimator.ranging import law_of_sines, led_ranges, printed_eq3
+from estimator.solvers.ranging import law_of_sines, led_ranges, printed_eq3
 
 SQUARE_K = np.diag([100.0, 100.0, 1.0])
 TABLE_1 = np.array([[0.5, 1.5, 3.5], [0.3, 1.9, 3.5], [0.8, 1.2, 3.5], [0.9, 1.1, 3.5]])

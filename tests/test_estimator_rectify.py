@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from estimator_synthetic import GRAVITY_M_S2, View, grid, view_of
 
-from estimator.dataset import Accelerometer
+from estimator.camera.leveling import level, levelling_homography, printed_eq6, rotation, tilt_from_gravity, tilt_sigmas
 from estimator.errors import EstimationFailure
-from estimator.rectify import level, levelling_homography, printed_eq6, rotation, tilt_from_gravity, tilt_sigmas
+from estimator.io.dataset import Accelerometer
 
 K = np.array([[1000.0, 0, 200], [0, 1000.0, 150], [0, 0, 1]])
 

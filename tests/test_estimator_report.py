@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 from test_estimator_score import LEDS, TRUTH, failed, ok, truths
 
-from estimator.figures import Decades, distribution_plot, error_plot
-from estimator.report import page
-from estimator.score import Scores, VariantScore, score_variant
-from estimator.svg import COLOURS, DASHES, MARKS, mark, style_of_variants
+from estimator.evaluate.score import Scores, VariantScore, score_variant
+from estimator.report.figures import Decades, distribution_plot, error_plot
+from estimator.report.report import page
+from estimator.report.svg import COLOURS, DASHES, MARKS, mark, style_of_variants
 
 BOUND = (1e-6, 0.0, 0.0, 0.0, 1e-6, 0.0, 0.0, 0.0, 2e-6)
 

@@ -8,9 +8,9 @@ import pytest
 from estimator_sighted import device, sighted
 from estimator_synthetic import Array, grid, view_of
 
-from estimator.dataset import Distortion
 from estimator.errors import EstimationFailure
-from estimator.reprojection import SQUARE_TO_DISC, Pose, fit, observations, projected, straightened
+from estimator.io.dataset import Distortion
+from estimator.solvers.reprojection import SQUARE_TO_DISC, Pose, fit, observations, projected, straightened
 
 RADIUS_M = 0.03
 LED_M = np.array([[3.0, 3.2, 3.4]])

@@ -9,11 +9,11 @@ import pyarrow.parquet as pq
 import pytest
 from estimator_synthetic import small_dataset
 
-from estimator.dataset import Led
 from estimator.errors import InputError
-from estimator.estimates import EstimateRow, LedRange, write_estimates
-from estimator.score import Scores, read_or_score, score_dataset, score_variant
-from estimator.truth import TruthRow
+from estimator.evaluate.score import Scores, read_or_score, score_dataset, score_variant
+from estimator.io.dataset import Led
+from estimator.io.estimates import EstimateRow, LedRange, write_estimates
+from estimator.io.truth import TruthRow
 
 LEDS = {10: Led(id=10, position_m=(1.0, 2.0, 3.5), radius_m=0.01, shape="disc")}
 TRUTH = (1.0, 2.0, 0.5)

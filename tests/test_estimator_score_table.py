@@ -2,8 +2,8 @@
 
 from test_estimator_score import LEDS, TRUTH, failed, ok, truths
 
-from estimator.score import score_variant
-from estimator.score_table import (
+from estimator.evaluate.score import score_variant
+from estimator.evaluate.score_table import (
     ERROR_HEADERS,
     LIMIT_HEADERS,
     error_cells,
@@ -12,7 +12,7 @@ from estimator.score_table import (
     limit_cells,
     share_text,
 )
-from estimator.summary import Interval
+from estimator.evaluate.statistics import Interval
 
 
 def test_lengths_for_people() -> None:

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binom, chi2, norm
 
-from estimator.summary import (
+from estimator.evaluate.statistics import (
     RESAMPLES,
     against_bound,
     median_interval,
@@ -18,7 +18,7 @@ from estimator.summary import (
     squared_in_sigmas,
     summary,
 )
-from estimator.tables import is_covariance
+from estimator.io.records import is_covariance
 
 ERRORS = st.lists(st.floats(0, 1e6), min_size=1, max_size=60)
 

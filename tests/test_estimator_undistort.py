@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from estimator_synthetic import Array
 
-from estimator.dataset import Camera, Distortion
+from estimator.camera.undistort import lens_pixels, pinhole_pixels
 from estimator.errors import EstimationFailure
-from estimator.undistort import lens_pixels, pinhole_pixels
+from estimator.io.dataset import Camera, Distortion
 
 
 def camera(projection: str = "perspective", skew_px: float = 0.0, **coefficients: float) -> Camera:

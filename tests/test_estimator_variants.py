@@ -9,14 +9,14 @@ import pyarrow.parquet as pq
 import pytest
 from estimator_synthetic import grid, small_dataset, view_of, write_dataset
 
-from estimator.batch import estimate_dataset, estimate_frame
-from estimator.dataset import DeviceFrame, read_dataset, read_frame
-from estimator.denoise import DENOISERS
 from estimator.errors import EstimationFailure
-from estimator.estimates import EstimateRow
-from estimator.pipeline import Estimate, Variant
-from estimator.sighting import centroids_px, sightings
-from estimator.variants import VARIANTS, variant_named
+from estimator.evaluate.batch import estimate_dataset, estimate_frame
+from estimator.io.dataset import DeviceFrame, read_dataset, read_frame
+from estimator.io.estimates import EstimateRow
+from estimator.spots.correspondences import centroids_px, sightings
+from estimator.spots.denoise import DENOISERS
+from estimator.variants.catalogue import VARIANTS, variant_named
+from estimator.variants.variant import Estimate, Variant
 
 
 @pytest.fixture(scope="module")

@@ -5,12 +5,12 @@ from pathlib import Path
 import pytest
 from estimator_synthetic import small_dataset
 
-from estimator.batch import estimate_dataset
-from estimator.dataset import read_dataset
 from estimator.errors import InputError
-from estimator.estimates import EstimateRow
-from estimator.variants import VARIANTS
-from estimator.workers import estimate_with_workers
+from estimator.evaluate.batch import estimate_dataset
+from estimator.evaluate.workers import estimate_with_workers
+from estimator.io.dataset import read_dataset
+from estimator.io.estimates import EstimateRow
+from estimator.variants.catalogue import VARIANTS
 
 
 @pytest.fixture(scope="module")

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from vlcrender.exposure import expose, variance_e2
-from vlcrender.sensor import Sensor
+from vlcrender.sensor.sensor import Sensor
+from vlcrender.sensor.signal_chain import expose, variance_e2
 
 ROWS, COLUMNS = 500, 800
 N = ROWS * COLUMNS
@@ -260,8 +260,8 @@ def test_a_window_gets_the_noise_of_the_whole_frame(rng: np.random.Generator) ->
 def test_threads_make_no_difference(tmp_path: Path) -> None:
     """One thread, two, and all, each in a process of its own."""
     code = (
-        "import sys, numpy as np; from test_full_chain import EVERYTHING; from vlcrender.backend import dr; "
-        "from vlcrender.exposure import expose; dr.set_thread_count(int(sys.argv[1])); "
+        "import sys, numpy as np; from test_full_chain import EVERYTHING; from vlcrender.core.backend import dr; "
+        "from vlcrender.sensor.signal_chain import expose; dr.set_thread_count(int(sys.argv[1])); "
         "means = np.linspace(0, 4000, 120000, dtype=np.float32).reshape(300, 400); "
         "np.save(sys.argv[2], expose(EVERYTHING, means, 'key', 0, 0, 0.1))"
     )

@@ -18,10 +18,10 @@ import pyarrow.parquet as pq
 import pytest
 from conftest import ROOT, SMALL
 
+from vlcrender.dataset.generate import generate
+from vlcrender.dataset.recipe import Plan, load_plan
+from vlcrender.dataset.verify import problems_of
 from vlcrender.errors import InputError
-from vlcrender.generate import generate
-from vlcrender.recipe import Plan, load_plan
-from vlcrender.verify import problems_of
 
 RECIPE = ROOT / "datasets/quickstart.toml"
 
@@ -63,8 +63,8 @@ def test_two_workers_give_the_same_bytes_as_one(made: Path, tmp_path: Path) -> N
 def test_one_thread_gives_the_same_bytes_as_all(made: Path, tmp_path: Path) -> None:
     """In a process of its own with every library held to one thread."""
     code = (
-        "from pathlib import Path; from test_generate import small_plan; from vlcrender.backend import dr; "
-        "from vlcrender.generate import generate; dr.set_thread_count(1); "
+        "from pathlib import Path; from test_generate import small_plan; from vlcrender.core.backend import dr; "
+        "from vlcrender.dataset.generate import generate; dr.set_thread_count(1); "
         f"generate(small_plan('expected=true'), Path({str(tmp_path / 'one')!r}))"
     )
     single = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL")}

@@ -9,15 +9,15 @@ import pytest
 from conftest import ROOT, SMALL
 from numpy.typing import NDArray
 
-from vlcrender.camera import Pose, rotation_cam_world
-from vlcrender.dataset import read_dataset_file
+from vlcrender.camera.intrinsics import Pose, rotation_cam_world
+from vlcrender.config.toml_model import check, override, read_toml
+from vlcrender.core.random_keys import stream
+from vlcrender.dataset.files import read_dataset_file
+from vlcrender.dataset.generate import generate
+from vlcrender.dataset.recipe import Recipe, load_plan
 from vlcrender.errors import InputError
-from vlcrender.generate import generate
-from vlcrender.inertial import STANDARD_GRAVITY_M_S2 as G
-from vlcrender.inertial import Imu, TiltError
-from vlcrender.recipe import Recipe, load_plan
-from vlcrender.settings import check, override, read_toml
-from vlcrender.streams import stream
+from vlcrender.sensor.accelerometer import STANDARD_GRAVITY_M_S2 as G
+from vlcrender.sensor.accelerometer import Imu, TiltError
 
 QUICKSTART = ROOT / "datasets/quickstart.toml"
 HERE = (3.0, 3.0, 1.0)

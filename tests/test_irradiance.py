@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from conftest import ROOT
 
-from vlcrender.geometry import Mesh, join, mesh_of_surfaces
-from vlcrender.glass import pane_reflectance
-from vlcrender.irradiance import bake, led_illuminance_lux, path_traced_lux, room_mesh
-from vlcrender.mitsuba_room import mitsuba_scene
-from vlcrender.scene import Leds, Scene, build_scene, load_scene
-from vlcrender.scene_settings import SceneSettings
-from vlcrender.settings import check, read_toml
-from vlcrender.sources import point_sources
+from vlcrender.config.toml_model import check, read_toml
+from vlcrender.light.lightmap import bake, led_illuminance_lux, path_traced_lux, room_mesh
+from vlcrender.light.mitsuba_room import mitsuba_scene
+from vlcrender.scene.fresnel import pane_reflectance
+from vlcrender.scene.loader import Leds, Scene, build_scene, load_scene
+from vlcrender.scene.mesh import Mesh, join, mesh_of_surfaces
+from vlcrender.scene.schema import SceneSettings
+from vlcrender.scene.sources import point_sources
 
 TABLE1 = read_toml(ROOT / "scenes/table1.toml")
 

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from scipy.special import j1
 
-from vlcrender.camera import Camera, Pose
-from vlcrender.led_blur import LedBlur, led_blur
-from vlcrender.led_edges import LedEdges, edges_of_led
-from vlcrender.led_image import image_of_led
-from vlcrender.led_shape import Disc
-from vlcrender.lens import AIRY_TAIL, defocus_diameter_px, split_for, split_kernel
-from vlcrender.render import Renderer
-from vlcrender.scene import Scene
-from vlcrender.windows import Window
+from vlcrender.camera.intrinsics import Camera, Pose
+from vlcrender.camera.lens import AIRY_TAIL, defocus_diameter_px, split_for, split_kernel
+from vlcrender.camera.roi import Window
+from vlcrender.core.planar_shapes import Disc
+from vlcrender.rendering.led_blur import LedBlur, led_blur
+from vlcrender.rendering.led_coverage import image_of_led
+from vlcrender.rendering.led_edges import LedEdges, edges_of_led
+from vlcrender.rendering.renderer import Renderer
+from vlcrender.scene.loader import Scene
 
 Array = np.ndarray[Any, np.dtype[np.float64]]
 

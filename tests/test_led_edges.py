@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from vlcrender.camera import Camera, Pose
-from vlcrender.distortion import Distortion
-from vlcrender.led_edges import edges_of_led
-from vlcrender.led_image import image_of_led
-from vlcrender.led_shape import Disc, Rectangle
+from vlcrender.camera.distortion import Distortion
+from vlcrender.camera.intrinsics import Camera, Pose
+from vlcrender.core.planar_shapes import Disc, Rectangle
+from vlcrender.rendering.led_coverage import image_of_led
+from vlcrender.rendering.led_edges import edges_of_led
 
 SPLIT = 8
 SMALL = {"width_px": 64, "height_px": 48, "pixel_pitch_um": 40.0, "focal_length_mm": 3.0}

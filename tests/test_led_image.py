@@ -5,10 +5,10 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from vlcrender.camera import Camera, Pose, project, rays_world
-from vlcrender.distortion import Distortion
-from vlcrender.led_image import LedImage, image_of_led, leds_that_may_be_seen
-from vlcrender.led_shape import Disc, Rectangle, circle_polygon_area, rectangle_polygon_area
+from vlcrender.camera.distortion import Distortion
+from vlcrender.camera.intrinsics import Camera, Pose, project, rays_world
+from vlcrender.core.planar_shapes import Disc, Rectangle, circle_polygon_area, rectangle_polygon_area
+from vlcrender.rendering.led_coverage import LedImage, image_of_led, leds_that_may_be_seen
 
 SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 

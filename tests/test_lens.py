@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy.special import j0, j1
 
-from vlcrender.backend import dr, mi
-from vlcrender.camera import Camera, ray_of_pixel
-from vlcrender.distortion import Distortion
-from vlcrender.led_shape import rectangle_polygon_area
-from vlcrender.lens import blur, blur_kernel, defocus_diameter_px, relative_illumination
+from vlcrender.camera.distortion import Distortion
+from vlcrender.camera.intrinsics import Camera, ray_of_pixel
+from vlcrender.camera.lens import blur, blur_kernel, defocus_diameter_px, relative_illumination
+from vlcrender.core.backend import dr, mi
+from vlcrender.core.planar_shapes import rectangle_polygon_area
 
 WIDE = {"width_px": 400, "height_px": 300, "pixel_pitch_um": 12.0, "focal_length_mm": 4.0}
 LENSES = {

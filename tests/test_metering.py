@@ -9,12 +9,12 @@ import pytest
 from conftest import ROOT, SMALL
 from pydantic import TypeAdapter
 
-from vlcrender.generate import generate
-from vlcrender.metering import Metering, NoiseLevelMetering, PeakMetering
-from vlcrender.recipe import load_plan
-from vlcrender.verify import problems_of
-from vlcrender.view import LedPatch, View, ViewPart
-from vlcrender.windows import Window
+from vlcrender.camera.roi import Window
+from vlcrender.dataset.auto_exposure import Metering, NoiseLevelMetering, PeakMetering
+from vlcrender.dataset.generate import generate
+from vlcrender.dataset.recipe import load_plan
+from vlcrender.dataset.verify import problems_of
+from vlcrender.rendering.expected_image import LedPatch, View, ViewPart
 
 
 def view_of(background: float, led: float) -> View:

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from scipy import constants
 
-from vlcrender.camera import Camera, Pose
-from vlcrender.mosaic import MosaicRenderer, colour_of_pixels
-from vlcrender.photometry import WAVELENGTHS_NM, Silicon, Tabulated, detectors, electron_rate_per_cd_m2
-from vlcrender.quantum_efficiency import COLOURS, QuantumEfficiency
-from vlcrender.render import Renderer
-from vlcrender.scene import Scene
-from vlcrender.sensor import Sensor
-from vlcrender.windows import LedWindows, Window
+from vlcrender.camera.intrinsics import Camera, Pose
+from vlcrender.camera.roi import LedWindows, Window
+from vlcrender.rendering.bayer import MosaicRenderer, colour_of_pixels
+from vlcrender.rendering.renderer import Renderer
+from vlcrender.scene.loader import Scene
+from vlcrender.sensor.quantum_efficiency import COLOURS, QuantumEfficiency
+from vlcrender.sensor.radiometry import WAVELENGTHS_NM, Silicon, Tabulated, detectors, electron_rate_per_cd_m2
+from vlcrender.sensor.sensor import Sensor
 
 QE = QuantumEfficiency(
     wavelengths_nm=(400.0, 450.0, 500.0, 550.0, 600.0, 650.0, 700.0),
@@ -82,7 +82,7 @@ def test_a_table_of_the_silicon_curve_is_the_silicon_curve() -> None:
 def test_a_narrow_filter_counts_its_photons_only() -> None:
     """QE 1 from 550 to 560 nm: rate = pi/4 / N^2 * A * tau * integral of L_lambda lambda / (h c), by hand as a sum."""
     line = QuantumEfficiency(wavelengths_nm=(549.999, 550.0, 560.0, 560.001), values=(0.0, 1.0, 1.0, 0.0))
-    from vlcrender.photometry import relative_spectrum, spectral_radiance
+    from vlcrender.sensor.radiometry import relative_spectrum, spectral_radiance
 
     radiance = spectral_radiance(1.0, relative_spectrum("LED-B3"))
     inside = (WAVELENGTHS_NM >= 550) & (WAVELENGTHS_NM <= 560)

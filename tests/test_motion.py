@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from vlcrender.camera import Camera, Pose, project
+from vlcrender.camera.intrinsics import Camera, Pose, project
+from vlcrender.camera.rig import mounted_cameras
+from vlcrender.dataset.motion import Motion, poses_during
 from vlcrender.errors import InputError
-from vlcrender.motion import Motion, poses_during
-from vlcrender.render import LedPatch, Renderer
-from vlcrender.rig import mounted_cameras
-from vlcrender.scene import Scene
+from vlcrender.rendering.renderer import LedPatch, Renderer
+from vlcrender.scene.loader import Scene
 
 EXPOSURE_S = 0.01
 POSE = Pose((0.3, 1.9, 0.5))

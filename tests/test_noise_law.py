@@ -7,9 +7,9 @@ import pytest
 from scipy import stats
 from test_sensor import chi_square_p
 
-from vlcrender.exposure import expose
-from vlcrender.poisson import poisson
-from vlcrender.sensor import Sensor
+from vlcrender.sensor.poisson import poisson
+from vlcrender.sensor.sensor import Sensor
+from vlcrender.sensor.signal_chain import expose
 
 N = 400_000
 MEANS = [0.2, 1.0, 3.0, 12.0, 300.0, 3000.0, 20_000.0]

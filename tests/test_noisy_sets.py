@@ -10,10 +10,10 @@ import pyarrow.parquet as pq
 import pytest
 from conftest import ROOT, SMALL
 
-from vlcrender.frame import Job, make_frame
-from vlcrender.generate import generate
-from vlcrender.recipe import Plan, load_plan
-from vlcrender.verify import problems_of
+from vlcrender.dataset.frame_job import Job, make_frame
+from vlcrender.dataset.generate import generate
+from vlcrender.dataset.recipe import Plan, load_plan
+from vlcrender.dataset.verify import problems_of
 
 LEFT = "rig=[{ name = 'left', offset_m = [-0.1, 0.0, 0.0], tilt_x_deg = 0.0, tilt_y_deg = 1.0 }]"
 NOISY = (

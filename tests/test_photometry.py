@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from vlcrender.camera import Camera
-from vlcrender.photometry import (
+from vlcrender.camera.intrinsics import Camera
+from vlcrender.sensor.radiometry import (
     WAVELENGTHS_NM,
     Silicon,
     electron_rate_per_cd_m2,

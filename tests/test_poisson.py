@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 from test_sensor import chi_square_p
 
-from vlcrender.poisson import LARGEST_MEAN, poisson
+from vlcrender.sensor.poisson import LARGEST_MEAN, poisson
 
 N = 1_000_000
 MEANS = [0.05, 0.2, 1.0, 9.9, 10.0, 12.0, 40.0, 3000.0, 20000.0, 300000.0]

@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 from conftest import ROOT
 
+from vlcrender.config.presets import preset, presets, with_presets
+from vlcrender.dataset.recipe import Recipe, load_plan
 from vlcrender.errors import InputError
-from vlcrender.presets import preset, presets, with_presets
-from vlcrender.recipe import Recipe, load_plan
 
 QUICKSTART = ROOT / "datasets/quickstart.toml"
 

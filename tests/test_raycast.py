@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from conftest import ROOT
 
-from vlcrender.camera import Camera, Pose, project
-from vlcrender.glass import pane_reflectance
-from vlcrender.lens import relative_illumination
-from vlcrender.photometry import Silicon, electron_rate_per_cd_m2
-from vlcrender.render import Renderer
-from vlcrender.scene import Scene, build_scene
-from vlcrender.scene_settings import SceneSettings
-from vlcrender.settings import check, read_toml
+from vlcrender.camera.intrinsics import Camera, Pose, project
+from vlcrender.camera.lens import relative_illumination
+from vlcrender.config.toml_model import check, read_toml
+from vlcrender.rendering.renderer import Renderer
+from vlcrender.scene.fresnel import pane_reflectance
+from vlcrender.scene.loader import Scene, build_scene
+from vlcrender.scene.schema import SceneSettings
+from vlcrender.sensor.radiometry import Silicon, electron_rate_per_cd_m2
 
 TABLE1 = read_toml(ROOT / "scenes/table1.toml")
 LAMP = {"id": 1, "position_m": [3.0, 3.5, 3.5], "radius_m": 0.03, "luminance_cd_m2": 10000.0}

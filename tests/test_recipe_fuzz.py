@@ -11,11 +11,11 @@ from conftest import ROOT
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
+from vlcrender.config.presets import presets
+from vlcrender.config.toml_model import read_toml
+from vlcrender.dataset.recipe import Plan, Recipe, load_plan, scaled
 from vlcrender.errors import InputError
-from vlcrender.presets import presets
-from vlcrender.recipe import Plan, Recipe, load_plan, scaled
-from vlcrender.sensor import Sensor
-from vlcrender.settings import read_toml
+from vlcrender.sensor.sensor import Sensor
 
 QUICKSTART = ROOT / "datasets/quickstart.toml"
 TABLES: dict[str, tuple[str, ...]] = {

@@ -5,15 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vlcrender.camera import Camera, Pose
+from vlcrender.camera.intrinsics import Camera, Pose
+from vlcrender.camera.lens import relative_illumination
+from vlcrender.config.toml_model import check
 from vlcrender.errors import InputError
-from vlcrender.lens import relative_illumination
-from vlcrender.photometry import Silicon, electron_rate_per_cd_m2
-from vlcrender.reference import reference_cd_m2
-from vlcrender.render import Renderer
-from vlcrender.scene import Scene, build_scene
-from vlcrender.scene_settings import SceneSettings
-from vlcrender.settings import check
+from vlcrender.rendering.path_traced import reference_cd_m2
+from vlcrender.rendering.renderer import Renderer
+from vlcrender.scene.loader import Scene, build_scene
+from vlcrender.scene.schema import SceneSettings
+from vlcrender.sensor.radiometry import Silicon, electron_rate_per_cd_m2
 
 SMALL_VIEW = {"width_px": 120, "height_px": 90, "pixel_pitch_um": 100.0}
 ROOM: dict[str, object] = {

@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 from conftest import ROOT
 
-from vlcrender import lens
-from vlcrender.camera import Camera, Pose, project
+from vlcrender.camera import lens
+from vlcrender.camera.intrinsics import Camera, Pose, project
+from vlcrender.camera.lens import relative_illumination
+from vlcrender.config.toml_model import check, read_toml
 from vlcrender.errors import InputError
-from vlcrender.lens import relative_illumination
-from vlcrender.photometry import Silicon, electron_rate_per_cd_m2
-from vlcrender.reference import reference_cd_m2
-from vlcrender.render import Renderer
-from vlcrender.scene import Scene, build_scene
-from vlcrender.scene_settings import SceneSettings
-from vlcrender.settings import check, read_toml
-from vlcrender.view import View
+from vlcrender.rendering.expected_image import View
+from vlcrender.rendering.path_traced import reference_cd_m2
+from vlcrender.rendering.renderer import Renderer
+from vlcrender.scene.loader import Scene, build_scene
+from vlcrender.scene.schema import SceneSettings
+from vlcrender.sensor.radiometry import Silicon, electron_rate_per_cd_m2
 
 
 @pytest.fixture(scope="module")

@@ -10,14 +10,14 @@ from conftest import ROOT, SMALL
 from hypothesis import given
 from hypothesis import strategies as st
 
-from estimator.batch import estimate_dataset
-from estimator.dataset import read_dataset
-from estimator.variants import VARIANTS
-from vlcrender.camera import Pose
-from vlcrender.generate import generate
-from vlcrender.recipe import load_plan
-from vlcrender.rig import pose_of
-from vlcrender.verify import problems_of
+from estimator.evaluate.batch import estimate_dataset
+from estimator.io.dataset import read_dataset
+from estimator.variants.catalogue import VARIANTS
+from vlcrender.camera.intrinsics import Pose
+from vlcrender.camera.rig import pose_of
+from vlcrender.dataset.generate import generate
+from vlcrender.dataset.recipe import load_plan
+from vlcrender.dataset.verify import problems_of
 
 angles = st.floats(-179, 179)
 

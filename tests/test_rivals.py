@@ -8,12 +8,12 @@ import pyarrow.parquet as pq
 import pytest
 from conftest import ROOT, SMALL
 
-from estimator.batch import estimate_dataset
-from estimator.dataset import read_dataset
-from estimator.estimates import EstimateRow
-from estimator.variants import VARIANTS
-from vlcrender.generate import generate
-from vlcrender.recipe import load_plan
+from estimator.evaluate.batch import estimate_dataset
+from estimator.io.dataset import read_dataset
+from estimator.io.estimates import EstimateRow
+from estimator.variants.catalogue import VARIANTS
+from vlcrender.dataset.generate import generate
+from vlcrender.dataset.recipe import load_plan
 
 STEREO = (*SMALL, "windows.margin_px=8", "poses.count=2", "accelerometer.error_deg=0")
 FISH_EYE = (

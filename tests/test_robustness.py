@@ -16,8 +16,9 @@ import pytest
 from conftest import ROOT
 from estimator_synthetic import Array, View, description, grid, poisson, render, small_dataset, view_of
 
-from estimator.batch import estimate_dataset, estimate_frame
-from estimator.dataset import (
+from estimator.errors import InputError
+from estimator.evaluate.batch import estimate_dataset, estimate_frame
+from estimator.io.dataset import (
     Accelerometer,
     Camera,
     DecodedSpot,
@@ -28,13 +29,12 @@ from estimator.dataset import (
     read_dataset,
     read_frame,
 )
-from estimator.detect import Readout, detect
-from estimator.errors import InputError
-from estimator.estimates import EstimateRow
-from estimator.sighting import sightings
-from estimator.variants import VARIANTS
-from vlcrender.generate import generate
-from vlcrender.recipe import load_plan
+from estimator.io.estimates import EstimateRow
+from estimator.spots.correspondences import sightings
+from estimator.spots.detect import Readout, detect
+from estimator.variants.catalogue import VARIANTS
+from vlcrender.dataset.generate import generate
+from vlcrender.dataset.recipe import load_plan
 
 SIZE = (800, 600, 3000.0)
 RADIUS_M = 0.01

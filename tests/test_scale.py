@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from conftest import ROOT
 
-from vlcrender.camera import Pose, project, rays_world
+from vlcrender.camera.intrinsics import Pose, project, rays_world
+from vlcrender.dataset.recipe import Recipe, ScaleMode, load_plan
 from vlcrender.errors import InputError
-from vlcrender.recipe import Recipe, ScaleMode, load_plan
-from vlcrender.render import Renderer
-from vlcrender.scene import Scene
+from vlcrender.rendering.renderer import Renderer
+from vlcrender.scene.loader import Scene
 
 QUICKSTART = ROOT / "datasets/quickstart.toml"
 FULL = ("camera.width_px=800", "camera.height_px=600", "camera.pixel_pitch_um=6.0")

@@ -8,13 +8,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from vlcrender.camera import Camera, Pose
+from vlcrender.camera.intrinsics import Camera, Pose
+from vlcrender.config.toml_model import check
 from vlcrender.errors import InputError
-from vlcrender.irradiance import room_mesh
-from vlcrender.scene import Scene, build_scene, load_scene
-from vlcrender.scene_settings import SceneSettings
-from vlcrender.settings import check
-from vlcrender.visibility import leds_in_view, level_coverage
+from vlcrender.light.lightmap import room_mesh
+from vlcrender.scene.loader import Scene, build_scene, load_scene
+from vlcrender.scene.schema import SceneSettings
+from vlcrender.scene.visibility import leds_in_view, level_coverage
 
 ROOT = Path(__file__).parent.parent
 TABLE1 = (ROOT / "scenes/table1.toml").read_text()

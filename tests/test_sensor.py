@@ -5,10 +5,10 @@ import pytest
 from pydantic import ValidationError
 from scipy import stats
 
-from vlcrender.exposure import expose
-from vlcrender.poisson import LARGEST_MEAN
-from vlcrender.sensor import LARGEST_WELL_E, Sensor, clip_full_well
-from vlcrender.streams import stream
+from vlcrender.core.random_keys import stream
+from vlcrender.sensor.poisson import LARGEST_MEAN
+from vlcrender.sensor.sensor import LARGEST_WELL_E, Sensor, clip_full_well
+from vlcrender.sensor.signal_chain import expose
 
 N = 400_000
 MEANS = [0.2, 3.0, 40.0, 3000.0]

@@ -7,15 +7,15 @@ import pytest
 from PIL import Image
 from test_reference import ROOM, SMALL_VIEW, blocks, both_ways, scene_of
 
-from vlcrender.background import Background
-from vlcrender.camera import Camera, Pose, project, rays_world
+from vlcrender.camera.intrinsics import Camera, Pose, project, rays_world
+from vlcrender.camera.lens import relative_illumination
+from vlcrender.camera.roi import Window
 from vlcrender.errors import InputError
-from vlcrender.geometry import mesh_of_surfaces
-from vlcrender.irradiance import Light, bake, room_mesh
-from vlcrender.lens import relative_illumination
-from vlcrender.scene import Scene
-from vlcrender.texture import Texture, read_reflectances
-from vlcrender.windows import Window
+from vlcrender.light.lightmap import Light, bake, room_mesh
+from vlcrender.rendering.background import Background
+from vlcrender.scene.loader import Scene
+from vlcrender.scene.mesh import mesh_of_surfaces
+from vlcrender.scene.texture import Texture, read_reflectances
 
 PLAIN = {"floor": 0.3, "ceiling": 0.8, "walls": 0.5}
 LAMP = {"id": 1, "position_m": [1.5, 1.5, 2.5], "radius_m": 0.02, "luminance_cd_m2": 20000.0}

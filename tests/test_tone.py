@@ -8,11 +8,11 @@ from conftest import ROOT, SMALL
 from PIL import Image
 from test_mosaic import QE
 
-from vlcrender.exposure import expose
-from vlcrender.generate import generate
-from vlcrender.recipe import load_plan
-from vlcrender.sensor import Sensor
-from vlcrender.tone import Processed
+from vlcrender.dataset.generate import generate
+from vlcrender.dataset.recipe import load_plan
+from vlcrender.sensor.isp import Processed
+from vlcrender.sensor.sensor import Sensor
+from vlcrender.sensor.signal_chain import expose
 
 NEUTRAL = (1.0, 1.0, 1.0)
 SENSOR = Sensor(bits=12, full_well_e=4095.0)

@@ -9,16 +9,16 @@ from conftest import ROOT, SMALL
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vlcrender.backend import dr
-from vlcrender.background import _edges
-from vlcrender.camera import Camera, Pose
+from vlcrender.camera.intrinsics import Camera, Pose
+from vlcrender.camera.roi import LedWindows, Window, led_windows
+from vlcrender.core.backend import dr
+from vlcrender.dataset.generate import generate
+from vlcrender.dataset.recipe import load_plan
+from vlcrender.dataset.verify import problems_of
 from vlcrender.errors import InputError
-from vlcrender.generate import generate
-from vlcrender.recipe import load_plan
-from vlcrender.render import Renderer
-from vlcrender.scene import Scene
-from vlcrender.verify import problems_of
-from vlcrender.windows import LedWindows, Window, led_windows
+from vlcrender.rendering.background import _edges
+from vlcrender.rendering.renderer import Renderer
+from vlcrender.scene.loader import Scene
 
 LEDS = LedWindows(kind="leds")
 OVERSCAN = LedWindows(kind="leds", overscan=True)

@@ -14,16 +14,16 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from vlcrender import __version__
-from vlcrender.camera import Camera
-from vlcrender.dataset import read_dataset_file
+from vlcrender.camera.intrinsics import Camera
+from vlcrender.dataset.files import read_dataset_file
+from vlcrender.dataset.recipe import ScaleMode, load_plan
+from vlcrender.dataset.verify import problems_of
 from vlcrender.errors import InputError
-from vlcrender.recipe import ScaleMode, load_plan
-from vlcrender.scene import load_scene
-from vlcrender.verify import problems_of
-from vlcrender.visibility import ENOUGH_LEDS, level_coverage, tilted_coverage
+from vlcrender.scene.loader import load_scene
+from vlcrender.scene.visibility import ENOUGH_LEDS, level_coverage, tilted_coverage
 
 if TYPE_CHECKING:
-    from vlcrender.datasheet import Datasheet
+    from vlcrender.emva1288.datasheet import Datasheet
 
 app = App(
     name="vlcrender",
@@ -71,7 +71,7 @@ def generate(
     if workers < 1:
         raise InputError(f"--workers {workers}: is not 1 or more")
     plan = load_plan(recipe, set_ or [], scale, scale_mode)
-    from vlcrender.generate import generate as make  # starts Mitsuba: not before the recipe is known to be good
+    from vlcrender.dataset.generate import generate as make  # starts Mitsuba: not before the recipe is known to be good
 
     columns = (
         TextColumn("{task.description}"),
@@ -155,7 +155,7 @@ def show(
         ):
             share = f"{100 * coverage.share:.2f} %"
             table.add_row(f"{height:g}", coverage.attitude, str(coverage.poses), str(coverage.seen), share)
-    from vlcrender.show import draw  # starts Mitsuba
+    from vlcrender.scene_plot import draw  # starts Mitsuba
 
     draw(loaded, camera, path, reference)
     Console(width=max(Console().width, 100)).print(table)
@@ -187,8 +187,8 @@ def datasheet(
     json_
         Print JSON instead of a table.
     """
-    from vlcrender.datasheet import load_sensor, make_datasheet  # starts Mitsuba
-    from vlcrender.datasheet_page import page
+    from vlcrender.emva1288.datasheet import load_sensor, make_datasheet  # starts Mitsuba
+    from vlcrender.emva1288.page import page
 
     if not 32 <= side_px <= 4096:
         raise InputError(f"--side-px {side_px}: is not 32 to 4096")
@@ -215,7 +215,7 @@ def datasheet(
 
 
 def _print_datasheet(name: str, sheet: "Datasheet") -> None:
-    from vlcrender.datasheet import cells
+    from vlcrender.emva1288.datasheet import cells
 
     table = Table(title=f"{name}: {'; '.join(sheet.conditions)}")
     for heading in ("", "", "set", "measured", "tolerance", "", ""):

@@ -1,0 +1,127 @@
+"""Runs variants over a dataset, shot by shot, and times them. Whatever a variant does, its frame stays in the count."""
+
+import operator
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from itertools import groupby
+
+import numpy as np
+
+from estimator.errors import EstimationFailure, InputError
+from estimator.io.dataset import Dataset, DeviceFrame, FrameRecord, Led, read_frame
+from estimator.io.estimates import EstimateRow, LedRange
+from estimator.io.records import LARGEST, is_covariance
+from estimator.variants.variant import Estimate, Variant
+
+Rows = dict[str, list[EstimateRow]]
+"""By variant, one a frame."""
+
+
+def estimate_dataset(
+    dataset: Dataset, variants: Sequence[Variant], on_frame: Callable[[], None]
+) -> dict[str, tuple[EstimateRow, ...]]:
+    """Every variant's rows, one a frame; each image is read once, and `on_frame` is called for each.
+
+    An image that cannot be read is a failed frame of every variant, with the reason `read: ...`.
+    """
+    rows: Rows = {variant.name: [] for variant in variants}
+    for records in shots(dataset):
+        for name, of_shot in estimate_shot(dataset, records, variants).items():
+            rows[name] += of_shot
+        for _ in records:
+            on_frame()
+    return {name: tuple(of_variant) for name, of_variant in rows.items()}
+
+
+def shots(dataset: Dataset) -> list[tuple[FrameRecord, ...]]:
+    """The frames of each shot, which are exposed and estimated together, in order."""
+    return [tuple(records) for _, records in groupby(dataset.frames, lambda record: record.shot)]
+
+
+def estimate_shot(dataset: Dataset, records: Sequence[FrameRecord], variants: Sequence[Variant]) -> Rows:
+    """Every variant's rows for the frames of one shot."""
+    rows: Rows = {variant.name: [] for variant in variants}
+    shot = [(record, _read(dataset, record)) for record in records]
+    for record, frame in shot:
+        for variant in variants:
+            if isinstance(frame, EstimationFailure):
+                row = _failed(record.frame, frame, dataset.leds, time_s=0.0)
+            else:
+                mates = tuple(mate for _, mate in shot if isinstance(mate, DeviceFrame) and mate is not frame)
+                row = estimate_frame(variant, replace(frame, mates=mates), record.frame)
+            rows[variant.name].append(row)
+    return rows
+
+
+def _read(dataset: Dataset, record: FrameRecord) -> DeviceFrame | EstimationFailure:
+    try:
+        frame = read_frame(dataset, record)
+    except InputError as error:
+        return EstimationFailure("read", str(error))
+    for part in frame.parts:
+        # One variant's work in place would be in the image that the next one gets.
+        part.image_dn.setflags(write=False)
+    return frame
+
+
+def estimate_frame(variant: Variant, frame: DeviceFrame, index: int) -> EstimateRow:
+    """One variant's answer to one frame; `time_s` is wall time from the digital numbers to the position.
+
+    What is no answer is a failed frame: an exception of any kind, something else than an Estimate, numbers that are
+    not finite, a covariance that is none, a range to an LED that is not on the map.
+    """
+    start = time.perf_counter()
+    try:
+        estimate = variant.estimate(frame)
+        return _answered(index, estimate, frame.leds, time.perf_counter() - start)
+    except EstimationFailure as failure:
+        return _failed(index, failure, frame.leds, time.perf_counter() - start)
+    except (Exception, SystemExit) as error:
+        crash = EstimationFailure("variant", f"crashed ({type(error).__name__})")
+        return _failed(index, crash, frame.leds, time.perf_counter() - start)
+
+
+def _answered(index: int, estimate: object, leds: Mapping[int, Led], time_s: float) -> EstimateRow:
+    if not isinstance(estimate, Estimate):
+        raise EstimationFailure("variant", "returned something else than an Estimate")
+    ranges = _led_ranges(estimate.ranges_m, leds)
+    position_m = np.asarray(estimate.position_m, dtype=np.float64)
+    if position_m.shape != (3,):
+        raise EstimationFailure("position", "the result is not three numbers", estimate.ranges_m)
+    if not np.abs(position_m).max() <= LARGEST:  # also for NaN
+        raise EstimationFailure("position", "the result is not a finite number", estimate.ranges_m)
+    covariance = None
+    if estimate.covariance_m2 is not None:
+        matrix = np.asarray(estimate.covariance_m2, dtype=np.float64)
+        if matrix.shape != (3, 3) or not is_covariance(matrix.ravel().tolist()):
+            raise EstimationFailure("covariance", "not a symmetric, positive definite matrix", estimate.ranges_m)
+        covariance = tuple(matrix.ravel().tolist())
+    x, y, z = position_m.tolist()
+    return EstimateRow(
+        frame=index,
+        status="ok",
+        reason="",
+        position_m=(x, y, z),
+        covariance_m2=covariance,
+        ambiguous=bool(estimate.ambiguous),
+        ranges=ranges,
+        time_s=time_s,
+    )
+
+
+def _failed(index: int, failure: EstimationFailure, leds: Mapping[int, Led], time_s: float) -> EstimateRow:
+    try:
+        ranges = _led_ranges(failure.ranges_m, leds)
+    except (EstimationFailure, TypeError, ValueError, OverflowError):
+        ranges = ()  # the frame has failed already, and for another reason
+    return EstimateRow(frame=index, status="failed", reason=str(failure), position_m=None, ranges=ranges, time_s=time_s)
+
+
+def _led_ranges(ranges_m: Mapping[int, float], leds: Mapping[int, Led]) -> tuple[LedRange, ...]:
+    ranges = {operator.index(led): float(range_m) for led, range_m in ranges_m.items()}
+    if not ranges.keys() <= leds.keys():
+        raise EstimationFailure("ranges", "to an LED that is not on the map")
+    if not all(abs(range_m) <= LARGEST for range_m in ranges.values()):
+        raise EstimationFailure("ranges", "the result is not a finite number")
+    return tuple(LedRange(led=led, range_m=range_m) for led, range_m in ranges.items())

@@ -1,0 +1,239 @@
+"""Estimates against the truth: per frame and per variant. Every frame is in the count, answered or not."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from pydantic import BaseModel, Field, ValidationError, model_validator
+
+from estimator.errors import InputError
+from estimator.evaluate.statistics import (
+    AgainstBound,
+    Interval,
+    Nees,
+    OfAll,
+    Summary,
+    against_bound,
+    median_interval,
+    nees,
+    of_all,
+    rmse_interval,
+    squared_in_sigmas,
+    summary,
+)
+from estimator.io.atomic import write_atomically
+from estimator.io.dataset import Dataset, Led, LedId, read_dataset
+from estimator.io.estimates import EstimateRow, read_estimates
+from estimator.io.records import Number, Positive, Row, Size, Triple, first_problem
+from estimator.io.truth import TruthRow, read_truth
+
+VERSION = 2
+
+
+class RangeError(Row):
+    """Estimated minus true distance to an LED."""
+
+    led: LedId
+    error_m: Number
+
+
+class FrameScore(Row):
+    """One frame of one variant; errors are null where it failed. `vertical_error_m` is signed, positive is too high.
+
+    `bound_m` is the root of the trace of the frame's Cramer-Rao bound, null without one; `nees` is `e^T C^-1 e` where
+    the variant reports a covariance.
+    """
+
+    frame: int
+    status: Literal["ok", "failed"]
+    reason: str
+    true_m: Triple
+    estimate_m: Triple | None
+    error_3d_m: Size | None
+    horizontal_error_m: Size | None
+    vertical_error_m: Number | None
+    bound_m: Size | None
+    nees: Size | None
+    ambiguous: bool
+    range_errors: tuple[RangeError, ...]
+    time_s: Size
+
+    @model_validator(mode="after")
+    def _status_fits(self) -> "FrameScore":
+        errors = (self.estimate_m, self.error_3d_m, self.horizontal_error_m, self.vertical_error_m)
+        if any((error is None) == (self.status == "ok") for error in errors):
+            raise ValueError("an ok frame has an estimate and errors, a failed one none")
+        return self
+
+
+class VariantScore(Row):
+    """One variant over all frames.
+
+    `of_all` counts failed frames as infinitely wrong. Every other summary is over the `ok` frames, null without any: it
+    is to be read beside `coverage`, their share of all. The two intervals are of `error_3d`. Range errors are of all
+    distances the variant made, failed frames' included, for a frame can fail after its distances are made.
+    """
+
+    variant: str
+    frames: int
+    ok: int
+    failed: int
+    coverage: float | None = Field(ge=0, le=1)
+    ambiguous: int
+    failures: dict[str, int]
+    of_all: OfAll | None
+    error_3d: Summary | None
+    median_interval: Interval | None
+    rmse_interval: Interval | None
+    horizontal: Summary | None
+    vertical: Summary | None
+    ranges: int
+    range_error: Summary | None
+    against_bound: AgainstBound | None
+    nees: Nees | None
+    median_time_s: Size | None
+    rows: tuple[FrameScore, ...]
+
+
+class Scores(Row):
+    """scores.json: all that a report needs of a dataset, the truth included."""
+
+    format: Literal["estimator-scores"] = "estimator-scores"
+    version: Literal[2] = 2
+    dataset: str
+    room_m: tuple[Positive, Positive, Positive]
+    led_map: tuple[Led, ...]
+    variants: tuple[VariantScore, ...]
+
+    @model_validator(mode="after")
+    def _same_frames(self) -> "Scores":
+        first = list(range(len(self.variants[0].rows))) if self.variants else []
+        if any([row.frame for row in variant.rows] != first for variant in self.variants):
+            raise ValueError("every variant has to have the frames 0, 1, 2, ... in order, and all the same")
+        return self
+
+
+def score_variant(
+    variant: str, estimates: Sequence[EstimateRow], truth: Sequence[TruthRow], leds: Mapping[int, Led]
+) -> VariantScore:
+    """Score one variant's rows against the truth of the same frames."""
+    rows = tuple(score_frame(row, true, leds) for row, true in zip(estimates, truth, strict=True))
+    good = [row for row in rows if row.status == "ok"]
+    errors_m = [row.error_3d_m for row in good if row.error_3d_m is not None]
+    bounded = [(row.error_3d_m, row.bound_m) for row in good if row.error_3d_m is not None and row.bound_m is not None]
+    range_errors_m = [error.error_m for row in rows for error in row.range_errors]
+    return VariantScore(
+        variant=variant,
+        frames=len(rows),
+        ok=len(good),
+        failed=len(rows) - len(good),
+        coverage=len(good) / len(rows) if rows else None,
+        ambiguous=sum(row.ambiguous for row in good),
+        failures=dict(Counter(row.reason for row in rows if row.status == "failed").most_common()),
+        of_all=of_all([row.error_3d_m for row in rows]),
+        error_3d=summary(errors_m),
+        median_interval=median_interval(errors_m),
+        rmse_interval=rmse_interval(errors_m),
+        horizontal=summary([row.horizontal_error_m for row in good if row.horizontal_error_m is not None]),
+        vertical=summary([row.vertical_error_m for row in good if row.vertical_error_m is not None]),
+        ranges=len(range_errors_m),
+        range_error=summary(range_errors_m),
+        against_bound=against_bound([error_m for error_m, _ in bounded], [bound_m for _, bound_m in bounded]),
+        nees=nees([row.nees for row in good if row.nees is not None]),
+        median_time_s=float(np.median([row.time_s for row in good])) if good else None,
+        rows=rows,
+    )
+
+
+def score_frame(estimate: EstimateRow, truth: TruthRow, leds: Mapping[int, Led]) -> FrameScore:
+    """Score one frame: position errors where there is a position, range errors for the ranges there are."""
+    true_m = np.array(truth.position_m)
+    error = horizontal = vertical = squares = None
+    if estimate.position_m is not None:
+        difference_m = np.array(estimate.position_m) - true_m
+        error, horizontal = float(np.linalg.norm(difference_m)), float(np.linalg.norm(difference_m[:2]))
+        vertical = float(difference_m[2])
+        if estimate.covariance_m2 is not None:
+            squares = squared_in_sigmas(difference_m, estimate.covariance_m2)
+    range_errors = tuple(
+        RangeError(led=r.led, error_m=r.range_m - float(np.linalg.norm(np.array(leds[r.led].position_m) - true_m)))
+        for r in estimate.ranges
+    )
+    bound_m2 = truth.bound_m2
+    return FrameScore(
+        frame=estimate.frame,
+        status=estimate.status,
+        reason=estimate.reason,
+        true_m=truth.position_m,
+        estimate_m=estimate.position_m,
+        error_3d_m=error,
+        horizontal_error_m=horizontal,
+        vertical_error_m=vertical,
+        bound_m=None if bound_m2 is None else float(np.sqrt(bound_m2[0] + bound_m2[4] + bound_m2[8])),
+        nees=squares,
+        ambiguous=estimate.ambiguous,
+        range_errors=range_errors,
+        time_s=estimate.time_s,
+    )
+
+
+def score_dataset(folder: Path) -> Scores:
+    """Score every file in `estimates/` and write scores.json; raises InputError where a file is missing or damaged."""
+    dataset = read_dataset(folder)
+    paths = _estimate_paths(folder)
+    if not paths:
+        raise InputError(f"{folder / 'estimates'}: no estimates to score; make them with `estimator run {folder}`")
+    truth = read_truth(folder / "truth.parquet", len(dataset.frames))
+    scores = Scores(
+        dataset=dataset.name,
+        room_m=dataset.room_m,
+        led_map=tuple(dataset.leds.values()),
+        variants=tuple(score_variant(path.stem, _read_known(path, dataset), truth, dataset.leds) for path in paths),
+    )
+    write_atomically(folder / "scores.json", scores.model_dump_json(indent=1).encode() + b"\n")
+    return scores
+
+
+class _Version(BaseModel):
+    version: int
+
+
+def read_or_score(folder: Path) -> Scores:
+    """scores.json where it is newer than the truth and all estimates, and covers them, else new scores.
+
+    The truth need not be there where scores.json is. An older version's scores are made again. Raises InputError.
+    """
+    path, estimates = folder / "scores.json", _estimate_paths(folder)
+    sources = [source for source in (*estimates, folder / "truth.parquet") if source.exists()]
+    if not path.exists() or any(source.stat().st_mtime > path.stat().st_mtime for source in sources):
+        return score_dataset(folder)
+    content = path.read_bytes()
+    try:
+        if _Version.model_validate_json(content).version < VERSION:
+            return score_dataset(folder)
+        scores = Scores.model_validate_json(content)
+    except ValidationError as error:
+        raise InputError(f"{path}: {first_problem(error)}") from None
+    if estimates and [score.variant for score in scores.variants] != [estimate.stem for estimate in estimates]:
+        return score_dataset(folder)
+    return scores
+
+
+def _estimate_paths(folder: Path) -> list[Path]:
+    paths = sorted((folder / "estimates").glob("*.parquet"), key=lambda path: path.stem)
+    for path in paths:
+        if not path.stem.isprintable():
+            raise InputError(f"{folder / 'estimates'}: {path.name!r}: needed a name of printable characters")
+    return paths
+
+
+def _read_known(path: Path, dataset: Dataset) -> tuple[EstimateRow, ...]:
+    """Estimates whose ranges are to LEDs of the map."""
+    rows = read_estimates(path, len(dataset.frames))
+    for row in rows:
+        for led_range in row.ranges:
+            if led_range.led not in dataset.leds:
+                raise InputError(f"{path}: frame {row.frame}: a range to LED {led_range.led}, which is not in led_map")
+    return rows

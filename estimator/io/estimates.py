@@ -1,0 +1,87 @@
+"""A variant's answers on disk: estimates/VARIANT.parquet, one row a frame (datasets/FORMAT.md)."""
+
+import io
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+from pydantic import Field, Strict, model_validator
+
+from estimator.errors import InputError
+from estimator.io.atomic import write_atomically
+from estimator.io.dataset import LedId
+from estimator.io.records import Covariance, Number, Row, Triple, read_rows
+
+COLUMNS = {
+    "frame": pa.int64(),
+    "status": pa.string(),
+    "reason": pa.string(),
+    "position_m": pa.list_(pa.float64()),
+    "covariance_m2": pa.list_(pa.float64()),
+    "ambiguous": pa.bool_(),
+    "ranges": pa.list_(pa.struct([("led", pa.int64()), ("range_m", pa.float64())])),
+    "time_s": pa.float64(),
+}
+
+# Most file systems end at 255 bytes, of which a temporary file's name takes some.
+NAME = r"[A-Za-z0-9][A-Za-z0-9._:=,+-]{0,199}"
+NAME_RULE = "at most 200 of A-Z a-z 0-9 . _ : = , + -, a letter or digit first"
+
+
+class LedRange(Row):
+    """The distance from the camera's projection centre to an LED, metres."""
+
+    led: LedId
+    range_m: Number
+
+
+class EstimateRow(Row):
+    """One frame's answer: a world position in metres, or `failed` and a reason `stage: what went wrong`.
+
+    `covariance_m2` is of the position, row by row, where the variant says how sure it is.
+    """
+
+    frame: int = Field(ge=0)
+    status: Literal["ok", "failed"]
+    reason: str
+    position_m: Triple | None
+    ranges: Annotated[tuple[LedRange, ...], Strict(False)]
+    time_s: float = Field(ge=0, le=1e9)
+    covariance_m2: Covariance | None = None
+    ambiguous: bool = False
+
+    @model_validator(mode="after")
+    def _status_fits(self) -> "EstimateRow":
+        ok = self.status == "ok"
+        if ok != (self.position_m is not None) or ok != (self.reason == ""):
+            raise ValueError("an ok row has a position and no reason, a failed one a reason and no position")
+        return self
+
+
+def estimates_path(folder: Path, variant: str) -> Path:
+    """Where a dataset keeps this variant's estimates; raises InputError for a name that no file can have."""
+    if not re.fullmatch(NAME, variant):
+        raise InputError(f"variant {variant!r}: the name becomes a file's; allowed: {NAME_RULE}")
+    return folder / "estimates" / f"{variant}.parquet"
+
+
+def write_estimates(folder: Path, variant: str, rows: Sequence[EstimateRow]) -> Path:
+    """Write a variant's rows, replacing what was there in one step; returns the path, raises InputError, OSError."""
+    path = estimates_path(folder, variant)
+    path.parent.mkdir(exist_ok=True)
+    schema = pa.schema(list(COLUMNS.items()))
+    buffer = io.BytesIO()
+    pq.write_table(pa.Table.from_pylist([row.model_dump() for row in rows], schema), buffer)
+    write_atomically(path, buffer.getvalue())
+    return path
+
+
+def read_estimates(path: Path, frame_count: int) -> tuple[EstimateRow, ...]:
+    """Read one variant's rows; raises InputError where they are damaged or are not one a frame, in order."""
+    rows = read_rows(path, COLUMNS, EstimateRow)
+    if [row.frame for row in rows] != list(range(frame_count)):
+        raise InputError(f"{path}: {len(rows)} rows, needed one for each of the {frame_count} frames, in order")
+    return rows

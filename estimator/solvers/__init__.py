@@ -1,0 +1,1 @@
+"""Solvers: distances and spots into positions, by trilateration, collinearity, stereo or reprojection error."""

@@ -1,0 +1,73 @@
+"""A rig that moves while it is exposed."""
+
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from scipy.spatial.transform import Rotation
+
+from vlcrender.camera.intrinsics import Camera, Pose, project, rays_world
+from vlcrender.camera.rig import Mounted, pose_of
+from vlcrender.config.toml_model import Settings
+from vlcrender.errors import InputError
+from vlcrender.scene.loader import Scene
+
+STEP_PX = 0.5
+"""Images move by less than this from one pose to the next: the midpoint rule then smooths an edge by (1/4 px) / sqrt(3)
+at most beside what the pixel itself does."""
+MOST_STEPS = 2000
+
+AngularVelocity = Annotated[float, Field(ge=-1e5, le=1e5)]
+LinearVelocity = Annotated[float, Field(ge=-1e3, le=1e3)]
+
+
+class Motion(Settings):
+    """Constant velocities during the exposure. The pose of a frame is the one at mid-exposure."""
+
+    angular_velocity_deg_s: tuple[AngularVelocity, AngularVelocity, AngularVelocity] = (0.0, 0.0, 0.0)
+    """About the axes of the camera `main`, right-handed."""
+    linear_velocity_m_s: tuple[LinearVelocity, LinearVelocity, LinearVelocity] = (0.0, 0.0, 0.0)
+    """Of its projection centre, world."""
+
+    def pose_at(self, middle: Pose, time_s: float) -> Pose:
+        """The pose `time_s` after mid-exposure."""
+        # The camera turns by this in its own axes; what it sees turns back.
+        turned = Rotation.from_rotvec(np.array(self.angular_velocity_deg_s) * time_s, degrees=True).as_matrix()
+        moved = np.array(middle.position_m) + np.array(self.linear_velocity_m_s) * time_s
+        return pose_of(moved, turned.T @ middle.rotation)
+
+
+def poses_during(
+    motion: Motion | None, mounted: Mounted, middle: Pose, exposure_s: float, scene: Scene
+) -> tuple[Pose, ...]:
+    """Poses of one camera spread evenly over the exposure (midpoint rule); `middle` is that of `main`.
+
+    Raises InputError where the image moves too far.
+    """
+    if motion is None:
+        return (mounted.pose(middle),)
+    ends = [mounted.pose(motion.pose_at(middle, time_s)) for time_s in (-exposure_s / 2, exposure_s / 2)]
+    way_px = _longest_way_px(mounted.camera, ends, scene)
+    steps = max(1, int(np.ceil(way_px / STEP_PX)))
+    if steps > MOST_STEPS:
+        raise InputError(
+            f"motion: moves the image by {way_px:.0f} px during the exposure of {exposure_s} s; at most "
+            f"{MOST_STEPS * STEP_PX:.0f} px are allowed"
+        )
+    times_s = ((np.arange(steps) + 0.5) / steps - 0.5) * exposure_s
+    return tuple(mounted.pose(motion.pose_at(middle, float(time_s))) for time_s in times_s)
+
+
+def _longest_way_px(camera: Camera, ends: list[Pose], scene: Scene) -> float:
+    """The farthest that anything goes that is on the sensor or a sensor's width beside it."""
+    size = np.array([camera.width_px, camera.height_px])
+    grid = np.stack(np.meshgrid([0.0, 0.5, 1.0], [0.0, 0.5, 1.0]), axis=-1).reshape(-1, 2) * size
+    centers = scene.leds.centers_m
+    nearest_m = float(np.abs(centers[:, 2] - ends[0].position_m[2]).min())
+    around = [np.array(end.position_m) + rays_world(camera, end, grid) * nearest_m for end in ends]
+    points: NDArray[np.float64] = np.concatenate([centers, *around])
+    start, stop = (project(camera, end, points)[0] for end in ends)
+    near = ((start >= -size) & (start <= 2 * size)).all(axis=1) | ((stop >= -size) & (stop <= 2 * size)).all(axis=1)
+    way = np.hypot(*(stop - start).T)[near]
+    return float(np.nanmax(way, initial=0.0))

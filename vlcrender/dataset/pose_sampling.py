@@ -1,0 +1,131 @@
+"""Where the camera stands in each frame."""
+
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from vlcrender.camera.intrinsics import Camera, Pose, rotation_cam_world
+from vlcrender.config.toml_model import Settings
+from vlcrender.core.random_keys import stream
+from vlcrender.errors import InputError
+from vlcrender.scene.loader import Scene
+from vlcrender.scene.visibility import leds_in_view
+
+Tilt = Annotated[float, Field(ge=-85, le=85)]
+TRIES = 10_000
+"""Random positions and yaws tried for one frame's tilts before the recipe is called impossible."""
+
+
+class AimedPoses(Settings):
+    """Random poses that look at LEDs.
+
+    Tilts are stratified over their ranges, so that few frames already span them. A target among the LEDs, a height
+    and a yaw are drawn, the camera is put where its optical axis meets the target, and the pose is kept if it stands
+    inside the room and sees enough LEDs whole.
+    """
+
+    kind: Literal["aimed"]
+    count: Annotated[int, Field(ge=1, le=10_000_000)]
+    tilt_x_deg: tuple[Tilt, Tilt]
+    tilt_y_deg: tuple[Tilt, Tilt]
+    height_m: tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]]
+    min_leds: Annotated[int, Field(ge=1, le=1000)] = 4
+    wall_distance_m: Annotated[float, Field(gt=0, le=100)] = 0.2
+    border_px: Annotated[float, Field(ge=0, le=10000)] = 20.0
+    """LEDs nearer than this to the image's border do not count."""
+
+    @model_validator(mode="after")
+    def _ranges_go_up(self) -> Self:
+        for name in ("tilt_x_deg", "tilt_y_deg", "height_m"):
+            low, high = getattr(self, name)
+            if low > high:
+                raise ValueError(f"{name} = [{low}, {high}]: the lower value comes first")
+        return self
+
+
+class PoseEntry(Settings):
+    """One pose as given."""
+
+    position_m: tuple[float, float, float]
+    tilt_x_deg: Tilt = 0.0
+    tilt_y_deg: Tilt = 0.0
+    yaw_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
+
+
+class ListedPoses(Settings):
+    """Poses as given, one a frame."""
+
+    kind: Literal["list"]
+    pose: Annotated[tuple[PoseEntry, ...], Field(min_length=1)]
+
+    @property
+    def count(self) -> int:
+        """Number of poses."""
+        return len(self.pose)
+
+
+class GridPoses(Settings):
+    """Level poses at one height, in the middles of columns (along x) times rows (along y) equal cells of the floor.
+
+    Table 1 of Huynh & Yoo 2016 has 350 x 350 at 0 m. A camera has to be inside the room: take a small height.
+    """
+
+    kind: Literal["grid"]
+    columns: Annotated[int, Field(ge=1, le=10_000)]
+    rows: Annotated[int, Field(ge=1, le=10_000)]
+    height_m: Annotated[float, Field(gt=0)]
+    yaw_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
+
+    @property
+    def count(self) -> int:
+        """Number of poses."""
+        return self.columns * self.rows
+
+
+AnyPoses = AimedPoses | ListedPoses | GridPoses
+Poses = Annotated[AnyPoses, Field(discriminator="kind")]
+
+
+def pose_of_frame(poses: AnyPoses, frame: int, seed: int, camera: Camera, scene: Scene) -> Pose:
+    """The pose of one frame; depends on nothing but its arguments. Raises InputError where none can be found."""
+    if isinstance(poses, GridPoses):
+        row, column = divmod(frame, poses.columns)  # x goes up fastest
+        x_m, y_m, _ = scene.room_m
+        place = (float((column + 0.5) * x_m / poses.columns), float((row + 0.5) * y_m / poses.rows), poses.height_m)
+        return Pose(place, yaw_deg=poses.yaw_deg)
+    if isinstance(poses, ListedPoses):
+        entry = poses.pose[frame]
+        return Pose(entry.position_m, entry.tilt_x_deg, entry.tilt_y_deg, entry.yaw_deg)
+    return _aimed_pose(poses, frame, seed, camera, scene)
+
+
+def _aimed_pose(poses: AimedPoses, frame: int, seed: int, camera: Camera, scene: Scene) -> Pose:
+    tilts = []
+    for axis, (low, high) in (("x", poses.tilt_x_deg), ("y", poses.tilt_y_deg)):
+        # Latin hypercube: each axis is cut into `count` strata, shuffled against the other.
+        order = stream(seed, 0, f"tilt-{axis}-strata").permutation(poses.count)
+        within = stream(seed, frame, f"tilt-{axis}").uniform()
+        tilts.append(low + (high - low) * (order[frame] + within) / poses.count)
+    tilt_x, tilt_y = map(float, tilts)
+    generator = stream(seed, frame, "aim")
+    low_corner = np.array([poses.wall_distance_m, poses.wall_distance_m, 0.0])
+    high_corner = scene.room_m - [poses.wall_distance_m, poses.wall_distance_m, 0.0]
+    for _ in range(TRIES):
+        target = scene.leds.centers_m[generator.integers(len(scene.leds))]
+        yaw = float(generator.uniform(-180, 180))
+        height = float(generator.uniform(*poses.height_m))
+        axis_world = rotation_cam_world(tilt_x, tilt_y, yaw)[2]
+        if axis_world[2] <= 0.01 or height >= target[2]:
+            continue
+        position = target - axis_world * (target[2] - height) / axis_world[2]
+        position[2] = height
+        if (position <= low_corner).any() or (position >= high_corner).any():
+            continue
+        pose = Pose((float(position[0]), float(position[1]), height), tilt_x, tilt_y, yaw)
+        if len(leds_in_view(camera, pose, scene, poses.border_px)) >= poses.min_leds:
+            return pose
+    raise InputError(
+        f"poses: frame {frame}: no position in {TRIES} tries sees {poses.min_leds} LEDs whole at tilts "
+        f"({tilt_x:.1f}, {tilt_y:.1f}) deg; lower min_leds or the tilts, or raise height_m"
+    )

@@ -1,0 +1,239 @@
+"""A sensor's data sheet: what its simulated exposures measure, beside what was set.
+
+The bench is the sensor's whole chain (`exposure.expose`) under light of one wavelength, even over all pixels;
+`photon_transfer` measures it as EMVA Standard 1288 has it and sees nothing but digital numbers. A measured value passes
+where it lies within SIGMAS standard errors of what was set. All numbers of frames come from keyed streams: a data sheet
+is the same each time it is made.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vlcrender.config.presets import KINDS, preset, with_presets
+from vlcrender.config.toml_model import Settings, check, read_toml
+from vlcrender.core.quantity import Quantity
+from vlcrender.emva1288.photon_transfer import (
+    FLAT_EXPOSURE_S,
+    ROUNDING_DN2,
+    UNDITHERED_DN2,
+    Measurement,
+    Shoot,
+    measure,
+)
+from vlcrender.errors import InputError
+from vlcrender.sensor.nonuniformity import response_variance
+from vlcrender.sensor.quantum_efficiency import COLOURS
+from vlcrender.sensor.radiometry import detectors
+from vlcrender.sensor.saturation import full_well_e, saturation_e
+from vlcrender.sensor.sensor import Sensor
+from vlcrender.sensor.signal_chain import expose
+
+SIGMAS = 4.0
+"""Of 15 values one is off by chance on one page in 1000."""
+
+
+class _SensorTable(Settings):
+    sensor: Sensor
+
+
+LABELS = {
+    "K": ("system gain", "DN/e", "slope of variance over mean, up to 70 % of saturation"),
+    "QE": ("quantum efficiency", "%", "slope of mean over photons, / K"),
+    "mu_y.dark": ("dark level", "DN", "mean of dark frames at no exposure time"),
+    "sigma_d": ("dark noise", "e", "dark variance at no exposure time, less rounding's 1/12, / K²"),
+    "mu_I": ("dark current", "e/s", "slope of the dark mean over time, / K"),
+    "T_d": ("doubles every", "°C", "dark current at three temperatures"),
+    "DSNU1288": ("dark nonuniformity", "e", "of rows, columns and pixels, in the mean of 64 dark frames"),
+    "DSNU1288.row": ("of rows", "e", "what rows differ by beyond their pixels"),
+    "DSNU1288.col": ("of columns", "e", "what columns differ by beyond their pixels"),
+    "PRNU1288": ("response nonuniformity", "%", "variance at half of saturation less that of DSNU, over the signal"),
+    "full well": ("largest signal", "e", "mean with twice the light of saturation, / K: well or converter full"),
+    "mu_e.sat": ("saturation capacity", "e", "QE times photons of the largest variance"),
+    "SNR_max": ("largest signal to noise", "dB", "root of mu_e.sat"),
+    "DR": ("dynamic range", "dB", "photons at saturation over photons of a signal to noise of 1"),
+    "LE": ("linearity error", "%", "mean deviation from a line, 5 to 95 % of saturation"),
+}
+"""Name, unit and definition of each row."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A line of the data sheet. Where nothing is set, 0 is expected."""
+
+    key: str
+    name: str
+    unit: str
+    definition: str
+    set_value: float
+    measured: float | None
+    """None where it cannot be told."""
+    tolerance: float | None
+    """SIGMAS standard errors; with nothing measured, what the value is known to be below."""
+    passed: bool | None
+
+
+@dataclass(frozen=True)
+class Datasheet:
+    """A data sheet with what its pictures need."""
+
+    title: str
+    conditions: tuple[str, ...]
+    sensor: Sensor
+    efficiency: float
+    """Electrons a photon, as set."""
+    measurement: Measurement
+    rows: tuple[Row, ...]
+
+
+def load_sensor(text: str) -> tuple[str, Sensor]:
+    """The sensor that a word on the command line means, and its name: a preset, or a TOML file with a [sensor] table.
+
+    Raises InputError for what is neither, and for values out of range.
+    """
+    if text.endswith(".toml"):
+        tree = with_presets({key: value for key, value in read_toml(Path(text)).items() if key in KINDS}, [], text)
+        if "sensor" not in tree:
+            raise InputError(f"{text}: has no [sensor] table")
+        name, source = Path(text).stem, text
+    else:
+        try:
+            tree = preset("sensors", text)
+        except InputError as error:
+            raise InputError(f"{error}; or name a .toml file that has a [sensor] table") from None
+        name, source = text, f"preset {text}"
+    return name, check({"sensor": tree["sensor"]}, _SensorTable, source).sensor
+
+
+def make_datasheet(
+    title: str,
+    sensor: Sensor,
+    wavelength_nm: float = 530.0,
+    side_px: int = 512,
+    progress: Callable[[int], None] = lambda frames: None,
+) -> Datasheet:
+    """Measure a sensor with `side_px` x `side_px` pixels. `progress` is told how many frames have been taken.
+
+    Raises InputError for a sensor that cannot be measured: blind at this wavelength, noiseless, or never full.
+    """
+    kinds = detectors(sensor)
+    detector = kinds[0] if len(kinds) == 1 else kinds[COLOURS.index("green")]
+    efficiency = float(detector.quantum_efficiency(np.array([wavelength_nm]))[0])
+    if not efficiency > 1e-6:
+        raise InputError(f"--wavelength-nm {wavelength_nm:g}: the sensor is blind there")
+    measured = measure(bench(sensor, efficiency, side_px, progress))
+    conditions = (
+        f"light of {wavelength_nm:g} nm, even over the pixels" + (", all of them green" if len(kinds) > 1 else ""),
+        f"{sensor.temperature_c:g} °C, ISO {sensor.iso:g}, {sensor.bits} bits, noise = {sensor.noise}",
+        f"{side_px} x {side_px} pixels, flat fields of {FLAT_EXPOSURE_S * 1000:g} ms",
+    )
+    return Datasheet(title, conditions, sensor, efficiency, measured, compare(sensor, efficiency, measured))
+
+
+def bench(
+    sensor: Sensor, efficiency: float, side_px: int, progress: Callable[[int], None] = lambda frames: None
+) -> Shoot:
+    """A camera of this sensor under even light: each call is a new exposure with a stream of its own.
+
+    Another `serial` is another camera, on another day.
+    """
+    taken = 0
+
+    def shoot(photons: float, exposure_s: float, warmer_c: float) -> NDArray[np.uint32]:
+        nonlocal taken
+        taken += 1
+        progress(taken)
+        warm = sensor.model_copy(update={"temperature_c": sensor.temperature_c + warmer_c})
+        light = np.full((side_px, side_px), photons * efficiency, dtype=np.float32)
+        return expose(warm, light, f"datasheet/{sensor.serial}/{taken}", exposure_s=exposure_s)
+
+    return shoot
+
+
+def compare(sensor: Sensor, efficiency: float, measured: Measurement) -> tuple[Row, ...]:
+    """Set against measured, a row for each of LABELS."""
+    acting, gain = sensor.acting(), 1 / sensor.gain_at_iso_e_per_dn
+    dark_e = sensor.dark_electrons(FLAT_EXPOSURE_S) if sensor.noise == "full" else 0.0
+    dark_noise_e = float(np.hypot(acting["read_noise_e"], acting["adc_noise_dn"] / gain))
+    current = acting["dark_current_e_s"]
+    total_e = float(np.linalg.norm([acting[key] for key in ("row_offset_e", "column_offset_e", "dsnu_e")]))
+    found = measured.dark_patterns
+    of_rows, of_columns, dsnu = (
+        variance.over(measured.gain).over(measured.gain) for variance in (found.row, found.column, found.total)
+    )
+    prnu = response_variance(found, measured.bright_patterns)
+    levels_e = np.array([p.photons for p in measured.points]) * efficiency
+    full_e, full_error_e = saturation_e(sensor, dark_e, levels_e, measured.dark.pixels)
+    light = Quantity(measured.saturation_photons, full_error_e / efficiency)
+    saturation = light.times(measured.quantum_efficiency)
+    rounding_e2 = ROUNDING_DN2 / gain**2 if dark_noise_e else 0.0
+    least_e = float(np.sqrt(dark_noise_e**2 + rounding_e2 + 0.25)) + 0.5
+    hidden = 0 < measured.dark_variance_dn2.value <= UNDITHERED_DN2
+    return (
+        _row("K", gain, measured.gain),
+        _row("QE", efficiency * 100, measured.quantum_efficiency.times(100)),
+        _row("mu_y.dark", sensor.black_level_dn, measured.dark_level_dn),
+        _hidden_row("sigma_d", dark_noise_e, measured)
+        if hidden
+        else _root_row("sigma_d", dark_noise_e, measured.dark_noise_e2),
+        _row("mu_I", current, measured.dark_current_e_s),
+        _row("T_d", sensor.dark_current_doubling_c if current else 0.0, measured.doubling_c),
+        _root_row("DSNU1288", total_e, dsnu),
+        _root_row("DSNU1288.row", acting["row_offset_e"], of_rows),
+        _root_row("DSNU1288.col", acting["column_offset_e"], of_columns),
+        _root_row("PRNU1288", acting["prnu"] * 100, prnu.times(100**2)),
+        _row("full well", full_well_e(sensor, dark_e), measured.full_well_e),
+        _row("mu_e.sat", full_e, saturation),
+        _row("SNR_max", _db(full_e) / 2, _in_db(saturation).times(0.5)),
+        _row("DR", _db(full_e / least_e), None if hidden else _in_db(light.over(measured.least_photons))),
+        _linearity_row(measured),
+    )
+
+
+def _row(key: str, set_value: float, measured: Quantity | None) -> Row:
+    if measured is None:
+        return Row(key, *LABELS[key], set_value, None, None, None)
+    tolerance = SIGMAS * measured.error
+    return Row(key, *LABELS[key], set_value, measured.value, tolerance, abs(measured.value - set_value) <= tolerance)
+
+
+def _root_row(key: str, set_value: float, square: Quantity) -> Row:
+    """For the root of what is measured: squares are compared, since near 0 they alone are normal."""
+    doubt = SIGMAS * square.error
+    tolerance = float(np.sqrt(set_value**2 + doubt)) - set_value
+    passed = abs(square.value - set_value**2) <= doubt
+    return Row(key, *LABELS[key], set_value, float(np.sqrt(max(square.value, 0.0))), tolerance, passed)
+
+
+def _hidden_row(key: str, set_value: float, measured: Measurement) -> Row:
+    """Dark noise behind rounding may be anything up to what rounding makes of none."""
+    most = float(np.sqrt(UNDITHERED_DN2)) / measured.gain.value
+    return Row(key, *LABELS[key], set_value, None, most, set_value <= most)
+
+
+def _linearity_row(measured: Measurement) -> Row:
+    """The chain is linear: what is found has to be noise's."""
+    most = measured.linearity_noise + SIGMAS * measured.linearity_error.error
+    found = measured.linearity_error.value
+    return Row("LE", *LABELS["LE"], 0.0, found * 100, most * 100, found <= most)
+
+
+def cells(row: Row) -> tuple[str, str, str, str]:
+    """Set, measured, tolerance and verdict of a row in words, to the tolerance's second digit."""
+    digits = 3 if not row.tolerance else max(0, 1 - int(np.floor(np.log10(row.tolerance))))
+    set_text = f"{row.set_value:.{digits}f}" if row.set_value else "none set"
+    verdict = "cannot be told" if row.passed is None else "pass" if row.passed else "OFF"
+    if row.measured is None:
+        return set_text, "" if row.tolerance is None else f"< {row.tolerance:.{digits}f}", "", verdict
+    return set_text, f"{row.measured:.{digits}f}", f"{row.tolerance:.{digits}f}", verdict
+
+
+def _db(ratio: float) -> float:
+    return 20 * float(np.log10(ratio))
+
+
+def _in_db(ratio: Quantity) -> Quantity:
+    return Quantity(_db(ratio.value), 20 / float(np.log(10)) * ratio.error / ratio.value)

@@ -1,0 +1,187 @@
+"""A data sheet as one HTML page with its plots; it needs no other file and no network."""
+
+from collections.abc import Callable, Sequence
+from html import escape
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vlcrender.emva1288.datasheet import Datasheet, cells
+
+Array = NDArray[np.float64]
+WIDTH, HEIGHT = 960.0, 380.0
+LEFT, RIGHT, TOP, BOTTOM = 76.0, 28.0, 12.0, 44.0
+
+STYLE = """
+:root { color-scheme: light dark; --ink: #1c2024; --soft: #667078; --line: #dde2e6; --paper: #fff; --back: #f4f6f8; }
+@media (prefers-color-scheme: dark) {
+  :root { --ink: #e6e9ec; --soft: #9aa4ad; --line: #363d44; --paper: #1d2126; --back: #14171a; }
+}
+* { box-sizing: border-box; }
+body { margin: 0 auto; max-width: 1200px; padding: 32px 20px 64px; background: var(--back); color: var(--ink);
+  font: 15px/1.5 system-ui, sans-serif; }
+h1 { font-size: 26px; margin: 0 0 4px; }
+h2 { font-size: 18px; margin: 32px 0 8px; }
+p { margin: 4px 0; color: var(--soft); }
+.card { background: var(--paper); border: 1px solid var(--line); border-radius: 10px; padding: 14px 18px;
+  overflow-x: auto; }
+table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums; }
+th { color: var(--soft); font-weight: 500; font-size: 13px; }
+th, td { padding: 6px 10px; text-align: right; white-space: nowrap; border-bottom: 1px solid var(--line); }
+tr:last-child td { border-bottom: 0; }
+.text { text-align: left; }
+.soft { color: var(--soft); white-space: normal; min-width: 200px; }
+.off { color: #d03b3b; font-weight: 600; }
+.key { display: inline-block; width: 10px; height: 10px; border-radius: 50%; margin: 0 6px 0 18px; }
+svg { width: 100%; height: auto; display: block; }
+svg text { fill: var(--soft); font: 12px system-ui, sans-serif; }
+svg .rule { stroke: var(--line); }
+svg path { fill: none; stroke-width: 1.6; }
+svg .measured { fill: #0072b2; } .key.measured { background: #0072b2; }
+svg .set { stroke: #d55e00; } .key.set { background: #d55e00; }
+svg .limit { stroke: #009e73; stroke-dasharray: 5 4; } .key.limit { background: #009e73; }
+"""
+
+
+def page(sheet: Datasheet) -> str:
+    """The whole page."""
+    conditions = " · ".join(escape(condition) for condition in sheet.conditions)
+    return f"""<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>Data sheet: {escape(sheet.title)}</title>
+<style>{STYLE}</style>
+</head>
+<body>
+<h1>Data sheet of the sensor {escape(sheet.title)}</h1>
+<p>{conditions}</p>
+<p>Measured from digital numbers as EMVA Standard 1288, Release 4.0 Linear, has it. A value passes where it is within
+four standard errors, the tolerance, of what was set.</p>
+<h2>Set and measured</h2>
+<div class="card">{_table(sheet)}</div>
+<h2>Photon transfer</h2>
+<div class="card"><p>Temporal variance over the dark against mean over the dark.
+{_legend("measured", "set: K times the signal", "saturation")}</p>{_photon_transfer(sheet)}</div>
+<h2>Signal to noise</h2>
+<div class="card"><p>Mean over the dark, over its temporal noise, against photons a pixel.
+{_legend("measured", "set", "as good as light allows")}</p>{_signal_to_noise(sheet)}</div>
+</body>
+</html>
+"""
+
+
+def _table(sheet: Datasheet) -> str:
+    rows = []
+    for row in sheet.rows:
+        set_text, measured, tolerance, verdict = (escape(cell) for cell in cells(row))
+        plus_minus = f"± {tolerance}" if tolerance else ""
+        kind = ' class="off"' if row.passed is False else ""
+        rows.append(
+            f'<tr><td class="text">{escape(row.key)}</td><td class="text">{escape(row.name)}</td><td>{set_text}</td>'
+            f'<td>{measured}</td><td>{plus_minus}</td><td class="text">{escape(row.unit)}</td><td{kind}>{verdict}</td>'
+            f'<td class="text soft">{escape(row.definition)}</td></tr>'
+        )
+    heads = ("text|", "text|", "|set", "|measured", "|tolerance", "text|", "|", "text|measured as")
+    head = "".join(f'<th class="{kind}">{name}</th>' for kind, _, name in (h.partition("|") for h in heads))
+    return f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
+
+
+def _legend(measured: str, set_text: str, limit: str) -> str:
+    names = (("measured", measured), ("set", set_text), ("limit", limit))
+    return "".join(f'<span class="key {kind}"></span>{escape(name)}' for kind, name in names)
+
+
+def _photon_transfer(sheet: Datasheet) -> str:
+    measured = sheet.measurement
+    signals = measured.signals_dn
+    variances = np.array([p.variance_dn2 for p in measured.points]) - measured.dark.variance_dn2
+    gain = 1 / sheet.sensor.gain_at_iso_e_per_dn
+    across, up = float(signals.max()) * 1.03, max(float(variances.max()), gain * float(signals.max())) * 1.05
+
+    def place(x: Array, y: Array) -> tuple[Array, Array]:
+        return LEFT + x / across * (WIDTH - LEFT - RIGHT), HEIGHT - BOTTOM - y / up * (HEIGHT - TOP - BOTTOM)
+
+    full = float(signals[measured.saturation_index])
+    ends = np.array([0.0, float(signals.max())])
+    parts = [
+        *_axes(_steps(across), _steps(up), place, "mean, DN", "variance, DN²"),
+        _path(*place(ends, gain * ends), "set"),
+        _path(*place(np.array([full, full]), np.array([0.0, up])), "limit"),
+        *_dots(*place(signals, variances)),
+    ]
+    return _svg("photon transfer curve", parts)
+
+
+def _signal_to_noise(sheet: Datasheet) -> str:
+    measured, sensor = sheet.measurement, sheet.sensor
+    acting, gain = sensor.acting(), sensor.gain_at_iso_e_per_dn
+    dark_dn = measured.dark.mean_dn
+    points = [
+        p
+        for p in (*measured.faint, *measured.points[: measured.saturation_index + 1])
+        if p.variance_dn2 > 0 and p.mean_dn - dark_dn > 0.1 * p.variance_dn2**0.5
+    ]
+    photons = np.array([p.photons for p in points])
+    ratios = np.array([(p.mean_dn - dark_dn) / p.variance_dn2**0.5 for p in points])
+    top = float(np.ceil(np.log10(photons[-1])))
+    curve = np.logspace(0, np.log10(photons[-1]), 200)
+    electrons = curve * sheet.efficiency
+    dark_e2 = acting["read_noise_e"] ** 2 + (acting["adc_noise_dn"] ** 2 + 1 / 12) * gain**2
+    high = float(np.ceil(np.log10(np.sqrt(photons[-1]))))
+
+    def place(x: Array, y: Array) -> tuple[Array, Array]:
+        u, v = np.log10(x) / top, (np.log10(y) + 1) / (high + 1)
+        return LEFT + u * (WIDTH - LEFT - RIGHT), HEIGHT - BOTTOM - v * (HEIGHT - TOP - BOTTOM)
+
+    decades_x, decades_y = np.logspace(0, top, int(top) + 1), np.logspace(-1, high, int(high) + 2)
+    set_ratios = electrons / np.sqrt(electrons + dark_e2)
+    shown = set_ratios >= 0.1
+    parts = [
+        *_axes(decades_x, decades_y, place, "photons a pixel", "signal to noise"),
+        _path(*place(curve, np.sqrt(curve)), "limit"),
+        _path(*place(curve[shown], set_ratios[shown]), "set"),
+        *_dots(*place(photons, ratios)),
+    ]
+    return _svg("signal to noise ratio", parts)
+
+
+def _steps(end: float) -> Array:
+    """Round numbers from 0 to `end`, five to ten of them."""
+    power = 10.0 ** np.floor(np.log10(end / 5))
+    step = power * max(factor for factor in (1, 2, 5) if factor * power <= end / 5)
+    return np.arange(0.0, end, step)
+
+
+def _axes(
+    xs: Array, ys: Array, place: Callable[[Array, Array], tuple[Array, Array]], x_name: str, y_name: str
+) -> list[str]:
+    """Rules and numbers at the values `xs` and `ys`, which begin at the corner."""
+    parts = []
+    across, floor = place(xs, np.full(len(xs), ys[0]))
+    for u, v, value in zip(across, floor, xs, strict=True):
+        parts.append(f'<line class="rule" x1="{u:.1f}" y1="{TOP}" x2="{u:.1f}" y2="{v:.1f}"/>')
+        parts.append(f'<text x="{u:.1f}" y="{v + 17:.1f}" text-anchor="middle">{value:,.6g}</text>')
+    left, up = place(np.full(len(ys), xs[0]), ys)
+    for u, v, value in zip(left, up, ys, strict=True):
+        parts.append(f'<line class="rule" x1="{u:.1f}" y1="{v:.1f}" x2="{WIDTH - RIGHT}" y2="{v:.1f}"/>')
+        parts.append(f'<text x="{u - 8:.1f}" y="{v + 4:.1f}" text-anchor="end">{value:,.6g}</text>')
+    middle = (HEIGHT - BOTTOM + TOP) / 2
+    parts.append(f'<text x="{WIDTH / 2}" y="{HEIGHT - 8}" text-anchor="middle">{escape(x_name)}</text>')
+    parts.append(f'<text transform="translate(14 {middle}) rotate(-90)" text-anchor="middle">{escape(y_name)}</text>')
+    return parts
+
+
+def _path(x: Array, y: Array, kind: str) -> str:
+    places = " ".join(f"{u:.1f},{v:.1f}" for u, v in zip(x, y, strict=True))
+    return f'<path class="{kind}" d="M{places}"/>'
+
+
+def _dots(x: Array, y: Array) -> list[str]:
+    return [f'<circle class="measured" cx="{u:.1f}" cy="{v:.1f}" r="3"/>' for u, v in zip(x, y, strict=True)]
+
+
+def _svg(label: str, parts: Sequence[str]) -> str:
+    body = "\n".join(parts)
+    return f'<svg viewBox="0 0 {WIDTH:.0f} {HEIGHT:.0f}" role="img" aria-label="{escape(label)}">\n{body}\n</svg>'

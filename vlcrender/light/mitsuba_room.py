@@ -1,0 +1,68 @@
+"""A room as Mitsuba knows it: its mesh, its window panes, and what glows."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vlcrender.core.backend import mi
+from vlcrender.scene.mesh import Mesh
+from vlcrender.scene.surfaces import Pane
+
+BEHIND_M = 1e-3
+"""What is outside lies this far behind its pane, and is larger by this part."""
+PANE_FACES = np.array([[0, 1, 2], [0, 2, 3]])
+
+Array = NDArray[np.float64]
+
+
+def mitsuba_scene(mesh: Mesh, glow_cd_m2: Array, panes: tuple[Pane, ...], panes_glow: bool) -> Any:
+    """Mesh and panes as a Mitsuba scene whose every shape has an attribute `vertex_glow`, in cd/m2."""
+    shapes = {"room": room_shape(mesh, glow_cd_m2)}
+    for i, pane in enumerate(panes):
+        shapes[f"pane{i}"] = pane_shape(pane)
+        if panes_glow:
+            shapes[f"outside{i}"] = outside_shape(pane)
+    return mi.load_dict({"type": "scene", **shapes}, optimize=False)
+
+
+def room_shape(mesh: Mesh, glow_cd_m2: Array) -> "mi.Mesh":
+    """The room's mesh for Mitsuba, diffuse, with albedo and glow at its corners."""
+    albedo = {"type": "mesh_attribute", "name": "vertex_albedo"}
+    bsdf: dict[str, object] = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": albedo}}
+    shape = _shape("room", mesh.vertices_m, mesh.faces, bsdf, glow_cd_m2)
+    shape.add_attribute("vertex_albedo", 1, mesh.albedo.astype(np.float32).tolist())
+    return shape
+
+
+def pane_shape(pane: Pane) -> "mi.Mesh":
+    """A window pane for Mitsuba: thin glass by Fresnel's law."""
+    return _shape(pane.name, pane.corners_m, PANE_FACES, pane_bsdf(pane), np.zeros(4))
+
+
+def outside_shape(pane: Pane) -> "mi.Mesh":
+    """What is seen through a pane: black where it does not glow, just behind it and a little larger."""
+    middle = pane.corners_m.mean(axis=0)
+    corners = middle + (1 + BEHIND_M) * (pane.corners_m - middle) - BEHIND_M * pane.normal
+    black = {"type": "diffuse", "reflectance": 0.0}
+    return _shape(f"outside {pane.name}", corners, PANE_FACES, black, np.full(4, pane.luminance_cd_m2))
+
+
+def pane_bsdf(pane: Pane) -> dict[str, object]:
+    """Thin glass: mirrors by Fresnel's law at both faces and lets the rest through."""
+    return {"type": "thindielectric", "int_ior": pane.refractive_index, "ext_ior": 1.0}
+
+
+def _shape(
+    name: str, vertices_m: Array, faces: NDArray[np.int64], bsdf: Mapping[str, object], glow_cd_m2: Array
+) -> "mi.Mesh":
+    properties = mi.Properties()
+    properties["bsdf"] = mi.load_dict(dict(bsdf))
+    shape = mi.Mesh(name, len(vertices_m), len(faces), props=properties)
+    parameters = mi.traverse(shape)
+    parameters["vertex_positions"] = vertices_m.astype(np.float32).ravel()
+    parameters["faces"] = faces.astype(np.uint32).ravel()
+    parameters.update()
+    shape.add_attribute("vertex_glow", 1, glow_cd_m2.astype(np.float32).tolist())
+    return shape

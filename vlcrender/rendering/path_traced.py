@@ -1,0 +1,262 @@
+"""The same view by Mitsuba's own path integrator: slow, independent of `render` and of the bake, for checking them.
+
+The room is built from Mitsuba's rectangles and discs, every LED is an area emitter, and light is followed from the
+camera by `path`. Two images add up: the LEDs' and windows' light with all its reflections, and the surrounding light,
+which is defined to hold its own reflections and so is looked at and not followed. Furniture alone is read and cut by
+the code that the fast way uses too.
+"""
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vlcrender.camera.intrinsics import Camera, Pose, mitsuba_to_world, ray_of_pixel
+from vlcrender.core.backend import dr, mi
+from vlcrender.errors import InputError
+from vlcrender.light.mitsuba_room import BEHIND_M, pane_bsdf, room_shape
+from vlcrender.scene.furniture import furniture_meshes
+from vlcrender.scene.loader import Scene
+from vlcrender.scene.surfaces import TOUCH_M, Surface
+from vlcrender.scene.texture import Texture
+
+Array = NDArray[np.float64]
+
+BATCHES = 8
+LED_STANDOFF_M = 1e-5
+"""LEDs are put this far below what they are mounted on, so that a ray meets the LED first."""
+SHEET_PIXELS = 16
+"""Pixels, linear in between, of a diffuser's image in the distance that LEDs are behind it."""
+MAX_DEPTH = 24
+MOST_PANES = 4
+"""Panes met one after the other on the way to what is looked at."""
+
+
+def reference_cd_m2(
+    scene: Scene, camera: Camera, pose: Pose, samples_per_pixel: int, seed: int = 0
+) -> tuple[Array, Array]:
+    """Luminance averaged over each pixel (and the pupil), and the variance of that estimate, both (height, width).
+
+    No photometry: no cos^4, no aperture. A pinhole is Mitsuba's own perspective sensor; of other lenses rays are drawn
+    here, evenly over the pixel and the pupil, and followed by Mitsuba. The variance comes from the scatter of BATCHES
+    images. Raises InputError for what it cannot do: a psf, and bare LEDs that are not Lambertian, since Mitsuba's area
+    emitters are Lambertian or send along the normal alone.
+    """
+    if camera.psf != "none":
+        raise InputError(f"camera.psf = {camera.psf!r}: the reference renderer has no diffraction; it has to be 'none'")
+    bare = np.array([sheet is None for sheet in scene.leds.sheets])
+    if not np.allclose(scene.leds.orders[bare], 1.0):
+        raise InputError("half_power_deg: the reference renderer's LEDs are Lambertian; it has to be 60")
+    loaded = mi.load_dict(scene_dict(scene, camera, pose), optimize=False)
+    followed = mi.load_dict({"type": "path", "max_depth": MAX_DEPTH, "rr_depth": 8})
+    looked_at = _FirstSurface(scene.settings.ambient.illuminance_lux)
+    pinhole = camera.projection == "perspective" and camera.distortion is None and camera.focus_distance_m is None
+    render = _by_sensor if pinhole and camera.skew_px == 0 else _by_rays
+    each = -(-samples_per_pixel // BATCHES)
+    images = []
+    for batch in range(BATCHES):
+        number = 2 * (seed * BATCHES + batch)
+        image = render(loaded, followed, camera, pose, each, number) + render(
+            loaded, looked_at, camera, pose, each, number + 1
+        )
+        images.append(image.reshape(camera.height_px, camera.width_px))
+    stack = np.stack(images)
+    return stack.mean(axis=0), stack.var(axis=0, ddof=1) / BATCHES
+
+
+class _FirstSurface(mi.SamplingIntegrator):
+    """What an even illuminance makes of the first diffuse surface that a ray meets, panes followed."""
+
+    def __init__(self, illuminance_lux: float) -> None:
+        super().__init__(mi.Properties())
+        self._flat_cd_m2 = illuminance_lux / np.pi
+
+    def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True) -> Any:
+        """Mitsuba's interface: (luminance, whether anything was met, no further channels)."""
+        luminance, met = _look(scene, sampler, mi.Ray3f(ray), mi.Bool(active))
+        return self._flat_cd_m2 * luminance, met, []
+
+
+@dr.syntax
+def _look(scene: Any, sampler: Any, ray: Any, active: Any) -> Any:
+    met, panes = mi.Bool(False), mi.UInt32(0)
+    reflectance: Any = mi.Float(0.0)
+    while active:
+        si = scene.ray_intersect(ray, active)
+        bsdf = si.bsdf()
+        active &= si.is_valid()
+        on_pane = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) & (panes < MOST_PANES)
+        diffuse = mi.unpolarized_spectrum(bsdf.eval_diffuse_reflectance(si, active & ~on_pane))[0]
+        reflectance = dr.select(active & ~on_pane, diffuse, reflectance)
+        met |= active
+        sample, _ = bsdf.sample(mi.BSDFContext(), si, sampler.next_1d(on_pane), sampler.next_2d(on_pane), on_pane)
+        ray = si.spawn_ray(si.to_world(sample.wo))
+        panes += 1
+        active &= on_pane
+    return reflectance, met
+
+
+def _by_sensor(scene: Any, integrator: Any, camera: Camera, pose: Pose, samples: int, seed: int) -> Array:
+    return np.asarray(mi.render(scene, integrator=integrator, spp=samples, seed=seed), dtype=np.float64)
+
+
+def _by_rays(scene: Any, integrator: Any, camera: Camera, pose: Pose, samples: int, seed: int) -> Array:
+    """Thin lens: from a point of the pupil to where the ray through its centre meets the plane of focus."""
+    count = camera.width_px * camera.height_px
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(seed, count * samples)
+    pixel = dr.arange(mi.UInt32, count * samples) // samples
+    row = pixel // camera.width_px
+    within = sampler.next_2d()
+    u, v = mi.Float(pixel - row * camera.width_px) + within.x, mi.Float(row) + within.y
+    x, y, z = ray_of_pixel(camera, u, v, dr)
+    pupil_m = 0.0 if camera.focus_distance_m is None else camera.aperture_mm / 2000
+    off = mi.warp.square_to_uniform_disk_concentric(sampler.next_2d()) * pupil_m
+    if isinstance(camera.focus_distance_m, float):
+        x, y, z = x - off.x / camera.focus_distance_m, y - off.y / camera.focus_distance_m, z
+    to_world = pose.rotation.T.tolist()
+    direction = mi.Vector3f(*(r[0] * x + r[1] * y + r[2] * z for r in to_world))
+    origin = mi.Point3f(*(p + r[0] * off.x + r[1] * off.y for p, r in zip(pose.position_m, to_world, strict=True)))
+    luminance, _, _ = integrator.sample(scene, sampler, mi.RayDifferential3f(origin, dr.normalize(direction)))
+    mean: Array = np.array(luminance, dtype=np.float64).reshape(count, samples).mean(axis=1)
+    return mean
+
+
+def sensor_dict(camera: Camera, pose: Pose) -> dict[str, object]:
+    """Mitsuba's description of a camera: axes turned, principal point, box pixels in float32."""
+    u, v = camera.center_px
+    return {
+        "type": "perspective",
+        "fov": camera.view_angles_deg()[0],
+        "fov_axis": "x",
+        "near_clip": 1e-3,
+        "far_clip": 1e4,
+        # Fractions of the image; positive moves the image left and up.
+        "principal_point_offset_x": -(u / camera.width_px - 0.5),
+        "principal_point_offset_y": -(v / camera.height_px - 0.5),
+        "to_world": mi.ScalarTransform4f(mitsuba_to_world(pose).tolist()),
+        "film": {
+            "type": "hdrfilm",
+            "width": camera.width_px,
+            "height": camera.height_px,
+            "pixel_format": "luminance",
+            "component_format": "float32",
+            "rfilter": {"type": "box"},
+        },
+        "sampler": {"type": "independent"},
+    }
+
+
+def scene_dict(scene: Scene, camera: Camera, pose: Pose) -> dict[str, object]:
+    """The scene for Mitsuba: LEDs and what is outside panes shine; a pane mirrors and lets through."""
+    tree: dict[str, object] = {"type": "scene", "sensor": sensor_dict(camera, pose)}
+    number = 0
+    for surface in scene.surfaces:
+        for corner, edge_u, edge_v in _without_holes(surface):
+            skin = _diffuse(surface.reflectance)
+            if surface.texture is not None:
+                skin["reflectance"] = _bitmap(surface.texture, corner, edge_u, edge_v)
+            part = _shape("rectangle", _frame(corner, edge_u, edge_v), skin, 0.0)
+            glow = _sheet_cd_m2(scene, surface)
+            if glow is not None:
+                part["emitter"] = {"type": "area", "radiance": {"type": "bitmap", "bitmap": glow, "raw": True}}
+            tree[f"surface{number}"] = part
+            number += 1
+    for i, mesh in enumerate(furniture_meshes(scene, 0)):
+        tree[f"furniture{i}"] = room_shape(mesh, np.zeros(len(mesh.vertices_m)))
+    for i, pane in enumerate(scene.panes):
+        frame = _frame(pane.corner_m, pane.edge_u_m, pane.edge_v_m)
+        tree[f"pane{i}"] = _shape("rectangle", frame, pane_bsdf(pane), 0.0)
+        behind = frame.copy()
+        behind[:3, 3] -= BEHIND_M * frame[:3, 2]
+        behind[:3, :2] *= 1 + BEHIND_M
+        tree[f"outside{i}"] = _shape("rectangle", behind, _diffuse(0.0), pane.luminance_cd_m2)
+    leds, face = scene.leds, scene.settings.led_reflectance
+    for i in range(len(leds)):
+        if leds.sheets[i] is not None:
+            continue  # its sheet shines
+        radius = leds.radii_m[i]
+        frame = np.diag([radius, -radius, -1.0, 1.0])  # faces down
+        frame[:3, 3] = leds.centers_m[i] - [0, 0, LED_STANDOFF_M]
+        shape = "rectangle" if leds.squares[i] else "disk"
+        tree[f"led{i}"] = _shape(shape, frame, _diffuse(face), leds.luminances_cd_m2[i])
+    return tree
+
+
+def _without_holes(surface: Surface) -> list[tuple[Array, Array, Array]]:
+    """Corner and edges of rectangles that make up a surface: strips along v, cut where a hole is."""
+    corner, edge_u, edge_v, holes = surface.corner_m, surface.edge_u_m, surface.edge_v_m, surface.holes
+    cuts = np.unique([0.0, 1.0, *(cut for a0, _, a1, _ in holes for cut in (a0, a1))])
+    parts = []
+    for low, high in pairwise(cuts):
+        if high - low < 1e-12:
+            continue
+        across = sorted((b0, b1) for a0, b0, a1, b1 in holes if a0 < (low + high) / 2 < a1)
+        start = 0.0
+        for b0, b1 in [*across, (1.0, 1.0)]:
+            if b0 - start > 1e-12:
+                parts.append((corner + low * edge_u + start * edge_v, (high - low) * edge_u, (b0 - start) * edge_v))
+            start = b1
+    return parts
+
+
+def _frame(corner: Array, edge_u: Array, edge_v: Array) -> Array:
+    """`to_world` of Mitsuba's rectangle, which spans [-1, 1]^2."""
+    frame = np.eye(4)
+    frame[:3, 0] = edge_u / 2
+    frame[:3, 1] = edge_v / 2
+    normal = np.cross(edge_u, edge_v)
+    frame[:3, 2] = normal / np.linalg.norm(normal)
+    frame[:3, 3] = corner + (edge_u + edge_v) / 2
+    return frame
+
+
+def _sheet_cd_m2(scene: Scene, surface: Surface) -> "mi.Bitmap | None":
+    """What LEDs make of a panel's diffuser, rows along edge_v and columns along edge_u; None for other surfaces."""
+    low = surface.corner_m
+    high = low + surface.edge_u_m + surface.edge_v_m
+    lit = [
+        (sheet, scene.leds.luminances_cd_m2[i])
+        for i, sheet in enumerate(scene.leds.sheets)
+        if sheet is not None
+        and abs(low[2] - scene.leds.centers_m[i, 2]) + abs(high[2] - low[2]) < TOUCH_M
+        and np.allclose(sheet.opening_m, [*low[:2], *high[:2]], rtol=0, atol=TOUCH_M)
+    ]
+    if not lit:
+        return None
+    step_m = min(sheet.distance_m for sheet, _ in lit) / SHEET_PIXELS
+    columns, rows = (int(np.ceil(np.linalg.norm(edge) / step_m)) for edge in (surface.edge_u_m, surface.edge_v_m))
+    b, a = np.meshgrid((np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij")
+    at = low + a[..., None] * surface.edge_u_m + b[..., None] * surface.edge_v_m
+    total = np.zeros((rows, columns))
+    for sheet, luminance in lit:
+        x0, y0, x1, y1 = sheet.lit_m
+        within = (at[..., 0] >= x0) & (at[..., 0] <= x1) & (at[..., 1] >= y0) & (at[..., 1] <= y1)
+        total += luminance * within * sheet.luminance(at[..., 0], at[..., 1])
+    return mi.Bitmap(total[:, :, None].astype(np.float32))
+
+
+def _bitmap(texture: Texture, corner: Array, edge_u: Array, edge_v: Array) -> dict[str, object]:
+    """A texture on Mitsuba's rectangle, whose (u, v) run along its edges; (0, 0) to (1, 1) is the image."""
+    size = np.array(texture.reflectances.shape[::-1])
+    start, along_u, along_v = (texture.at_px(corner + edge) / size for edge in (np.zeros(3), edge_u, edge_v))
+    to_uv = np.eye(3)
+    to_uv[:2] = np.stack([along_u - start, along_v - start, start], axis=1)
+    return {
+        "type": "bitmap",
+        "bitmap": mi.Bitmap(texture.reflectances[:, :, None].astype(np.float32)),
+        "raw": True,
+        "to_uv": mi.ScalarTransform3f(to_uv.tolist()),
+    }
+
+
+def _diffuse(reflectance: float) -> dict[str, object]:
+    return {"type": "diffuse", "reflectance": reflectance}
+
+
+def _shape(shape: str, frame: Array, bsdf: dict[str, object], luminance_cd_m2: float) -> dict[str, Any]:
+    tree = {"type": shape, "to_world": mi.ScalarTransform4f(frame.tolist()), "bsdf": bsdf}
+    if luminance_cd_m2 > 0:
+        tree["emitter"] = {"type": "area", "radiance": float(luminance_cd_m2)}
+    return tree

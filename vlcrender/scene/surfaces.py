@@ -1,0 +1,271 @@
+"""What light falls on: the room's diffuse surfaces with those of its panels, and window panes.
+
+World: metres, right-handed, z up, origin at a floor corner.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vlcrender.errors import InputError
+from vlcrender.scene.schema import PanelFrame, PanelGrid, Room, SceneSettings, TextureEntry
+from vlcrender.scene.texture import Texture, read_reflectances
+
+TOUCH_M = 1e-9
+"""Rounding allowance where two things touch."""
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A diffuse rectangle: corner + a * edge_u + b * edge_v with a, b in [0, 1]; seen from edge_u x edge_v."""
+
+    name: str
+    corner_m: NDArray[np.float64]
+    edge_u_m: NDArray[np.float64]
+    edge_v_m: NDArray[np.float64]
+    reflectance: float
+    """The mean, where there is a texture."""
+    holes: tuple[tuple[float, float, float, float], ...] = ()
+    """(a0, b0, a1, b1) of what is cut out: panels on a ceiling, windows in a wall."""
+    texture: Texture | None = None
+
+
+@dataclass(frozen=True)
+class Pane:
+    """A window pane: the rectangle corner + a * edge_u + b * edge_v, seen from edge_u x edge_v."""
+
+    name: str
+    corner_m: NDArray[np.float64]
+    edge_u_m: NDArray[np.float64]
+    edge_v_m: NDArray[np.float64]
+    luminance_cd_m2: float
+    refractive_index: float
+
+    @property
+    def corners_m(self) -> NDArray[np.float64]:
+        """The four corners in order around, shape (4, 3)."""
+        shares = ((0, 0), (1, 0), (1, 1), (0, 1))
+        return np.stack([self.corner_m + a * self.edge_u_m + b * self.edge_v_m for a, b in shares])
+
+    @property
+    def normal(self) -> NDArray[np.float64]:
+        """Unit vector into the room."""
+        normal: NDArray[np.float64] = np.cross(self.edge_u_m, self.edge_v_m)
+        return normal / float(np.linalg.norm(normal))
+
+    def mirrored(self, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Mirror images (..., 3) of points (..., 3) in the pane's plane."""
+        height = ((points_m - self.corner_m) * self.normal).sum(axis=-1, keepdims=True)
+        images: NDArray[np.float64] = points_m - 2 * height * self.normal
+        return images
+
+    def holds(self, points_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Whether points (..., 3) of its plane are within the pane, (...,)."""
+        from_corner = points_m - self.corner_m
+        inside = np.ones(points_m.shape[:-1], dtype=bool)
+        for edge in (self.edge_u_m, self.edge_v_m):
+            share = (from_corner * edge).sum(axis=-1) / float(edge @ edge)
+            inside &= (share >= 0) & (share <= 1)
+        return inside
+
+
+def panel_centers_m(grid: PanelGrid) -> NDArray[np.float64]:
+    """Centres of the undersides, shape (rows * columns, 3), columns (x) fastest."""
+    x = grid.first_center_m[0] + grid.pitch_m[0] * np.arange(grid.columns)
+    y = grid.first_center_m[1] + grid.pitch_m[1] * np.arange(grid.rows)
+    yy, xx = np.meshgrid(y, x, indexing="ij")
+    return np.stack([xx.ravel(), yy.ravel(), np.full(xx.size, grid.first_center_m[2])], axis=1)
+
+
+def panel_opening_m(grid: PanelGrid, x: float, y: float) -> tuple[float, float, float, float]:
+    """(x0, y0, x1, y1) of what the frame leaves of the underside of the panel centred at (x, y)."""
+    rim = 0.0 if grid.frame is None else grid.frame.width_m
+    half_x, half_y = grid.size_m[0] / 2 - rim, grid.size_m[1] / 2 - rim
+    return x - half_x, y - half_y, x + half_x, y + half_y
+
+
+def room_surfaces(
+    room: Room, panels: tuple[PanelGrid, ...], panes: tuple[Pane, ...], folder: Path, source: str
+) -> list[Surface]:
+    """Floor, ceiling and walls, cut where panels touch and panes are; images are read from below `folder`."""
+    o = np.zeros(3)
+    x, y, z = (np.diag(room.size_m)[i] for i in range(3))
+    skins = {name: _skin(room, name, folder, source) for name in ("floor", "ceiling", "walls")}
+    floor, ceiling = (_hung(skins[name], corner, x, y) for name, corner in (("floor", o), ("ceiling", z)))
+    surfaces = [
+        Surface("floor", o, x, y, skins["floor"].reflectance, texture=floor),
+        Surface("ceiling", z, y, x, skins["ceiling"].reflectance, _panels_on_ceiling(room, panels), ceiling),
+    ]
+    for name, (corner, edge_u, edge_v) in _walls(room).items():
+        holes = tuple(_hole(pane, corner, edge_u, edge_v) for pane in panes if pane.name.startswith(f"window {name} "))
+        along = y if name.startswith("x") else x
+        texture = _hung(skins["walls"], corner + z, along, -z)
+        surfaces.append(Surface(f"wall {name}", corner, edge_u, edge_v, skins["walls"].reflectance, holes, texture))
+    return surfaces
+
+
+@dataclass(frozen=True)
+class _Skin:
+    """What a surface looks like: its (mean) reflectance, and an image with the size of its tile where it has one."""
+
+    reflectance: float
+    image: NDArray[np.float64] | None = None
+    tile_m: tuple[float, float] = (1.0, 1.0)
+
+
+def _skin(room: Room, name: str, folder: Path, source: str) -> _Skin:
+    reflectance: float | None = getattr(room.reflectance, name)
+    entry: TextureEntry | None = getattr(room.texture, name)
+    if entry is None:
+        if reflectance is None:
+            raise InputError(f"{source}: key room.reflectance.{name} is missing, and there is no room.texture.{name}")
+        return _Skin(reflectance)
+    if reflectance is not None:
+        raise InputError(
+            f"{source}: room.reflectance.{name} = {reflectance}: room.texture.{name} says it already; leave one out"
+        )
+    image = read_reflectances(folder / entry.file, f"{source}: room.texture.{name}.file = {entry.file!r}")
+    return _Skin(float(image.mean()), image, entry.tile_m)
+
+
+def _hung(
+    skin: _Skin, corner: NDArray[np.float64], across: NDArray[np.float64], down: NDArray[np.float64]
+) -> Texture | None:
+    """The skin's image with its first pixel in a corner and its sides along two edges."""
+    if skin.image is None:
+        return None
+    width, height = (side * edge / np.linalg.norm(edge) for side, edge in zip(skin.tile_m, (across, down), strict=True))
+    return Texture(skin.image, corner, width, height)
+
+
+def _walls(room: Room) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]]:
+    """Corner and edges of each wall; edge_u x edge_v points into the room."""
+    o = np.zeros(3)
+    x, y, z = (np.diag(room.size_m)[i] for i in range(3))
+    return {"x=0": (o, y, z), "x=max": (x, z, y), "y=0": (o, z, x), "y=max": (y, x, z)}
+
+
+def _panels_on_ceiling(room: Room, panels: tuple[PanelGrid, ...]) -> tuple[tuple[float, float, float, float], ...]:
+    """Parts of the ceiling that panels touch, in its (a, b) = (y, x) shares."""
+    width, depth, height = room.size_m
+    holes = []
+    for grid in panels:
+        if abs(grid.first_center_m[2] + grid.size_m[2] - height) > TOUCH_M:
+            continue
+        half_x, half_y = grid.size_m[0] / 2, grid.size_m[1] / 2
+        for x, y, _ in panel_centers_m(grid).tolist():
+            holes.append(((y - half_y) / depth, (x - half_x) / width, (y + half_y) / depth, (x + half_x) / width))
+    return tuple(holes)
+
+
+def _hole(
+    pane: Pane, corner: NDArray[np.float64], edge_u: NDArray[np.float64], edge_v: NDArray[np.float64]
+) -> tuple[float, float, float, float]:
+    low = pane.corner_m - corner
+    high = low + pane.edge_u_m + pane.edge_v_m
+    along = [(float(p @ edge_u / (edge_u @ edge_u)), float(p @ edge_v / (edge_v @ edge_v))) for p in (low, high)]
+    (a0, b0), (a1, b1) = along
+    return a0, b0, a1, b1
+
+
+def panes_of(settings: SceneSettings, source: str) -> tuple[Pane, ...]:
+    """The scene's window panes. Raises InputError where one does not fit into its wall or overlaps another."""
+    panes: list[Pane] = []
+    taken: list[tuple[str, tuple[NDArray[np.float64], NDArray[np.float64]]]] = []
+    for index, window in enumerate(settings.window):
+        where = f"{source}: window[{index}]"
+        corner, edge_u, edge_v = _walls(settings.room)[window.wall]
+        along = 1 if window.wall.startswith("x") else 0
+        low = corner.copy()
+        low[along] = window.corner_m[0]
+        low[2] = window.corner_m[1]
+        high = low.copy()
+        high[along] += window.size_m[0]
+        high[2] += window.size_m[1]
+        if (high > np.array(settings.room.size_m) + TOUCH_M).any():
+            raise InputError(
+                f"{where}: from {low.round(4).tolist()} to {high.round(4).tolist()} m does not fit "
+                f"into the room of {list(settings.room.size_m)} m"
+            )
+        if any(wall == window.wall and _overlap(low, high, *extent, along) for wall, extent in taken):
+            raise InputError(f"{where}: overlaps another window in wall {window.wall}")
+        taken.append((window.wall, (low, high)))
+        span = high - low
+        panes.append(
+            Pane(
+                name=f"window {window.wall} {index}",
+                corner_m=low,
+                edge_u_m=np.where(edge_u != 0, span, 0.0),
+                edge_v_m=np.where(edge_v != 0, span, 0.0),
+                luminance_cd_m2=window.luminance_cd_m2,
+                refractive_index=window.refractive_index,
+            )
+        )
+    return tuple(panes)
+
+
+def _overlap(
+    low: NDArray[np.float64],
+    high: NDArray[np.float64],
+    other_low: NDArray[np.float64],
+    other_high: NDArray[np.float64],
+    along: int,
+) -> bool:
+    axes = [along, 2]
+    return bool((low[axes] < other_high[axes] - TOUCH_M).all() and (high[axes] > other_low[axes] + TOUCH_M).all())
+
+
+def panel_surfaces(grid: PanelGrid, room_m: NDArray[np.float64], where: str) -> list[Surface]:
+    """Underside, sides and frame of each panel. Raises InputError where panels overlap or leave the room."""
+    size = np.array(grid.size_m)
+    for axis, name, count in ((0, "columns", grid.columns), (1, "rows", grid.rows)):
+        if count > 1 and grid.pitch_m[axis] < size[axis] - TOUCH_M:
+            raise InputError(
+                f"{where}.pitch_m: {name} {grid.pitch_m[axis]} m apart overlap; panels are {size[axis]} m wide"
+            )
+    drop = 0.0 if grid.frame is None else grid.frame.depth_m
+    surfaces: list[Surface] = []
+    for number, center in enumerate(panel_centers_m(grid)):
+        low = center - [size[0] / 2, size[1] / 2, 0.0]
+        high = center + [size[0] / 2, size[1] / 2, size[2]]
+        if (low - [0, 0, drop] < -TOUCH_M).any() or (high > room_m + TOUCH_M).any():
+            raise InputError(
+                f"{where}: panel {number} from {(low - [0, 0, drop]).round(4).tolist()} to {high.round(4).tolist()} m "
+                f"is not inside the room of {room_m.tolist()} m"
+            )
+        name = f"panel {number}"
+        x0, y0, x1, y1 = panel_opening_m(grid, float(center[0]), float(center[1]))
+        under, across, along = np.array([x0, y0, low[2]]), np.array([x1 - x0, 0, 0]), np.array([0, y1 - y0, 0])
+        surfaces.append(Surface(f"{name} underside", under, along, across, grid.reflectance))
+        surfaces += _sides(f"{name} side", low, size, grid.reflectance)
+        if grid.frame is not None:
+            surfaces += _frame_surfaces(f"{name} frame", low, size, grid.frame)
+    return surfaces
+
+
+def _sides(
+    name: str, low: NDArray[np.float64], size: NDArray[np.float64], reflectance: float, inwards: bool = False
+) -> list[Surface]:
+    """The four upright sides of a box, seen from outside or from inside."""
+    x, y, z = (np.diag(size)[i] for i in range(3))
+    outside = (("x-", low, z, y), ("x+", low + x, y, z), ("y-", low, x, z), ("y+", low + y, z, x))
+    return [
+        Surface(f"{name} {side}", corner, *((v, u) if inwards else (u, v)), reflectance)
+        for side, corner, u, v in outside
+    ]
+
+
+def _frame_surfaces(name: str, low: NDArray[np.float64], size: NDArray[np.float64], frame: PanelFrame) -> list[Surface]:
+    """A rim below a panel whose lowest corner is `low`: its outside, its inside and what faces down."""
+    bottom = low - [0, 0, frame.depth_m]
+    rim = np.array([frame.width_m, frame.width_m, 0])
+    outer, inner = (np.array([*(size[:2] - 2 * width), frame.depth_m]) for width in (0.0, frame.width_m))
+    x, y, _ = np.diag(size)
+    hole = (rim[1] / size[1], rim[0] / size[0], 1 - rim[1] / size[1], 1 - rim[0] / size[0])
+    return [
+        *_sides(f"{name} outside", bottom, outer, frame.reflectance),
+        *_sides(f"{name} inside", bottom + rim, inner, frame.reflectance, inwards=True),
+        Surface(f"{name} rim", bottom, y, x, frame.reflectance, (hole,)),
+    ]

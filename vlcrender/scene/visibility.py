@@ -1,0 +1,100 @@
+"""Which LEDs a pose sees whole, and what share of poses sees enough of them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from vlcrender.camera.intrinsics import Camera, Pose, image_of_points, project, rays_world, transform
+from vlcrender.core.random_keys import stream
+from vlcrender.scene.loader import Scene
+
+LEVEL_GRID = 350
+"""Positions a side, as in Table 1 of Huynh & Yoo 2016: 7 m in steps of 0.02 m."""
+TILTED_POSES = 5_000
+TILT_LIMIT_DEG = 60.0
+ENOUGH_LEDS = 4
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Share of `poses` poses that see ENOUGH_LEDS LEDs or more."""
+
+    height_m: float
+    attitude: str
+    poses: int
+    seen: int
+
+    @property
+    def share(self) -> float:
+        """Of all poses, 0 to 1."""
+        return self.seen / self.poses
+
+
+def leds_in_view(camera: Camera, pose: Pose, scene: Scene, margin_px: float = 0.0) -> NDArray[np.int64]:
+    """Indices of the LEDs whose whole face (a square's circle) is on the sensor, `margin_px` or more inside."""
+    leds = scene.leds
+    centers_cam = transform(pose.rotation, leds.centers_m - np.array(pose.position_m))
+    candidates = np.flatnonzero(_on_sensor(camera, centers_cam))
+    angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    rim = np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=1)
+    # The circumscribed 24-gon: what holds it holds the circle.
+    points = leds.centers_m[candidates, None, :] + rim * (leds.reaches_m[candidates, None, None] / np.cos(np.pi / 24))
+    pixels, _ = project(camera, pose, points)
+    inside = (pixels >= margin_px) & (pixels <= np.array([camera.width_px, camera.height_px]) - margin_px)
+    seen = inside.all(axis=(-1, -2)) & (pose.position_m[2] < leds.centers_m[candidates, 2])
+    visible: NDArray[np.int64] = candidates[seen]
+    return visible
+
+
+def level_coverage(camera: Camera, scene: Scene, height_m: float, yaw_deg: float) -> Coverage:
+    """Level poses on a LEVEL_GRID x LEVEL_GRID grid of cell centres over the floor, LED centres in view."""
+    room = scene.room_m
+    x = (np.arange(LEVEL_GRID) + 0.5) * room[0] / LEVEL_GRID
+    y = (np.arange(LEVEL_GRID) + 0.5) * room[1] / LEVEL_GRID
+    positions = np.stack([*np.meshgrid(x, y, indexing="ij"), np.full((LEVEL_GRID, LEVEL_GRID), height_m)], axis=-1)
+    positions = positions.reshape(-1, 3)
+    pose = Pose((0.0, 0.0, 0.0), yaw_deg=yaw_deg)
+    size = np.array([camera.width_px, camera.height_px])
+    corners = rays_world(camera, pose, size * np.array([[0, 0], [1, 0], [0, 1], [1, 1]]))
+    with np.errstate(divide="ignore"):
+        slopes = np.where(corners[:, 2:] > 0, corners[:, :2] / corners[:, 2:], np.inf)
+    tree = cKDTree(positions[:, :2])
+    counts = np.zeros(len(positions), dtype=np.int64)
+    for center in scene.leds.centers_m[scene.leds.centers_m[:, 2] > height_m]:
+        reach = np.hypot(slopes[:, 0], slopes[:, 1]).max() * (center[2] - height_m)
+        near = np.array(tree.query_ball_point(center[:2], reach), dtype=np.int64)
+        counts[near] += _on_sensor(camera, transform(pose.rotation, center - positions[near]))
+    side = "x" if yaw_deg == 0 else "y"
+    return Coverage(height_m, f"level, long side along {side}", len(positions), int((counts >= ENOUGH_LEDS).sum()))
+
+
+def tilted_coverage(camera: Camera, scene: Scene, height_m: float) -> Coverage:
+    """Random poses: anywhere, 0 to 60 deg on both axes, any yaw; not aimed."""
+    generator = stream(0, 0, "tilted-coverage")
+    room = scene.room_m
+    positions = np.stack(
+        [
+            generator.uniform(0, room[0], TILTED_POSES),
+            generator.uniform(0, room[1], TILTED_POSES),
+            np.full(TILTED_POSES, height_m),
+        ],
+        axis=1,
+    )
+    angles = generator.uniform([0, 0, -180], [TILT_LIMIT_DEG, TILT_LIMIT_DEG, 180], (TILTED_POSES, 3))
+    rotations = np.stack([Pose((0.0, 0.0, 0.0), *map(float, triple)).rotation for triple in angles])
+    counts = np.zeros(TILTED_POSES, dtype=np.int64)
+    for center in scene.leds.centers_m:
+        counts += _on_sensor(camera, ((center - positions)[:, None, :] @ rotations.transpose(0, 2, 1))[:, 0])
+    attitude = f"tilted 0 to {TILT_LIMIT_DEG:.0f} deg on both axes, not aimed"
+    return Coverage(height_m, attitude, TILTED_POSES, int((counts >= ENOUGH_LEDS).sum()))
+
+
+def _on_sensor(camera: Camera, p_cam: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether points in camera axes (n, 3) are imaged on the sensor, shape (n,)."""
+    pixels = image_of_points(camera, p_cam)  # NaN, which is on no side of a border, where the lens does not image
+    tolerance = 1e-6  # a point on the border counts, whichever way its last digit rounds
+    size = np.array([camera.width_px, camera.height_px])
+    seen = ((pixels >= -tolerance) & (pixels <= size + tolerance)).all(axis=1)
+    return np.asarray(seen, dtype=np.bool_)

@@ -1,0 +1,153 @@
+"""A picture of a room: its plan and what a camera in it sees, with the share of poses that see enough LEDs."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import EllipseCollection, PolyCollection
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from numpy.typing import NDArray
+
+from vlcrender.camera.intrinsics import Camera, Pose, project, rays_world
+from vlcrender.camera.lens import relative_illumination
+from vlcrender.rendering.path_traced import reference_cd_m2
+from vlcrender.rendering.renderer import Renderer
+from vlcrender.scene.loader import Scene
+from vlcrender.scene.visibility import leds_in_view
+from vlcrender.sensor.radiometry import Silicon, electron_rate_per_cd_m2
+
+EXPOSURE_S = 160e-6
+REFERENCE_SCALE = 8
+REFERENCE_SAMPLES = 128
+WHITE_E = 4000.0
+
+
+def show_pose(scene: Scene, camera: Camera) -> Pose:
+    """A level pose on the floor that sees as many LEDs as can be, of those under the middle of LEDs near each other."""
+    best, most = None, -1
+    centers = scene.leds.centers_m
+    middle = scene.room_m[:2] / 2
+    order = np.argsort(np.linalg.norm(centers[:, :2] - middle, axis=1), kind="stable")[:50]
+    for yaw in (0.0, 90.0):
+        for center in centers[order]:
+            near = centers[np.linalg.norm(centers - center, axis=1) < 0.5]
+            x, y = near[:, :2].mean(axis=0)
+            pose = Pose((float(x), float(y), 0.05), yaw_deg=yaw)
+            count = len(leds_in_view(camera, pose, scene))
+            if count > most:
+                best, most = pose, count
+    assert best is not None  # a scene has at least one LED
+    return best
+
+
+def draw(scene: Scene, camera: Camera, path: Path, reference: bool = False) -> None:
+    """Write a PNG with the plan and the view from `show_pose`.
+
+    With `reference` the view is path-traced by Mitsuba, slowly and in larger pixels.
+    """
+    pose = show_pose(scene, camera)
+    electrons: NDArray[Any]
+    if reference:
+        electrons = _reference_electrons(scene, camera, pose)
+    else:
+        electrons = Renderer(scene).view(camera, pose).expected_electrons(EXPOSURE_S)
+    figure = Figure(figsize=(14, 6.2), layout="constrained")
+    plan, image = figure.subplots(1, 2, width_ratios=[1, 1.25])
+    discs = _draw_plan(plan, scene, camera, pose)
+    figure.colorbar(discs, ax=plan, label="LED luminance, cd/m$^2$", shrink=0.8)
+    _draw_view(image, scene, camera, pose, electrons)
+    figure.savefig(path, dpi=110)
+
+
+def _draw_plan(axes: Axes, scene: Scene, camera: Camera, pose: Pose) -> EllipseCollection:
+    x_m, y_m, z_m = scene.room_m
+    undersides = [s for s in scene.surfaces if s.name.endswith("underside")]
+    axes.add_patch(Rectangle((0, 0), x_m, y_m, fill=False, lw=1.5))
+    axes.add_collection(
+        PolyCollection(
+            [
+                [(s.corner_m + a * s.edge_u_m + b * s.edge_v_m)[:2] for a, b in ((0, 0), (1, 0), (1, 1), (0, 1))]
+                for s in undersides
+            ],
+            facecolors="0.92",
+            edgecolors="0.6",
+            linewidths=0.5,
+        )
+    )
+    leds = scene.leds
+    widths = np.maximum(2 * leds.radii_m, 0.004 * x_m)
+    discs = EllipseCollection(
+        widths,
+        widths,
+        np.zeros(len(leds)),
+        units="x",
+        offsets=leds.centers_m[:, :2],
+        transOffset=axes.transData,
+        cmap="plasma",
+    )
+    discs.set_array(leds.luminances_cd_m2)
+    axes.add_collection(discs)
+    size = np.array([camera.width_px, camera.height_px])
+    rays = rays_world(camera, pose, size * np.array([[0, 0], [1, 0], [1, 1], [0, 1]]))
+    reach = (scene.leds.centers_m[:, 2].mean() - pose.position_m[2]) / rays[:, 2]
+    footprint = np.array(pose.position_m[:2]) + rays[:, :2] * reach[:, None]
+    axes.add_collection(PolyCollection([footprint], facecolors="none", edgecolors="tab:blue", linewidths=1.5))
+    axes.plot(*pose.position_m[:2], "+", color="tab:blue", ms=10)
+    axes.set(
+        xlim=(-0.02 * x_m, 1.02 * x_m),
+        ylim=(1.02 * y_m, -0.02 * y_m),
+        xlabel="x, m",
+        ylabel="y, m (down, as in the image)",
+    )
+    axes.set_aspect("equal")
+    axes.set_title(f"{scene.name}: {x_m:g} x {y_m:g} x {z_m:g} m seen from below, {len(leds)} LEDs; blue: the view")
+    return discs
+
+
+def _reference_electrons(scene: Scene, camera: Camera, pose: Pose) -> NDArray[np.float64]:
+    coarse = camera.model_copy(
+        update={
+            "width_px": camera.width_px // REFERENCE_SCALE,
+            "height_px": camera.height_px // REFERENCE_SCALE,
+            "pixel_pitch_um": camera.pixel_pitch_um * REFERENCE_SCALE,
+        }
+    )
+    cd_m2, _ = reference_cd_m2(scene, coarse, pose, REFERENCE_SAMPLES)
+    u, v = np.meshgrid(np.arange(coarse.width_px) + 0.5, np.arange(coarse.height_px) + 0.5)
+    # electrons of a pixel of the real size; both spectra as the LEDs'
+    rate = electron_rate_per_cd_m2(camera, scene.settings.led_spectrum, Silicon())
+    electrons: NDArray[np.float64] = EXPOSURE_S * rate * cd_m2 * relative_illumination(coarse, u, v)
+    return electrons
+
+
+def _draw_view(axes: Axes, scene: Scene, camera: Camera, pose: Pose, electrons: NDArray[Any]) -> None:
+    block = max(1, electrons.shape[1] // 1000)
+    rows, columns = (n // block * block for n in electrons.shape)
+    small = electrons[:rows, :columns].reshape(rows // block, block, columns // block, block).mean(axis=(1, 3))
+    axes.imshow(
+        np.clip(small / WHITE_E, 0, 1) ** (1 / 2.2),
+        cmap="gray",
+        vmin=0,
+        vmax=1,
+        extent=(0, camera.width_px, camera.height_px, 0),
+    )
+    for index in leds_in_view(camera, pose, scene):
+        led_id = int(scene.leds.ids[index])
+        center, _ = project(camera, pose, scene.leds.centers_m[index])
+        axes.annotate(
+            str(led_id),
+            (float(center[0]), float(center[1])),
+            xytext=(0, 9),
+            textcoords="offset points",
+            color="orange",
+            ha="center",
+            fontsize=7,
+        )
+    x, y, z = pose.position_m
+    axes.set(xlabel="u, px", ylabel="v, px")
+    axes.set_title(
+        f"seen level from ({x:.2f}, {y:.2f}, {z:.2f}) m, yaw {pose.yaw_deg:g} deg, "
+        f"{EXPOSURE_S * 1e6:g} us at f/{camera.f_number:g}; gamma 2.2"
+    )

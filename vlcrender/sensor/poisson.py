@@ -1,0 +1,88 @@
+"""Poisson draws by counter: each pixel's number depends on the key, the pixel and its mean, and on nothing else.
+
+So a window of a frame gets the draws that the whole frame would, in any order and on any number of threads. Means of 10
+and more: transformed rejection with squeeze (PTRS, W. Hoermann, Insurance: Mathematics and Economics 12 (1993) 39).
+Below: products of uniforms (Knuth). Uniforms: `philox`.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vlcrender.core.backend import dr, exact_math, mi
+from vlcrender.core.philox import PHILOX, places, seed_of
+
+MOST_TURNS = 1000
+"""A turn takes a draw with a chance of 0.7 or more, so that none ever gets here; no kernel may run for ever."""
+LARGEST_MEAN = 2.0**22
+"""Beyond it the float32 arithmetic of the kernel would show."""
+
+
+def poisson(means: NDArray[np.float32], key: str, row: int = 0, column: int = 0) -> NDArray[np.uint32]:
+    """Draw Poisson counts for a window of pixels.
+
+    means: (rows, columns), finite, 0 to LARGEST_MEAN; the window starts at pixel (row, column), which may be negative,
+    of the frame that `key` names. Raises ValueError for other means.
+    """
+    low, high = float(means.min()), float(means.max())
+    if not 0 <= low <= high <= LARGEST_MEAN:
+        raise ValueError(f"means from {low} to {high} electrons; 0 to {LARGEST_MEAN:.0f} are allowed")
+    with exact_math():
+        flat = np.ascontiguousarray(means, dtype=np.float32).ravel()
+        count: Any = mi.UInt32(draw(mi.Float(flat), seed_of(key), *places(means.shape, row, column)))
+        dr.eval(count)
+    counts: NDArray[np.uint32] = count.numpy().reshape(means.shape)
+    return counts
+
+
+@dr.syntax
+def draw(mean: Any, seed: Any, column: Any, row: Any) -> Any:
+    """Poisson counts as Float32, for a kernel: means 0 to LARGEST_MEAN, seed and places as `philox` has them."""
+    large = mean >= 10.0
+    mu = dr.maximum(mean, 10.0)
+    b = 0.931 + 2.53 * dr.sqrt(mu)
+    a = -0.059 + 0.02483 * b
+    inverse_alpha = 1.1239 + 1.1328 / (b - 3.4)
+    squeeze = 0.9277 - 3.6224 / (b - 2.0)
+    limit = dr.exp(-mean)
+    product: Any = mi.Float(1.0)
+    count: Any = mi.Float(0.0)
+    turn: Any = mi.UInt32(0)
+    active = mi.Bool(True)
+    while active:
+        u = PHILOX(seed, column, row, turn, iterations=10).next_float32x4(active)
+        # PTRS takes one pair of uniforms a try; two tries a turn would waste more than they save.
+        centred = u[0] - 0.5
+        edge = 0.5 - dr.abs(centred)
+        tried = dr.floor((2.0 * a / edge + b) * centred + mu + 0.43)
+        quick = (edge >= 0.07) & (u[1] <= squeeze)
+        possible = (tried >= 0.0) & ((edge >= 0.013) | (u[1] <= edge))
+        density = dr.log(u[1] * inverse_alpha / (a / (edge * edge) + b))
+        accepted = quick | (possible & (density <= _log_probability(tried, mu)))
+        # Knuth: multiply uniforms until the product is below exp(-mean); four factors a turn.
+        low: Any = mi.Bool(False)
+        steps: Any = mi.Float(0.0)
+        for i in range(4):
+            product = product * u[i]
+            low |= product <= limit
+            steps += dr.select(low, 0.0, 1.0)
+        count = dr.select(active, dr.select(large, dr.select(accepted, tried, count), count + steps), count)
+        active &= ~dr.select(large, accepted, low) & (turn < MOST_TURNS)
+        turn += 1
+    return count
+
+
+def _log_probability(k: Any, mu: Any) -> Any:
+    """log of mu^k exp(-mu) / k! by C. Loader's saddle point (2000): float32 holds it, and not the factors."""
+    safe = dr.maximum(k, 1.0)
+    inverse = 1.0 / safe
+    squared = inverse * inverse
+    stirling = inverse * (1.0 / 12.0 - squared * (1.0 / 360.0 - squared / 1260.0))
+    difference = safe - mu
+    x = difference / (safe + mu)
+    x2 = x * x
+    series = difference * x + 2.0 * safe * x * x2 * (1.0 / 3.0 + x2 * (1.0 / 5.0 + x2 * (1.0 / 7.0 + x2 / 9.0)))
+    deviance = dr.select(dr.abs(x) < 0.1, series, safe * dr.log(safe / mu) - difference)
+    saddle = -0.5 * dr.log(2.0 * dr.pi * safe) - stirling - deviance
+    return dr.select(k >= 1.0, saddle, -mu)

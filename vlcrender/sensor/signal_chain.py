@@ -1,0 +1,91 @@
+"""The whole chain from expected electrons to digital numbers, in the order that `sensor` gives."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vlcrender.core.backend import dr, exact_math, mi
+from vlcrender.core.philox import normals, places, seed_of
+from vlcrender.sensor.poisson import LARGEST_MEAN, draw, poisson
+from vlcrender.sensor.sensor import Electrons, Sensor, clip_full_well
+
+
+def variance_e2(sensor: Sensor, expected_e: NDArray[np.float32], exposure_s: float = 0.0) -> NDArray[np.float64]:
+    """Variance of each pixel's digital number in electrons squared, same shape; inf where it is saturated.
+
+    The fixed patterns count: who does not know them cannot tell them from noise (that a row or a column shares its
+    offset is left aside). Saturated are pixels whose mean is at the full well or at the converter's end. Rounding adds
+    gain^2 / 12 but where digital numbers are the electrons counted.
+    """
+    gain, full = sensor.gain_at_iso_e_per_dn, sensor.noise == "full"
+    mean = expected_e.astype(np.float64)
+    level = mean + sensor.dark_electrons(exposure_s) if full else mean
+    variance = level.copy()
+    if full:
+        added = (sensor.dark_noise_e, sensor.dsnu_e, sensor.row_offset_e, sensor.column_offset_e)
+        variance += (sensor.prnu * mean) ** 2 + sum(sigma**2 for sigma in added)
+    if full or gain != 1.0:
+        variance += gain**2 / 12
+    variance[level >= sensor.saturation_e] = np.inf
+    return variance
+
+
+def expose(
+    sensor: Sensor,
+    expected_e: NDArray[np.float32],
+    key: str,
+    row: int = 0,
+    column: int = 0,
+    exposure_s: float = 0.0,
+    camera: str = "main",
+) -> NDArray[np.uint32]:
+    """Turn expected electrons (rows, columns), finite and >= 0, into digital numbers of the same shape.
+
+    `key` names the stream of random numbers of this exposure; the window starts at pixel (row, column) of the frame,
+    and its noise is that of the whole frame's pixels there. With `noise = "full"` the dark current gathers electrons
+    for `exposure_s`, and the fixed patterns are those of the sensor's `serial` in the camera of this name.
+    """
+    expected_e = np.minimum(expected_e, np.float32(LARGEST_MEAN))
+    if sensor.noise == "full":
+        return _full_chain(sensor, expected_e, key, f"{sensor.serial}/{camera}", (row, column), exposure_s)
+    electrons: Electrons = poisson(expected_e, key, row, column) if sensor.noise == "shot" else expected_e
+    return sensor.quantise(clip_full_well(electrons, sensor.full_well_e))
+
+
+def _full_chain(
+    sensor: Sensor,
+    expected_e: NDArray[np.float32],
+    key: str,
+    individual: str,
+    start: tuple[int, int],
+    exposure_s: float,
+) -> NDArray[np.uint32]:
+    """The steps of `sensor`'s docstring, by their numbers, in one kernel."""
+    low, high = float(expected_e.min()), float(expected_e.max())
+    if not 0 <= low <= high:
+        raise ValueError(f"means from {low} to {high} electrons; 0 and more are allowed")
+
+    def number(value: float) -> Any:  # as data: as a literal it would make a kernel of each sensor
+        return dr.opaque(mi.Float, value)
+
+    with exact_math():
+        column, row = places(expected_e.shape, *start)
+        response, offset = normals(seed_of(f"{individual}/pixels"), column, row)
+        mean = mi.Float(np.ascontiguousarray(expected_e).ravel())
+        mean = mean * dr.maximum(1.0 + number(sensor.prnu) * response, 0.0)  # 2
+        mean = dr.minimum(mean + number(sensor.dark_electrons(exposure_s)), LARGEST_MEAN)  # 3
+        electrons = draw(mean, seed_of(key), column, row)  # 4
+        electrons = electrons + number(sensor.dsnu_e) * offset  # 5
+        electrons = dr.minimum(electrons, number(sensor.full_well_e))  # 6
+        # 7 and 8: read and converter noise are normal and both are added beyond the clip, so that one draw is both.
+        noise, _ = normals(seed_of(f"{key}/read"), column, row)
+        of_row, _ = normals(seed_of(f"{individual}/rows"), mi.UInt32(0), row)
+        of_column, _ = normals(seed_of(f"{individual}/columns"), column, mi.UInt32(0))
+        electrons = electrons + number(sensor.dark_noise_e) * noise
+        electrons = electrons + number(sensor.row_offset_e) * of_row + number(sensor.column_offset_e) * of_column
+        level = dr.round(electrons / number(sensor.gain_at_iso_e_per_dn)) + number(sensor.black_level_dn)  # 8 and 9
+        dn: Any = mi.UInt32(dr.clip(level, 0.0, number(sensor.largest_dn)))
+        dr.eval(dn)
+    image: NDArray[np.uint32] = dn.numpy().reshape(expected_e.shape)
+    return image
