@@ -98,7 +98,7 @@ def test_provenance_is_not_needed_and_not_kept(folder: Path) -> None:
 
 
 def test_only_the_scorer_knows_of_the_truth() -> None:
-    sources = (Path(__file__).parent.parent / "estimator").glob("*.py")
+    sources = sorted((Path(__file__).parent.parent / "estimator").rglob("*.py"))
     assert [
         path.name for path in sources if "truth.parquet" in re.sub(r'""".*?"""', "", path.read_text(), flags=re.S)
     ] == ["score.py"]

@@ -30,7 +30,7 @@ def test_every_preset_is_a_sensor(name: str) -> None:
 
 @pytest.mark.parametrize("name", presets("sensors"))
 def test_every_number_of_a_preset_says_where_it_is_from(name: str) -> None:
-    text = (ROOT / f"vlcrender/presets/sensors/{name}.toml").read_text()
+    text = (ROOT / f"vlcrender/config/preset_files/sensors/{name}.toml").read_text()
     for line in text.splitlines():
         if "=" in line and not line.startswith("#") and name != "ideal":
             assert "#" in line or "noise = " in line or "quantum_efficiency" in line, line
