@@ -9,7 +9,7 @@ from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.core.backend import dr
 from vlcrender.core.planar_shapes import Disc
 from vlcrender.light.lightmap import bake
-from vlcrender.rendering.led_coverage import image_of_led, leds_that_may_be_seen
+from vlcrender.rendering.led_coverage import coverage_of_led, leds_that_may_be_seen
 from vlcrender.rendering.renderer import Renderer
 from vlcrender.scene.loader import load_scene
 
@@ -30,7 +30,7 @@ def main() -> None:
     per_cd = PEAK_E / scene.leds.luminances_cd_m2.max()
 
     # The bake: an error of the illuminance is one of the image, alike over a texel.
-    cd_m2 = light.led_cd_m2() + light.surround_cd_m2()
+    cd_m2 = light.led_cd_m2() + light.ambient_cd_m2()
     error_e = per_cd * light.albedo * light.sigma_lux / np.pi
     print(f"bake, share of the shot noise's variance, worst corner        {(error_e**2 / (per_cd * cd_m2)).max():8.4%}")
 
@@ -51,7 +51,7 @@ def main() -> None:
     worst, pixels = 0.0, 0
     for pose in POSES:
         for i in leds_that_may_be_seen(camera, pose, scene.leds.centers_m, scene.leds.radii_m):
-            image = image_of_led(camera, pose, scene.leds.centers_m[i], Disc(float(scene.leds.radii_m[i])))
+            image = coverage_of_led(camera, pose, scene.leds.centers_m[i], Disc(float(scene.leds.radii_m[i])))
             if image is None or image.visible_fraction < 1:
                 continue
             rows, columns = image.coverage.shape
@@ -63,7 +63,7 @@ def main() -> None:
                     "height_px": FINER * rows,
                 }
             )
-            fine_image = image_of_led(shifted, pose, scene.leds.centers_m[i], Disc(float(scene.leds.radii_m[i])))
+            fine_image = coverage_of_led(shifted, pose, scene.leds.centers_m[i], Disc(float(scene.leds.radii_m[i])))
             assert fine_image is not None
             whole = np.zeros((FINER * rows, FINER * columns))
             r, c = fine_image.row, fine_image.column

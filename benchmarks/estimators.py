@@ -31,7 +31,7 @@ from estimator.variants.catalogue import VARIANTS
 
 WORKERS = 2
 TRIES = 3
-MOST_FRAMES = 20
+MAX_FRAMES = 20
 
 
 class Clock:
@@ -55,7 +55,7 @@ def stages_ms(folder: Path, name: str) -> np.ndarray:
     dataset = read_dataset(folder)
     clock = Clock(estimator.spots.correspondences.detect)
     rows = []
-    for record in dataset.frames[:MOST_FRAMES]:
+    for record in dataset.frames[:MAX_FRAMES]:
         tries = []
         for _ in range(TRIES):
             start = time.process_time()

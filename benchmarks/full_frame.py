@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from vlcrender.camera.intrinsics import Camera, Pose
-from vlcrender.camera.roi import Window
+from vlcrender.camera.roi import Roi
 from vlcrender.core.backend import dr, mi
 from vlcrender.dataset.files import exr_attributes, write_exr, write_preview
 from vlcrender.rendering.path_traced import scene_dict
@@ -50,9 +50,9 @@ def main() -> None:
     repeats = int(sys.argv[1]) if len(sys.argv) > 1 else 5
     scene = load_scene(Path(__file__).parent.parent / "scenes/office.toml")
     camera, sensor, renderer = Camera(), Sensor(), Renderer(scene)
-    view = renderer.view(camera, POSE)
+    view = renderer.expected_image(camera, POSE)
     expected = view.expected_electrons(EXPOSURE_S)
-    whole = Window.of_sensor(camera)
+    whole = Roi.of_sensor(camera)
     dn = expose(sensor, expected, "bench")
     loaded = mi.load_dict(scene_dict(scene, camera, POSE), optimize=False)
     depth, path = mi.load_dict({"type": "depth"}), mi.load_dict({"type": "path", "max_depth": 8})
@@ -60,7 +60,7 @@ def main() -> None:
         exr, png = Path(folder) / "frame.exr", Path(folder) / "frame.png"
         attributes = exr_attributes(camera, "main", EXPOSURE_S, 0)
         stages: dict[str, Callable[[], object]] = {
-            "rays and LED patches": lambda: renderer.view(camera, POSE),
+            "rays and LED patches": lambda: renderer.expected_image(camera, POSE),
             "expected electrons": lambda: view.expected_electrons(EXPOSURE_S),
             "Poisson noise and digital numbers": lambda: expose(sensor, expected, "bench"),
             "EXR (PIZ) and its SHA-256": lambda: write_exr(exr, [(whole, dn)], whole, attributes),

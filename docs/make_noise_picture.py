@@ -41,7 +41,7 @@ def processed(image_dn: NDArray[np.uint32], sensor: Sensor) -> NDArray[np.float6
 def main() -> None:
     """Render, expose twice, and draw the difference's distribution and its variance over the mean."""
     sensor = Sensor()
-    view = Renderer(load_scene(ROOT / "scenes/office.toml")).view(BLURRED, POSE)
+    view = Renderer(load_scene(ROOT / "scenes/office.toml")).expected_image(BLURRED, POSE)
     expected = view.expected_electrons(EXPOSURE_S)
     pair = [expose(sensor, expected, f"picture/{n}") for n in range(2)]
     raw = pair[0].astype(float) - pair[1]

@@ -56,8 +56,8 @@ def office(folder: Path = ROOT / "scenes", **changes: object) -> Scene:
 def main() -> None:
     """Render and write all."""
     plain = Renderer(office())
-    pane = {"wall": "x=0", "corner_m": [1.0, 0.9], "size_m": [5.0, 2.2], "luminance_cd_m2": 40.0}
-    glass = Renderer(office(window=[pane]))
+    glazing = {"wall": "x=0", "corner_m": [1.0, 0.9], "size_m": [5.0, 2.2], "luminance_cd_m2": 40.0}
+    glass = Renderer(office(glazing=[glazing]))
     lamps = read_toml(ROOT / "scenes/office.toml")["panels"]
     squares = [{**lamps[0], "leds": {**lamps[0]["leds"], "shape": "square", "half_power_deg": 30.0}}]
     OUT.mkdir(exist_ok=True)
@@ -106,7 +106,7 @@ def main() -> None:
     for axes, (title, (renderer, camera, pose, during)) in zip(
         figure.subplots(3, 4).ravel(), shots.items(), strict=True
     ):
-        image = renderer.view(camera, pose, during=during).expected_electrons(1.0)
+        image = renderer.expected_image(camera, pose, during=during).expected_electrons(1.0)
         image = image / np.quantile(image, 0.5) / WHITES.get(title, 12.0)
         axes.imshow(np.clip(image, 0, 1) ** (1 / 2.2), cmap="gray", vmin=0, vmax=1)
         axes.set_title(title, fontsize=10)

@@ -34,8 +34,8 @@ def from_pixels(dataset: Dataset, frame: int, leds: list[int], pixels: np.ndarra
     record = dataset.frames[frame]
     matrix = dataset.cameras[record.camera].matrix()
     world = np.array([dataset.leds[led].position_m for led in leds])
-    levelled = level(pixels, matrix, rotation(*tilt_from_gravity(record.accelerometer_m_s2)))
-    return position_from_ranges(world, led_ranges(levelled, matrix, world, law_of_sines))
+    leveled = level(pixels, matrix, rotation(*tilt_from_gravity(record.accelerometer_m_s2)))
+    return position_from_ranges(world, led_ranges(leveled, matrix, world, law_of_sines))
 
 
 def image_of_a_circle_centre(

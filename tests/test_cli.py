@@ -61,9 +61,9 @@ GENERATE_MISTAKES: dict[str, tuple[list[str], list[str]]] = {
     "seed": (["--set", "seed=-3"], ["seed = -3"]),
     "pixels": (["--set", "camera.width_px=4000.5"], ["camera.width_px = 4000.5"]),
     "principal point": (["--set", "camera.principal_point_px=[99999, 0]"], ["principal_point_px = [99999"]),
-    "windows of a kind": (["--set", "windows.kind=panels"], ["windows", "panels", "leds"]),
-    "windows without a kind": (["--set", "windows.overscan=true"], ["windows.kind is missing"]),
-    "margin": (["--set", 'windows={ kind = "leds", margin_px = -1 }'], ["windows.margin_px = -1"]),
+    "windows of a kind": (["--set", "regions.kind=panels"], ["regions", "panels", "leds"]),
+    "windows without a kind": (["--set", "regions.overscan=true"], ["regions.kind is missing"]),
+    "margin": (["--set", 'windows={ kind = "leds", margin_px = -1 }'], ["regions.margin_px = -1"]),
     "margin in mm": (["--set", 'windows={ kind = "leds", margin_mm = 1 }'], ["margin_mm", "did you mean margin_px"]),
     "motion": (
         ["--set", "motion.angular_velocity_rad_s=[0, 0, 1]"],
@@ -80,7 +80,7 @@ GENERATE_MISTAKES: dict[str, tuple[list[str], list[str]]] = {
     "unknown option": (["--frobnicate"], ["--frobnicate"]),
     "overscan behind distortion": (
         ["--set", 'windows={kind="leds", overscan=true}', "--set", "camera.distortion.k1=-0.05"],
-        ["windows.overscan = true", "distortion"],
+        ["regions.overscan = true", "distortion"],
     ),
     "unreachable": (["--set", "poses.min_leds=900"], ["frame 0", "900 LEDs", "lower min_leds"]),
 }

@@ -9,7 +9,7 @@ import pytest
 from conftest import ROOT, SMALL
 
 from estimator.camera.leveling import level, rotation, tilt_from_gravity
-from estimator.camera.undistort import WIDEST_DEG, pinhole_pixels
+from estimator.camera.undistort import MAX_FIELD_ANGLE_DEG, pinhole_pixels
 from estimator.io.dataset import Camera as DeviceCamera
 from estimator.io.dataset import DeviceFrame, read_dataset, read_frame
 from estimator.variants.catalogue import VARIANTS
@@ -72,10 +72,10 @@ def test_a_gravity_reading_levels_the_pixels_that_the_pose_tilted(tilts: tuple[f
     leds = aim + np.array([[0, 0, 0], [0.13, 0, 0], [0, 0.13, 0], [-0.13, 0.26, 0]])
     seen, _ = project(camera, pose, leds)
     reading = TiltError(error_deg=0.0).reading_m_s2(pose, stream(0, 0, "none"))
-    levelled = level(seen, camera.matrix, rotation(*tilt_from_gravity(tuple(reading))))
+    leveled = level(seen, camera.matrix, rotation(*tilt_from_gravity(tuple(reading))))
     expected, _ = project(camera, Pose(pose.position_m, yaw_deg=25.0), leds)
     # double precision; the horizon is near at 75.5 deg from the zenith: pixels of 1e5, so 1e5 * 1e-15 * amplification
-    assert np.abs(levelled - expected).max() < 1e-6
+    assert np.abs(leveled - expected).max() < 1e-6
 
 
 def test_a_hand_computed_point() -> None:
@@ -89,9 +89,9 @@ def test_windows_are_read_where_they_were_taken_and_give_the_same_positions(tmp_
     # Not so steep that lamps melt into each other: where they do, which are told apart hangs on the last electron.
     tilts = ["poses.tilt_x_deg=[0, 25]", "poses.tilt_y_deg=[0, 25]", "poses.height_m=[0.9, 1.8]"]
     base = [*SMALL, *tilts, "poses.count=2", "sensor.noise=none", "poses.border_px=20"]
-    for name, more in (("full", []), ("windows", ['windows={ kind = "leds", margin_px = 20 }'])):
+    for name, more in (("full", []), ("regions", ['windows={ kind = "leds", margin_px = 20 }'])):
         generate(load_plan(ROOT / "datasets/quickstart.toml", [*base, *more]), tmp_path / name)
-    for whole, cut in zip(device_frames(tmp_path / "full"), device_frames(tmp_path / "windows"), strict=True):
+    for whole, cut in zip(device_frames(tmp_path / "full"), device_frames(tmp_path / "regions"), strict=True):
         image = whole.parts[0].image_dn
         assert sum(part.image_dn.size for part in cut.parts) < image.size
         for part in cut.parts:
@@ -149,7 +149,9 @@ def test_one_side_undoes_the_distortion_of_the_other(lens: Distortion) -> None:
 
 def test_one_side_undoes_the_fish_eye_of_the_other() -> None:
     fish_eye = Camera(projection="equidistant", width_px=800, height_px=600, pixel_pitch_um=60.0, skew_px=2.0)
-    theta, around = np.meshgrid(np.radians(np.linspace(0, WIDEST_DEG - 0.1, 30)), np.radians(np.arange(0, 360, 15)))
+    theta, around = np.meshgrid(
+        np.radians(np.linspace(0, MAX_FIELD_ANGLE_DEG - 0.1, 30)), np.radians(np.arange(0, 360, 15))
+    )
     rays = np.stack([np.sin(theta) * np.cos(around), np.sin(theta) * np.sin(around), np.cos(theta)], -1).reshape(-1, 3)
     straight = image_of_points(fish_eye.model_copy(update={"projection": "perspective"}), rays)
     found = pinhole_pixels(image_of_points(fish_eye, rays), as_told(fish_eye))

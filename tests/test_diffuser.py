@@ -2,18 +2,18 @@
 
 import numpy as np
 import pytest
-from test_reference import SMALL_VIEW, blocks, both_ways, scene_of
+from test_path_traced import SMALL_VIEW, blocks, both_ways, scene_of
 
 from vlcrender.camera.intrinsics import Camera, Pose, project
-from vlcrender.camera.roi import Window
+from vlcrender.camera.roi import Roi
 from vlcrender.errors import InputError
 from vlcrender.rendering.background import differs_from_neighbour
 from vlcrender.rendering.renderer import Renderer
-from vlcrender.scene.diffuser import DIM_SHARE, Sheet
+from vlcrender.scene.diffuser import DIM_SHARE, Diffuser
 from vlcrender.scene.loader import Scene
 from vlcrender.sensor.radiometry import Silicon, electron_rate_per_cd_m2
 
-SHEET = Sheet((0.03, -0.01), 0.04, 0.6, np.pi * 0.005**2, 1.0, (-0.1, -0.05, 0.2, 0.15))
+SHEET = Diffuser((0.03, -0.01), 0.04, 0.6, np.pi * 0.005**2, 1.0, (-0.1, -0.05, 0.2, 0.15))
 DIFFUSER = {"distance_m": 0.03, "transmittance": 0.6}
 FRAME = {"width_m": 0.02, "depth_m": 0.04, "reflectance": 0.4}
 
@@ -35,18 +35,18 @@ def panelled(diffuser: bool, frame: bool, **changes: object) -> Scene:
     return scene_of(panels=[panel], **changes)
 
 
-def lit_by_order_1(sheet: Sheet) -> float:
+def lit_by_order_1(diffuser: Diffuser) -> float:
     """Closed form of the luminance times area, order 1: each quadrant as a corner's form factor times pi."""
     total = 0.0
-    x0, y0, x1, y1 = sheet.lit_m
-    for dx in (sheet.foot_m[0] - x0, x1 - sheet.foot_m[0]):
-        for dy in (sheet.foot_m[1] - y0, y1 - sheet.foot_m[1]):
-            a, b = dx / sheet.distance_m, dy / sheet.distance_m
+    x0, y0, x1, y1 = diffuser.lit_m
+    for dx in (diffuser.foot_m[0] - x0, x1 - diffuser.foot_m[0]):
+        for dy in (diffuser.foot_m[1] - y0, y1 - diffuser.foot_m[1]):
+            a, b = dx / diffuser.distance_m, dy / diffuser.distance_m
             total += (
                 a / np.sqrt(1 + a * a) * np.arctan(b / np.sqrt(1 + a * a))
                 + b / np.sqrt(1 + b * b) * np.arctan(a / np.sqrt(1 + b * b))
             ) / 2
-    return sheet.transmittance * sheet.area_m2 / np.pi * total
+    return diffuser.transmittance * diffuser.area_m2 / np.pi * total
 
 
 def test_the_light_of_a_sheet_is_what_falls_on_it_and_passes() -> None:
@@ -59,25 +59,25 @@ def test_on_a_wide_sheet_all_light_passes_but_what_is_dim(order: float) -> None:
 
     What is lit is a square, between the circles inside and around it.
     """
-    sheet = Sheet((0.0, 0.0), 0.04, 0.6, 1e-4, order, (-9.0, -9.0, 9.0, 9.0))
+    diffuser = Diffuser((0.0, 0.0), 0.04, 0.6, 1e-4, order, (-9.0, -9.0, 9.0, 9.0))
     whole = 0.6 * 1e-4 * 2 / (order + 1)
     cosine = DIM_SHARE ** (1 / (order + 3))
     corner = 1 / np.sqrt(1 + 2 * (1 / cosine**2 - 1))
-    light = sheet.quadrants()[1].sum()
+    light = diffuser.quadrants()[1].sum()
     assert whole * (1 - cosine ** (order + 1)) < light < whole * (1 - corner ** (order + 1))
     # at the circle's rim the sheet has DIM_SHARE of the foot's luminance
-    edge = sheet.luminance(np.array([0.0, sheet.reach_m]), np.zeros(2))
+    edge = diffuser.luminance(np.array([0.0, diffuser.reach_m]), np.zeros(2))
     assert edge[1] / edge[0] == pytest.approx(DIM_SHARE, rel=1e-9)
 
 
-@pytest.mark.parametrize("sheet", [SHEET, Sheet((0.0, 0.0), 0.04, 0.6, 1e-4, 1.0, (-9.0, -9.0, 9.0, 9.0))])
-def test_four_points_light_as_the_sheet_does(sheet: Sheet) -> None:
+@pytest.mark.parametrize("diffuser", [SHEET, Diffuser((0.0, 0.0), 0.04, 0.6, 1e-4, 1.0, (-9.0, -9.0, 9.0, 9.0))])
+def test_four_points_light_as_the_sheet_does(diffuser: Diffuser) -> None:
     """Against a fine grid, anywhere below within 70 deg, as `point_sources` says."""
-    at, light = sheet.quadrants()
-    x0, y0, x1, y1 = sheet.lit_m
+    at, light = diffuser.quadrants()
+    x0, y0, x1, y1 = diffuser.lit_m
     n = 400
     x, y = np.meshgrid(x0 + (np.arange(n) + 0.5) / n * (x1 - x0), y0 + (np.arange(n) + 0.5) / n * (y1 - y0))
-    fine = sheet.luminance(x, y) * (x1 - x0) * (y1 - y0) / n**2
+    fine = diffuser.luminance(x, y) * (x1 - x0) * (y1 - y0) / n**2
 
     def lux(sx: np.ndarray, sy: np.ndarray, weight: np.ndarray, place: np.ndarray) -> float:
         d2 = (sx - place[0]) ** 2 + (sy - place[1]) ** 2 + place[2] ** 2
@@ -88,7 +88,7 @@ def test_four_points_light_as_the_sheet_does(sheet: Sheet) -> None:
             for turn in np.radians([0, 90, 200]):
                 sine = np.sin(angle)
                 place = distance_m * np.array([sine * np.cos(turn), sine * np.sin(turn), -np.cos(angle)])
-                place[:2] += sheet.foot_m
+                place[:2] += diffuser.foot_m
                 points = lux(at[:, 0], at[:, 1], light, place)
                 assert points == pytest.approx(lux(x, y, fine, place), rel=error)
 
@@ -97,12 +97,12 @@ def test_a_sheet_is_seen_with_the_luminance_and_the_flux_of_the_model() -> None:
     scene = panelled(diffuser=True, frame=False)
     camera = Camera(width_px=500, height_px=400, pixel_pitch_um=16.0)
     pose = Pose((1.5, 1.5, 0.4))
-    view = Renderer(scene).view(camera, pose)
+    view = Renderer(scene).expected_image(camera, pose)
     rate = electron_rate_per_cd_m2(camera, "LED-B3", Silicon())
     assert [patch.led_id for patch in view.patches] == [1, 2, 3, 4, 5, 6]
     area_m2 = (2.0 * 16e-6 / 18e-3) ** 2
-    for patch, sheet in zip(view.patches, scene.leds.sheets, strict=True):
-        assert sheet is not None
+    for patch, diffuser in zip(view.patches, scene.leds.diffusers, strict=True):
+        assert diffuser is not None
         u, v = patch.center_px
         column, row = int(u) - patch.column, int(v) - patch.row
         # the foot: T E / pi with E = L A / d^2; half a pixel is 0.9 mm of 3 cm, 4 (0.9 / 30)^2 / 2 * 2 =
@@ -112,7 +112,7 @@ def test_a_sheet_is_seen_with_the_luminance_and_the_flux_of_the_model() -> None:
         assert patch.electrons_per_s[row, column] / rate == pytest.approx(foot * cos4, rel=4e-3)
         # all of it: cos^4 falls by 2 % over the panel
         total = patch.electrons_per_s.sum(dtype=float) / rate * area_m2
-        assert total == pytest.approx(2e5 * lit_by_order_1(sheet) * cos4, rel=0.01)
+        assert total == pytest.approx(2e5 * lit_by_order_1(diffuser) * cos4, rel=0.01)
         assert patch.visible_fraction == pytest.approx(1.0)
 
 
@@ -129,7 +129,7 @@ def test_a_rim_hides_leds_from_aside(slope: float, share: float) -> None:
     camera = Camera(width_px=600, height_px=400, pixel_pitch_um=20.0)
     middle, _ = project(camera, pose, led)
     assert 100 < middle[0] < 500
-    seen = [patch for patch in Renderer(scene).view(camera, pose).patches if patch.led_id == 1]
+    seen = [patch for patch in Renderer(scene).expected_image(camera, pose).patches if patch.led_id == 1]
     assert sum(patch.visible_fraction for patch in seen) == pytest.approx(share, abs=0.02)
 
 
@@ -145,7 +145,7 @@ def test_diffusers_and_frames_are_as_in_the_reference(frame: bool) -> None:
     # pixels), and 1 %: the reference's image is linear between points d / 16 apart, 4 / 8 / 16^2 = 0.2 % at the foot; a
     # pixel of 1.6 cm is half of d and averaged from 2 x 2 places: (1/2)^4 / 4320 of the fourth derivative, 4 * 6 * 8 *
     # 10 at the foot, 0.3 %; and the light that the frame's inside, which is baked too dark, reflects: 0.4 % measured.
-    sensor = Window.of_sensor(camera)
+    sensor = Roi.of_sensor(camera)
     _, labels = Renderer(scene)._background.images(camera, pose, (sensor,), (1.0, 1.0))
     inside = lit & ~differs_from_neighbour(labels[0])
     assert inside.sum() > 200

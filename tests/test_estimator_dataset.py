@@ -295,8 +295,8 @@ def test_an_image_of_another_size_kind_or_range_is_refused(folder: Path) -> None
     with OpenEXR.File(header, {"Z": np.zeros((300, 400), np.uint32)}) as file:
         file.write(str(path))
     assert "needed Y alone" in refused_frame(folder, **rehash(folder))
-    window = (np.array([0, 0], np.int32), np.array([499, 299], np.int32))
-    with OpenEXR.File({**header, "displayWindow": window}, {"Y": np.zeros((300, 400), np.uint32)}) as file:
+    roi = (np.array([0, 0], np.int32), np.array([499, 299], np.int32))
+    with OpenEXR.File({**header, "displayWindow": roi}, {"Y": np.zeros((300, 400), np.uint32)}) as file:
         file.write(str(path))
     assert "displayWindow" in refused_frame(folder, **rehash(folder))
 

@@ -175,8 +175,8 @@ def test_windows_give_the_spots_of_the_whole_image(denoised: bool) -> None:
     image = poisson(render(view, leds, led_e=[1000, 2000, 3000, 4000, 2000, 1000]), 3)
     whole = spots_of(image, denoised)
     reach_px = REACH_PX if denoised else 0
-    windows = windows_around(image, view.project(leds), 36, denoised)
-    parts = detect(windows, image.size, reach_px)
+    rois = windows_around(image, view.project(leds), 36, denoised)
+    parts = detect(rois, image.size, reach_px)
     assert len(parts) == len(whole) == 6
     for spot in parts:
         same = min(whole, key=lambda other: np.hypot(other.u_px - spot.u_px, other.v_px - spot.v_px))

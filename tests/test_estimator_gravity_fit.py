@@ -5,11 +5,11 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from estimator_sighted import device, sighted
+from estimator_correspondences import device, sighted
 from estimator_synthetic import Array, View, grid, view_of
 
 from estimator.errors import EstimationFailure
-from estimator.variants.gravity_fit import fit_sightings
+from estimator.variants.gravity_fit import fit_correspondences
 from estimator.variants.pnp import position_from_pixels
 from estimator.variants.variant import Estimate
 
@@ -19,7 +19,9 @@ TABLE_1 = np.array([[0.5, 1.5, 3.5], [0.3, 1.9, 3.5], [0.8, 1.2, 3.5], [0.9, 1.1
 def draws(view: View, leds_m: Array, sigma_px: float, error_deg: float, count: int) -> list[Estimate]:
     """Answers to as many draws of centroids' and accelerometer's errors."""
     rng = np.random.default_rng(7)
-    return [fit_sightings(device(view, error_deg, rng), sighted(view, leds_m, sigma_px, rng)) for _ in range(count)]
+    return [
+        fit_correspondences(device(view, error_deg, rng), sighted(view, leds_m, sigma_px, rng)) for _ in range(count)
+    ]
 
 
 def nees(answers: list[Estimate], view: View) -> Array:
@@ -59,7 +61,7 @@ def test_gravity_decides_between_the_two_poses_of_a_plane() -> None:
     worst_pnp = 0.0
     for _ in range(20):
         seen = sighted(view, TABLE_1, 0.02, rng)
-        answer = fit_sightings(device(view, 0.1, rng), seen)
+        answer = fit_correspondences(device(view, 0.1, rng), seen)
         error = answer.position_m - view.position_m
         assert answer.covariance_m2 is not None
         # 1e-6 of chi^2 with three degrees of freedom.
@@ -93,7 +95,7 @@ def test_an_accelerometer_without_error_is_taken_at_its_word() -> None:
     """LEDs on a line give no tilt about it; gravity does, exactly."""
     leds = grid(4, 1, 0.14, (3, 2, 3.0))
     view = view_of((3, 2, 3.0), 2.8, 25, -15, 40)
-    answer = fit_sightings(device(view, 0.0), sighted(view, leds))
+    answer = fit_correspondences(device(view, 0.0), sighted(view, leds))
     # Pixels are exact; 1e-5 deg is what the reading is taken to be good to.
     np.testing.assert_allclose(answer.position_m, view.position_m, atol=1e-7)
 
@@ -102,14 +104,14 @@ def test_two_leds_are_refused() -> None:
     view = view_of((3, 2, 3.0), 2.8, 25, -15, 40)
     leds = grid(2, 1, 0.14, (3, 2, 3.0))
     with pytest.raises(EstimationFailure, match="position: LEDs identified: 2, needed: 3"):
-        fit_sightings(device(view, 0.1), sighted(view, leds))
+        fit_correspondences(device(view, 0.1), sighted(view, leds))
 
 
 def test_leds_at_different_heights_are_taken() -> None:
     leds = grid(3, 3, 0.2, (3, 2, 2.7))
     leds[::2, 2] += 0.15
     view = view_of((3, 2, 2.7), 2.5, 25, -30, 40)
-    answer = fit_sightings(device(view, 0.1), sighted(view, leds))
+    answer = fit_correspondences(device(view, 0.1), sighted(view, leds))
     np.testing.assert_allclose(answer.position_m, view.position_m, atol=1e-8)
 
 
@@ -128,4 +130,4 @@ def test_a_lens_that_cannot_be_taken_out_of_one_spot_costs_that_spot_alone() -> 
         replace(one, spot=replace(one.spot, u_px=float(u), v_px=float(v)))
         for one, (u, v) in zip(sighted(view, leds), pixels, strict=True)
     ]
-    np.testing.assert_allclose(fit_sightings(frame, seen).position_m, view.position_m, atol=1e-8)
+    np.testing.assert_allclose(fit_correspondences(frame, seen).position_m, view.position_m, atol=1e-8)

@@ -20,7 +20,7 @@ def claim(led: int, u_px: float, v_px: float) -> DecodedSpot:
 
 
 def matches(spots: list[Spot], decoded: list[DecodedSpot]) -> dict[int, float]:
-    return {sighting.led.id: sighting.spot.u_px for sighting in identify(spots, decoded, LEDS)}
+    return {correspondence.led.id: correspondence.spot.u_px for correspondence in identify(spots, decoded, LEDS)}
 
 
 def test_each_identity_gets_the_spot_next_to_it() -> None:

@@ -88,7 +88,7 @@ def test_a_sharp_face_covers_what_its_points_do(shape: str, distorted: bool) -> 
     """
     lens = camera(distortion=DISTORTION if distorted else None)
     drawn = images(lens, led(shape), here(lens))
-    share = drawn.canvas.window(drawn.draw(here(lens)).share, 0)
+    share = drawn.canvas.roi(drawn.draw(here(lens)).share, 0)
     expected = share_by_points(led(shape), lens, drawn.canvas)
     assert share.sum() == pytest.approx(expected.sum(), rel=1e-3)
     inside = (share > 0) & (share < 1)
@@ -109,7 +109,7 @@ def test_a_defocused_face_is_its_points_spread_over_discs() -> None:
     lens = view.model_copy(update={"f_number": f_number})
     assert disc_diameter_px(lens, depth) == pytest.approx([6.0])
     drawn = images(lens, one, here(lens))
-    share = drawn.canvas.window(drawn.draw(here(lens)).share, 0)
+    share = drawn.canvas.roi(drawn.draw(here(lens)).share, 0)
     expected = share_by_points(one, lens, drawn.canvas, 6.0)
     assert np.abs(share - expected).max() < 0.012
     sharp = share_by_points(one, lens, drawn.canvas)

@@ -5,12 +5,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from estimator_sighted import device, sighted
+from estimator_correspondences import device, sighted
 from estimator_synthetic import Array, grid, view_of
 
 from estimator.errors import EstimationFailure
 from estimator.io.dataset import Distortion
-from estimator.solvers.reprojection import SQUARE_TO_DISC, Pose, fit, observations, projected, straightened
+from estimator.solvers.reprojection import (
+    SQUARE_TO_DISC,
+    Pose,
+    corrected_for_eccentricity,
+    fit,
+    observations,
+    projected,
+)
 
 RADIUS_M = 0.03
 LED_M = np.array([[3.0, 3.2, 3.4]])
@@ -148,5 +155,5 @@ def test_what_a_lens_bends_within_a_spot_is_taken_off(
     start = Pose(view.R_cam_world, np.array(view.position_m))
     bent = fit(observed, start).pose
     assert np.linalg.norm(bent.position_m - view.position_m) > 1e-5
-    straight = fit(straightened(observed, bent), start).pose
+    straight = fit(corrected_for_eccentricity(observed, bent), start).pose
     assert np.linalg.norm(straight.position_m - view.position_m) < 2e-6

@@ -107,7 +107,7 @@ def test_reported_covariances_and_ambiguity_are_counted() -> None:
     assert score.nees is not None
     assert (score.nees.frames, score.nees.mean) == (2, pytest.approx(2.5))
     assert [row.nees for row in score.rows] == [pytest.approx(1), pytest.approx(4), None]
-    assert (score.ambiguous, score.coverage) == (1, 1.0)
+    assert (score.ambiguous, score.success_rate) == (1, 1.0)
 
 
 def test_to_fail_the_worst_frames_costs_coverage_and_gains_nothing() -> None:
@@ -119,7 +119,7 @@ def test_to_fail_the_worst_frames_costs_coverage_and_gains_nothing() -> None:
     assert honest.error_3d is not None
     assert dropped.error_3d is not None
     assert dropped.error_3d.rmse_m < honest.error_3d.rmse_m / 10
-    assert (honest.coverage, dropped.coverage) == (1.0, 0.75)
+    assert (honest.success_rate, dropped.success_rate) == (1.0, 0.75)
     assert honest.of_all is not None
     assert dropped.of_all is not None
     assert dropped.of_all.median_m == pytest.approx(0.01)

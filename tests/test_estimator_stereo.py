@@ -121,25 +121,25 @@ def turned(degrees: float) -> Array:
 def test_of_several_mates_the_parallel_one_furthest_beside_is_the_partner() -> None:
     near, far = frame_of((0.05, 0, 0)), frame_of((-0.2, 0.1, 0))
     behind, askew = frame_of((1.0, 0, 0.3)), frame_of((1.0, 0, 0), turned(5))
-    mate, baseline_m = partner(replace(frame_of(), mates=(near, behind, far, askew)))
-    assert mate is far
+    other, baseline_m = partner(replace(frame_of(), other_cameras=(near, behind, far, askew)))
+    assert other is far
     np.testing.assert_allclose(baseline_m, [-0.2, 0.1])
 
 
 def test_the_baseline_is_in_the_cameras_own_axes() -> None:
     """Both turned by 90 deg: what is along x of the rig is along -y of theirs."""
     one, other = frame_of((0, 0, 0), turned(90)), frame_of((0.1, 0, 0), turned(90))
-    np.testing.assert_allclose(partner(replace(one, mates=(other,)))[1], [0, -0.1], atol=1e-15)
+    np.testing.assert_allclose(partner(replace(one, other_cameras=(other,)))[1], [0, -0.1], atol=1e-15)
 
 
 @pytest.mark.parametrize(
-    "mates",
+    "other_cameras",
     [(frame_of((0, 0, 0.1)),), (frame_of((0.1, 0, 0), turned(0.1)),), (frame_of((0, 0, 0)),)],
     ids=["in front", "askew", "at the same place"],
 )
-def test_other_rigs_are_refused(mates: tuple[DeviceFrame, ...]) -> None:
+def test_other_rigs_are_refused(other_cameras: tuple[DeviceFrame, ...]) -> None:
     with pytest.raises(EstimationFailure, match="stereo: no second camera is parallel to this one and beside it"):
-        partner(replace(frame_of(), mates=mates))
+        partner(replace(frame_of(), other_cameras=other_cameras))
 
 
 @pytest.mark.parametrize("name", ["rahman2011", "kim"])

@@ -13,7 +13,7 @@ from estimator.errors import EstimationFailure
 from estimator.evaluate.batch import estimate_dataset, estimate_frame
 from estimator.io.dataset import DeviceFrame, read_dataset, read_frame
 from estimator.io.estimates import EstimateRow
-from estimator.spots.correspondences import centroids_px, sightings
+from estimator.spots.correspondences import centroids_px, correspondences
 from estimator.spots.denoise import DENOISERS
 from estimator.variants.catalogue import VARIANTS, variant_named
 from estimator.variants.variant import Estimate, Variant
@@ -139,9 +139,9 @@ def test_the_literal_algorithm_1_shifts_every_spot_up_and_left(noisy: Path) -> N
     truth = pq.read_table(noisy / "truth.parquet", columns=["leds"]).to_pylist()
     literal = DENOISERS["literal"]
     for record, true in zip(dataset.frames, truth, strict=True):
-        seen = sightings(read_frame(dataset, record), lambda raw_e: literal.apply(raw_e, 0.0), literal.reach_px)
+        seen = correspondences(read_frame(dataset, record), lambda raw_e: literal.apply(raw_e, 0.0), literal.reach_px)
         exact = {led["led"]: (led["u_px"], led["v_px"]) for led in true["leds"]}
-        off = centroids_px(seen) - [exact[sighting.led.id] for sighting in seen]
+        off = centroids_px(seen) - [exact[correspondence.led.id] for correspondence in seen]
         assert len(off) > 10
         np.testing.assert_allclose(off, -2.5, atol=0.15 + 0.1)  # 0.1 px: four sigma of the noise in the edges
 

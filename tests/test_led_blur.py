@@ -8,10 +8,10 @@ from scipy.special import j1
 
 from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.lens import AIRY_TAIL, defocus_diameter_px, split_for, split_kernel
-from vlcrender.camera.roi import Window
+from vlcrender.camera.roi import Roi
 from vlcrender.core.planar_shapes import Disc
 from vlcrender.rendering.led_blur import LedBlur, led_blur
-from vlcrender.rendering.led_coverage import image_of_led
+from vlcrender.rendering.led_coverage import coverage_of_led
 from vlcrender.rendering.led_edges import LedEdges, edges_of_led
 from vlcrender.rendering.renderer import Renderer
 from vlcrender.scene.loader import Scene
@@ -48,23 +48,23 @@ CAMERAS = {f"disc {d} px": defocused(d) for d in (0.2, 0.35, 0.7, 1.0, 2.0, 3.0,
 }
 
 
-def sharp_image(camera: Camera) -> tuple[Array, Window, LedEdges]:
+def sharp_image(camera: Camera) -> tuple[Array, Roi, LedEdges]:
     """Coverage of an LED overhead imaged at CENTER_PX, its window and edges."""
     pose = Pose((1.0, 1.0, 1.0))
     center_m = np.array([*(1.0 + (CENTER_PX - 32) * OVERHEAD_M / camera.focal_px), 1.0 + OVERHEAD_M])
-    image = image_of_led(camera, pose, center_m, Disc(RADIUS_M), 40)
+    image = coverage_of_led(camera, pose, center_m, Disc(RADIUS_M), 40)
     assert image is not None
     edges = edges_of_led(camera, pose, center_m, Disc(RADIUS_M), image, split_for(camera, OVERHEAD_M))
-    return image.coverage, Window(image.row, image.column, *image.coverage.shape), edges
+    return image.coverage, Roi(image.row, image.column, *image.coverage.shape), edges
 
 
-def blurred_image(camera: Camera) -> tuple[Array, Window]:
+def blurred_image(camera: Camera) -> tuple[Array, Roi]:
     """The same after the lens."""
-    coverage, window, edges = sharp_image(camera)
+    coverage, roi, edges = sharp_image(camera)
     kernel = split_kernel(camera, OVERHEAD_M)
     assert kernel is not None
     blur = LedBlur((kernel.whole,), (kernel,), None)
-    return blur.blurred(0, coverage, window, [edges], 1.0), window.grown(blur.spread_px)
+    return blur.blurred(0, coverage, roi, [edges], 1.0), roi.padded(blur.spread_px)
 
 
 def shared_by_discs(distance: Array, first: float, second: float) -> Array:
@@ -104,12 +104,12 @@ def share_kept(scale: float) -> float:
 def test_an_edge_is_true_to_a_twentieth_of_its_shot_noise(name: str) -> None:
     """Against the closed form of a disc behind a disc, or rings of the Airy pattern, at 64 x 64 places a pixel."""
     camera = CAMERAS[name]
-    image, window = blurred_image(camera)
+    image, roi = blurred_image(camera)
     if camera.psf == "diffraction":
         scale = camera.working_f_number * 0.55 / 10.0
         image = image * share_kept(scale)  # kernels make up for what they leave out
     inside = (np.arange(64) + 0.5) / 64 - 0.5
-    centers = np.stack(np.broadcast_arrays(*window.centers_px()), axis=-1)
+    centers = np.stack(np.broadcast_arrays(*roi.centers_px()), axis=-1)
     near = np.hypot(*np.moveaxis(centers - CENTER_PX, -1, 0)) < 13
     rows, columns = np.nonzero(near)
     u, v = centers[rows, columns].T
@@ -130,12 +130,12 @@ def test_an_edge_is_true_to_a_twentieth_of_its_shot_noise(name: str) -> None:
 @pytest.mark.parametrize("name", CAMERAS)
 def test_parts_keep_the_light_and_move_it_nowhere(name: str) -> None:
     camera = CAMERAS[name]
-    image, window = blurred_image(camera)
+    image, roi = blurred_image(camera)
     coverage, _, _ = sharp_image(camera)
     # rounding, 2^-52 of each of some thousand pixels
     assert image.sum() == pytest.approx(coverage.sum(), rel=1e-11)
     assert image.min() >= 0
-    centroid = np.array([(image * place).sum() for place in window.centers_px()]) / image.sum()
+    centroid = np.array([(image * place).sum() for place in roi.centers_px()]) / image.sum()
     # parts hold their light at their centres: that moves an edge by up to 1 / (8 n) of a part's width, n >= 4 here,
     # at 80 places and more around the rim which it moves either way
     assert np.abs(centroid - CENTER_PX).max() < 1 / (8 * 4**2) / np.sqrt(80) * 3

@@ -6,7 +6,7 @@ import pytest
 from vlcrender.camera.distortion import Distortion
 from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.core.planar_shapes import Disc, Rectangle
-from vlcrender.rendering.led_coverage import image_of_led
+from vlcrender.rendering.led_coverage import coverage_of_led
 from vlcrender.rendering.led_edges import edges_of_led
 
 SPLIT = 8
@@ -24,8 +24,8 @@ LENSES = {
 def test_parts_are_the_pixels_of_a_finer_camera(lens: dict, shape: Disc | Rectangle) -> None:
     pose, center_m = Pose((1.0, 1.0, 0.5), 6, -8, 30), np.array([1.3, 0.9, 2.5])
     camera, fine = Camera(**SMALL, **lens), Camera(**FINE, **lens)
-    image = image_of_led(camera, pose, center_m, shape, 10)
-    finer = image_of_led(fine, pose, center_m, shape, 10 * SPLIT)
+    image = coverage_of_led(camera, pose, center_m, shape, 10)
+    finer = coverage_of_led(fine, pose, center_m, shape, 10 * SPLIT)
     assert image is not None
     assert finer is not None
     edges = edges_of_led(camera, pose, center_m, shape, image, SPLIT)

@@ -19,7 +19,7 @@ LED_2 = np.array([0.3, 1.9, 3.5])
 def patch(scene: Scene, camera: Camera, motion: Motion | None) -> LedPatch:
     (mounted,) = mounted_cameras(camera, ())
     during = poses_during(motion, mounted, POSE, EXPOSURE_S, scene)
-    return next(p for p in Renderer(scene).view(camera, POSE, None, during).patches if p.led_id == 2)
+    return next(p for p in Renderer(scene).expected_image(camera, POSE, None, during).patches if p.led_id == 2)
 
 
 def moments(light: LedPatch) -> tuple[np.ndarray, np.ndarray]:
@@ -87,8 +87,10 @@ def test_steps_are_half_a_pixel_at_most(table1: Scene, small_camera: Camera) -> 
 def test_standing_still_is_the_same_to_the_bit(table1: Scene, small_camera: Camera) -> None:
     assert poses_during(Motion(), mounted_cameras(small_camera, ())[0], POSE, EXPOSURE_S, table1) == (POSE,)
     renderer = Renderer(table1)
-    one = renderer.view(small_camera, POSE).expected_electrons(1e-4)
-    assert renderer.view(small_camera, POSE, None, (POSE,)).expected_electrons(1e-4).tobytes() == one.tobytes()
+    one = renderer.expected_image(small_camera, POSE).expected_electrons(1e-4)
+    assert (
+        renderer.expected_image(small_camera, POSE, None, (POSE,)).expected_electrons(1e-4).tobytes() == one.tobytes()
+    )
 
 
 def test_too_far_is_refused(table1: Scene) -> None:

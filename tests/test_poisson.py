@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 from test_sensor import chi_square_p
 
-from vlcrender.sensor.poisson import LARGEST_MEAN, poisson
+from vlcrender.sensor.poisson import MAX_MEAN, poisson
 
 N = 1_000_000
 MEANS = [0.05, 0.2, 1.0, 9.9, 10.0, 12.0, 40.0, 3000.0, 20000.0, 300000.0]
@@ -64,7 +64,7 @@ def test_streams_are_independent() -> None:
         assert abs(np.corrcoef(first, other)[0, 1]) < 5 / np.sqrt(N)
 
 
-@pytest.mark.parametrize("mean", [-1.0, np.nan, np.inf, 2 * LARGEST_MEAN])
+@pytest.mark.parametrize("mean", [-1.0, np.nan, np.inf, 2 * MAX_MEAN])
 def test_other_means_are_refused(mean: float) -> None:
     with pytest.raises(ValueError, match="are allowed"):
         poisson(np.array([[1.0, mean]], dtype=np.float32), "bad")

@@ -104,12 +104,12 @@ REFUSED = {
         ["exposure", "motion", "exposure_s"],
     ),
     "share": (
-        ["exposure.kind=peak", "exposure.share_of_saturation=1.5", "exposure.longest_s=1.0"],
+        ["exposure.kind=peak", "exposure.share_of_saturation=1.5", "exposure.max_s=1.0"],
         ["exposure.share_of_saturation = 1.5"],
     ),
     "level": (["exposure.kind=noise-level", "exposure.level_db=nan"], ["exposure.level_db"]),
     "repeats": (["repeats=0"], ["repeats = 0"]),
-    "processed windows": (["processed={}", "windows.kind=leds"], ["processed", "windows"]),
+    "processed windows": (["processed={}", "regions.kind=leds"], ["processed", "regions"]),
     "quality": (["processed.quality=101"], ["processed.quality = 101"]),
 }
 

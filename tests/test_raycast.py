@@ -9,8 +9,9 @@ from conftest import ROOT
 from vlcrender.camera.intrinsics import Camera, Pose, project
 from vlcrender.camera.lens import relative_illumination
 from vlcrender.config.toml_model import check, read_toml
+from vlcrender.rendering.expected_image import LedPatch
 from vlcrender.rendering.renderer import Renderer
-from vlcrender.scene.fresnel import pane_reflectance
+from vlcrender.scene.fresnel import glazing_reflectance
 from vlcrender.scene.loader import Scene, build_scene
 from vlcrender.scene.schema import SceneSettings
 from vlcrender.sensor.radiometry import Silicon, electron_rate_per_cd_m2
@@ -26,24 +27,28 @@ def room(folder: Path | None = None, **changes: object) -> Scene:
     return build_scene(check(tree, SceneSettings, "test"), "test", folder or ROOT / "scenes")
 
 
+def patch_of(scene: Scene, pose: Pose) -> LedPatch:
+    return Renderer(scene).expected_image(WIDE, pose).patches[0]
+
+
 def test_a_pane_reflects_by_fresnels_law() -> None:
     # straight on: F = (0.52 / 2.52)^2 = 4.258 % at each face, 2 F / (1 + F) = 8.168 %
-    assert pane_reflectance(1.0, 1.52, np.sqrt) == pytest.approx(0.08168, abs=1e-5)
+    assert glazing_reflectance(1.0, 1.52, np.sqrt) == pytest.approx(0.08168, abs=1e-5)
     # grazing: everything; no glass: nothing
-    assert pane_reflectance(1e-9, 1.52, np.sqrt) == pytest.approx(1.0, abs=1e-6)
-    assert pane_reflectance(0.5, 1.0, np.sqrt) == pytest.approx(0.0, abs=1e-12)
+    assert glazing_reflectance(1e-9, 1.52, np.sqrt) == pytest.approx(1.0, abs=1e-6)
+    assert glazing_reflectance(0.5, 1.0, np.sqrt) == pytest.approx(0.0, abs=1e-12)
     # at Brewster's angle atan(n) p-light passes: F = s^2 / 2 with s = cos(2 theta_B)
     brewster = np.arctan(1.52)
     face = np.cos(2 * brewster) ** 2 / 2
-    assert pane_reflectance(np.cos(brewster), 1.52, np.sqrt) == pytest.approx(2 * face / (1 + face), rel=1e-9)
+    assert glazing_reflectance(np.cos(brewster), 1.52, np.sqrt) == pytest.approx(2 * face / (1 + face), rel=1e-9)
 
 
 def test_the_mirror_image_of_an_led_is_where_geometry_puts_it() -> None:
     """In a pane in the wall x = 0 the LED at x = 3 is seen as one at x = -3, dimmed by the pane."""
-    renderer = Renderer(room(window=[PANE]))
+    renderer = Renderer(room(glazing=[PANE]))
     # towards the wall and up: the mirror image is 5 m away across and 2.5 m up
     pose = Pose((2.0, 3.4, 1.0), tilt_y_deg=-60.0)
-    view = renderer.view(WIDE, pose)
+    view = renderer.expected_image(WIDE, pose)
     (reflection,) = view.parts[0].reflections
     assert reflection.led_id == 1
     expected, _ = project(WIDE, pose, np.array([-3.0, 3.5, 3.5]))
@@ -56,7 +61,7 @@ def test_the_mirror_image_of_an_led_is_where_geometry_puts_it() -> None:
     # brightness of a full pixel: L R cos^4 rate, R at the angle whose cosine is 5 / |(5, 0.1, 2.5)|
     peak = np.unravel_index(np.argmax(reflection.electrons_per_s), reflection.electrons_per_s.shape)
     at = np.array([reflection.column + peak[1] + 0.5, reflection.row + peak[0] + 0.5])
-    reflectance = pane_reflectance(5 / np.sqrt(25 + 0.01 + 6.25), 1.52, np.sqrt)
+    reflectance = glazing_reflectance(5 / np.sqrt(25 + 0.01 + 6.25), 1.52, np.sqrt)
     rate = electron_rate_per_cd_m2(WIDE, "LED-B3", Silicon())
     whole = 10000 * reflectance * rate * float(relative_illumination(WIDE, *at))
     assert reflection.electrons_per_s.max() == pytest.approx(whole, rel=0.01)
@@ -64,13 +69,13 @@ def test_the_mirror_image_of_an_led_is_where_geometry_puts_it() -> None:
 
 def test_no_led_is_mirrored_where_the_pane_is_not() -> None:
     low = {**PANE, "corner_m": [0.5, 0.1], "size_m": [6.0, 0.5]}
-    renderer = Renderer(room(window=[low]))
-    view = renderer.view(WIDE, Pose((2.0, 3.4, 1.0), tilt_y_deg=-60.0))
+    renderer = Renderer(room(glazing=[low]))
+    view = renderer.expected_image(WIDE, Pose((2.0, 3.4, 1.0), tilt_y_deg=-60.0))
     assert not view.parts[0].reflections
 
 
 def test_a_reflection_flickers_with_its_led() -> None:
-    part = Renderer(room(window=[PANE])).view(WIDE, Pose((2.0, 3.4, 1.0), tilt_y_deg=-60.0)).parts[0]
+    part = Renderer(room(glazing=[PANE])).expected_image(WIDE, Pose((2.0, 3.4, 1.0), tilt_y_deg=-60.0)).parts[0]
     assert np.array_equal(part.expected_electrons(1e-3, {1: 0.0}), part.background_e_per_s * np.float32(1e-3))
 
 
@@ -82,7 +87,7 @@ def test_a_board_hides_as_much_of_an_led_as_it_covers(tmp_path: Path, edge_x: fl
     (tmp_path / "board.obj").write_text(text)
     piece = {"file": "board.obj", "position_m": [0.0, 0.0, 3.49]}
     camera = Camera(width_px=400, height_px=300, pixel_pitch_um=12.0)
-    view = Renderer(room(tmp_path, furniture=[piece])).view(camera, Pose((3.0, 3.5, 0.5)))
+    view = Renderer(room(tmp_path, furniture=[piece])).expected_image(camera, Pose((3.0, 3.5, 0.5)))
     seen = [patch for patch in view.patches if patch.led_id == 1]
     if share == 0:
         assert not seen
@@ -105,8 +110,8 @@ def test_a_board_between_pane_and_led_hides_as_much_of_the_false_image(
     (tmp_path / "board.obj").write_text(text)
     piece = {"file": "board.obj", "position_m": [-0.02, 0.0, 3.49]}
     pose = Pose((2.0, 3.4, 1.0), tilt_y_deg=-60.0)
-    scenes = room(tmp_path, window=[PANE], furniture=[piece]), room(window=[PANE])
-    hidden, free = (Renderer(scene).view(WIDE, pose).parts[0].reflections for scene in scenes)
+    scenes = room(tmp_path, glazing=[PANE], furniture=[piece]), room(glazing=[PANE])
+    hidden, free = (Renderer(scene).expected_image(WIDE, pose).parts[0].reflections for scene in scenes)
     light = sum(r.electrons_per_s.sum(dtype=float) for r in hidden)
     # 64 rays a pixel of an image 9 px wide, and a disc seen under perspective: a few parts of a thousand
     assert light / free[0].electrons_per_s.sum(dtype=float) == pytest.approx(share, abs=0.02)
@@ -116,8 +121,7 @@ def test_a_lambertian_order_dims_the_led_aside() -> None:
     """L = L_0 cos^(m - 1): at 30 deg and a half-power angle of 30 deg, m = 4.82, so cos^3.82 = 0.577."""
     pose = Pose((3.0 - 3.0 * np.tan(np.radians(30)), 3.5, 0.5), tilt_y_deg=30.0)
     plain, narrow = (
-        Renderer(room(led=[{**LAMP, "half_power_deg": angle}])).view(WIDE, pose).patches[0].electrons_per_s.max()
-        for angle in (60.0, 30.0)
+        patch_of(room(led=[{**LAMP, "half_power_deg": angle}]), pose).electrons_per_s.max() for angle in (60.0, 30.0)
     )
     order = -np.log(2) / np.log(np.cos(np.radians(30)))
     # the brightest pixel is at the LED's near rim: 3.82 tan(30 deg) * 0.03 m cos(30 deg) / 3.46 m = 1.7 % brighter
@@ -127,7 +131,7 @@ def test_a_lambertian_order_dims_the_led_aside() -> None:
 def test_a_square_led_has_the_light_of_its_area() -> None:
     pose = Pose((3.0, 3.5, 0.5))
     disc, square = (
-        Renderer(room(led=[{**LAMP, "shape": shape}])).view(WIDE, pose).patches[0].electrons_per_s.sum(dtype=float)
+        patch_of(room(led=[{**LAMP, "shape": shape}]), pose).electrons_per_s.sum(dtype=float)
         for shape in ("disc", "square")
     )
     assert square / disc == pytest.approx(4 / np.pi, rel=1e-3)
@@ -145,5 +149,5 @@ def test_a_panel_hung_low_hides_an_led_above_it() -> None:
     }
     panel |= {"reflectance": 0.7, "leds": {**leds, "luminance_cd_m2": [5000.0, 5000.0]}}
     lamps = [LAMP, {**LAMP, "id": 2, "position_m": [3.6, 3.5, 3.5]}]
-    view = Renderer(room(led=lamps, panels=[panel])).view(WIDE, Pose((3.0, 3.5, 0.5)))
+    view = Renderer(room(led=lamps, panels=[panel])).expected_image(WIDE, Pose((3.0, 3.5, 0.5)))
     assert sorted(patch.led_id for patch in view.patches) == [2, 10]

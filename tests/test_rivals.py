@@ -15,7 +15,7 @@ from estimator.variants.catalogue import VARIANTS
 from vlcrender.dataset.generate import generate
 from vlcrender.dataset.recipe import load_plan
 
-STEREO = (*SMALL, "windows.margin_px=8", "poses.count=2", "accelerometer.error_deg=0")
+STEREO = (*SMALL, "regions.margin_px=8", "poses.count=2", "accelerometer.error_deg=0")
 FISH_EYE = (
     *("camera.width_px=800", "camera.height_px=600", "camera.pixel_pitch_um=6.0", "exposure_s=6.4e-6"),
     *("poses.border_px=4", "poses.count=2"),

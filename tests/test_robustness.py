@@ -30,7 +30,7 @@ from estimator.io.dataset import (
     read_frame,
 )
 from estimator.io.estimates import EstimateRow
-from estimator.spots.correspondences import sightings
+from estimator.spots.correspondences import correspondences
 from estimator.spots.detect import Readout, detect
 from estimator.variants.catalogue import VARIANTS
 from vlcrender.dataset.generate import generate
@@ -270,8 +270,8 @@ def test_the_stated_covariance_covers_the_error(name: str, variant: str) -> None
 def test_spots_that_are_full_are_flagged_with_and_without_the_noise_of_reading() -> None:
     """Lamps at three times the full well: every second one. The others, at 4000 of 6000 electrons, are not."""
     for name in ("saturated", "saturated, read noise"):
-        seen = sightings(answers(name)[0].frame)
-        assert [sighting.spot.saturated for sighting in seen] == [False, True] * 6
+        seen = correspondences(answers(name)[0].frame)
+        assert [correspondence.spot.saturated for correspondence in seen] == [False, True] * 6
 
 
 def test_a_full_pixel_is_known_in_the_noise_of_reading() -> None:
@@ -316,7 +316,7 @@ def test_a_reading_that_is_no_number_is_refused_by_name(tmp_path: Path) -> None:
 
 
 PANE = """
-[[window]]
+[[glazing]]
 wall = "x=0"
 corner_m = [1.0, 0.9]
 size_m = [5.0, 2.5]

@@ -31,12 +31,12 @@ def test_every_point_lands_on_a_tenth_of_its_pixel() -> None:
 
 
 def test_keys_in_pixels_are_scaled_and_the_light_is_as_the_mode_says() -> None:
-    windows = ('windows={ kind = "leds", margin_px = 30 }', "poses.border_px=20")
-    full = recipe(*windows)
-    binned, same = (recipe(*windows, scale=10, mode=mode) for mode in ("binned", "same-photons"))
+    regions = ('windows={ kind = "leds", margin_px = 30 }', "poses.border_px=20")
+    full = recipe(*regions)
+    binned, same = (recipe(*regions, scale=10, mode=mode) for mode in ("binned", "same-photons"))
     for small in (binned, same):
-        assert small.windows is not None
-        assert small.windows.margin_px == 3.0
+        assert small.regions is not None
+        assert small.regions.margin_px == 3.0
         assert small.poses.border_px == 2.0  # type: ignore[union-attr]
         assert small.camera.pixel_pitch_um == 60.0
         assert small.camera.f_number == full.camera.f_number
@@ -53,15 +53,15 @@ def test_a_metered_exposure_is_the_full_cameras(office: Scene) -> None:
     """
     pose = Pose((3.15, 3.1, 0.6), 6, -8, 20)
     kinds = {
-        "peak": ["exposure.kind=peak", "exposure.share_of_saturation=0.6", "exposure.longest_s=1.0"],
+        "peak": ["exposure.kind=peak", "exposure.share_of_saturation=0.6", "exposure.max_s=1.0"],
         "noise-level": ["exposure.kind=noise-level", "exposure.level_db=-30"],
     }
     for metering in kinds.values():
         of_camera = ("camera.width_px=2000", "camera.height_px=1500", "camera.pixel_pitch_um=2.4")
         full, small = (recipe(*of_camera, *metering, scale=scale) for scale in (1, 10))
-        views = [Renderer(office).view(r.camera, pose) for r in (full, small)]
+        views = [Renderer(office).expected_image(r.camera, pose) for r in (full, small)]
         times = [r.time_s(view) for r, view in zip((full, small), views, strict=True)]
-        assert max(patch.window.columns for patch in views[1].patches) > 4
+        assert max(patch.roi.columns for patch in views[1].patches) > 4
         assert times[1] == pytest.approx(times[0], rel=4e-3)
         same = recipe(*of_camera, *metering, scale=10, mode="same-photons")
         assert same.time_s(views[1]) == pytest.approx(times[0] / 100, rel=4e-3)
@@ -72,9 +72,9 @@ def test_a_metered_exposure_is_the_full_cameras(office: Scene) -> None:
 def test_a_binned_pixel_holds_the_sum_of_its_pixels(office: Scene, pose: Pose, skewed: tuple[str, ...]) -> None:
     full, small = (recipe(*skewed, scale=scale) for scale in (1, 10))
     renderer = Renderer(office)
-    image = renderer.view(full.camera, pose).expected_electrons(full.exposure_s).astype(float)
+    image = renderer.expected_image(full.camera, pose).expected_electrons(full.exposure_s).astype(float)
     sums = image.reshape(60, 10, 80, 10).sum(axis=(1, 3))
-    binned = renderer.view(small.camera, pose).expected_electrons(small.exposure_s)
+    binned = renderer.expected_image(small.camera, pose).expected_electrons(small.exposure_s)
     # Two first-order errors of a pixel that an LED covers in part, f = 300 px. cos^4 is taken at its centre, its light
     # may be a quarter of a pixel off: 4 * 0.17 / (4 * 300) = 6e-4. Coverage is an area on the LED's plane, where the
     # pixel's far side counts for more by 3 tan(angle from the vertical) / 300; its half errs by 1/4 of it.
@@ -94,7 +94,7 @@ def test_same_photons_in_a_larger_pixel(office: Scene) -> None:
     pose = Pose((3.15, 3.1, 0.6), 6, -8, 20)
     renderer = Renderer(office)
     full, small = recipe(), recipe(scale=10, mode="same-photons")
-    images = [renderer.view(r.camera, pose).expected_electrons(r.exposure_s) for r in (full, small)]
+    images = [renderer.expected_image(r.camera, pose).expected_electrons(r.exposure_s) for r in (full, small)]
     assert np.median(images[1]) == pytest.approx(np.median(images[0]), rel=0.02)
 
 

@@ -14,7 +14,7 @@ from vlcrender.errors import InputError
 from vlcrender.light.lightmap import room_mesh
 from vlcrender.scene.loader import Scene, build_scene, load_scene
 from vlcrender.scene.schema import SceneSettings
-from vlcrender.scene.visibility import leds_in_view, level_coverage
+from vlcrender.scene.visibility import leds_in_view, level_visibility
 
 ROOT = Path(__file__).parent.parent
 TABLE1 = (ROOT / "scenes/table1.toml").read_text()
@@ -67,7 +67,7 @@ def test_table1_as_printed_sees_four_leds_from_36_of_122500_level_poses(table1: 
         in_x = np.abs(table1.leds.centers_m[:, 0] - steps[:, None]) * 15000 / 3.5 <= half_x + 1e-6
         in_y = np.abs(table1.leds.centers_m[:, 1] - steps[:, None]) * 15000 / 3.5 <= half_y + 1e-6
         seen = (in_x[:, None, :] & in_y[None, :, :]).sum(axis=2) >= 4
-        coverage = level_coverage(Camera(), table1, 0.0, yaw)
+        coverage = level_visibility(Camera(), table1, 0.0, yaw)
         assert (coverage.poses, coverage.seen) == (122_500, int(seen.sum()))
         assert coverage.seen == {0.0: 0, 90.0: 36}[yaw]
 
@@ -136,10 +136,10 @@ def test_a_bad_panel_is_refused_in_one_line(tmp_path: Path, old: str, new: str, 
 
 WINDOW = {"wall": "x=0", "corner_m": [1.0, 1.0], "size_m": [1.0, 1.0], "luminance_cd_m2": 100.0}
 BAD_ADDITIONS: list[tuple[dict[str, object], str]] = [
-    ({"window": [{**WINDOW, "size_m": [7.0, 1.0]}]}, r"window\[0\]: .*does not fit"),
-    ({"window": [WINDOW, {**WINDOW, "corner_m": [1.5, 1.5]}]}, r"window\[1\]: overlaps another window in wall x=0"),
-    ({"window": [{**WINDOW, "wall": "north"}]}, r"window\[0\]\.wall = \"north\": .*'x=0'"),
-    ({"window": [{**WINDOW, "refractive_index": 0.5}]}, r"refractive_index = 0\.5"),
+    ({"glazing": [{**WINDOW, "size_m": [7.0, 1.0]}]}, r"glazing\[0\]: .*does not fit"),
+    ({"glazing": [WINDOW, {**WINDOW, "corner_m": [1.5, 1.5]}]}, r"glazing\[1\]: overlaps another glazing in wall x=0"),
+    ({"glazing": [{**WINDOW, "wall": "north"}]}, r"glazing\[0\]\.wall = \"north\": .*'x=0'"),
+    ({"glazing": [{**WINDOW, "refractive_index": 0.5}]}, r"refractive_index = 0\.5"),
     ({"furniture": [{"file": "nowhere.ply"}]}, r"furniture\[0\]\.file = 'nowhere.ply': no such file"),
     ({"furniture": [{"file": "chair.blend"}]}, r"furniture\[0\]\.file = \"chair.blend\""),
     ({"bake": {"texel_m": 0.0}}, r"bake\.texel_m = 0\.0"),
@@ -223,5 +223,5 @@ def test_the_shipped_files_are_toml_with_units_in_their_keys() -> None:
 @pytest.mark.parametrize("path", sorted((ROOT / "scenes").glob("*.toml")), ids=lambda path: path.stem)
 def test_every_shipped_scene_can_be_laid_out(path: Path) -> None:
     scene = load_scene(path)
-    assert len(scene.leds) == len(scene.leds.sheets)
+    assert len(scene.leds) == len(scene.leds.diffusers)
     assert all(0 < surface.reflectance < 1 for surface in scene.surfaces)

@@ -6,13 +6,13 @@ from pydantic import ValidationError
 from scipy import stats
 
 from vlcrender.core.random_keys import stream
-from vlcrender.sensor.poisson import LARGEST_MEAN
-from vlcrender.sensor.sensor import LARGEST_WELL_E, Sensor, clip_full_well
+from vlcrender.sensor.poisson import MAX_MEAN
+from vlcrender.sensor.sensor import MAX_WELL_E, Sensor, clip_full_well
 from vlcrender.sensor.signal_chain import expose
 
 N = 400_000
 MEANS = [0.2, 3.0, 40.0, 3000.0]
-WIDE = Sensor(full_well_e=LARGEST_WELL_E, gain_e_per_dn=1.0)
+WIDE = Sensor(full_well_e=MAX_WELL_E, gain_e_per_dn=1.0)
 
 
 def draw(mean: float, name: str) -> np.ndarray:
@@ -90,11 +90,11 @@ def test_full_well_clips_electrons_before_gain() -> None:
 
 
 def test_no_well_holds_more_than_is_drawn() -> None:
-    assert LARGEST_WELL_E == LARGEST_MEAN
-    sensor = Sensor(full_well_e=LARGEST_WELL_E, gain_e_per_dn=1000.0, bits=14)
-    assert (expose(sensor, np.full((2, 2), 1e12, dtype=np.float32), "x") >= (LARGEST_WELL_E - 1e4) / 1000).all()
+    assert MAX_WELL_E == MAX_MEAN
+    sensor = Sensor(full_well_e=MAX_WELL_E, gain_e_per_dn=1000.0, bits=14)
+    assert (expose(sensor, np.full((2, 2), 1e12, dtype=np.float32), "x") >= (MAX_WELL_E - 1e4) / 1000).all()
     with pytest.raises(ValidationError, match="full_well_e"):
-        Sensor(full_well_e=2 * LARGEST_WELL_E)
+        Sensor(full_well_e=2 * MAX_WELL_E)
 
 
 def test_streams_share_nothing_between_neighbouring_seeds_frames_and_names() -> None:

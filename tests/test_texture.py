@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from test_reference import ROOM, SMALL_VIEW, blocks, both_ways, scene_of
+from test_path_traced import ROOM, SMALL_VIEW, blocks, both_ways, scene_of
 
 from vlcrender.camera.intrinsics import Camera, Pose, project, rays_world
 from vlcrender.camera.lens import relative_illumination
-from vlcrender.camera.roi import Window
+from vlcrender.camera.roi import Roi
 from vlcrender.errors import InputError
-from vlcrender.light.lightmap import Light, bake, room_mesh
+from vlcrender.light.lightmap import Lightmap, bake, room_mesh
 from vlcrender.rendering.background import Background
 from vlcrender.scene.loader import Scene
 from vlcrender.scene.mesh import mesh_of_surfaces
@@ -49,7 +49,7 @@ def evenly_lit(scene: Scene, lux: float) -> Background:
     corners = len(mesh.vertices_m)
     albedo = np.append(mesh.albedo, 0.5)
     return Background(
-        scene, Light(mesh, albedo, np.zeros(corners + 1), np.full(corners + 1, lux), np.zeros(corners + 1))
+        scene, Lightmap(mesh, albedo, np.zeros(corners + 1), np.full(corners + 1, lux), np.zeros(corners + 1))
     )
 
 
@@ -89,7 +89,7 @@ def test_a_view_of_a_texture_errs_by_less_than_a_hundredth_of_the_shot_noise(
     """
     scene = papered(tmp_path, speckled(), (0.6, 0.6))
     camera = Camera(width_px=80, height_px=60, pixel_pitch_um=pitch_um)
-    images, labels = evenly_lit(scene, 440.0).images(camera, pose, (Window.of_sensor(camera),), (0.0, 4000 / 16000))
+    images, labels = evenly_lit(scene, 440.0).images(camera, pose, (Roi.of_sensor(camera),), (0.0, 4000 / 16000))
     texture = scene.surfaces[1].texture
     assert texture is not None
     # brute force itself errs by 0.3 / 24^1.5 = 0.25 % of a step in a pixel with an edge: 1e-4 of the shot noise
@@ -124,7 +124,7 @@ def test_an_image_lies_as_written(tmp_path: Path, name: str, place: list[float],
         at[1 if place[0] in (0.0, 3.0) and place[1] == 0.4 else 0] += 0.025
     scene = papered(tmp_path, image, (0.6, 0.3), name)
     camera = Camera(width_px=400, height_px=300, pixel_pitch_um=20.0)
-    background, _ = evenly_lit(scene, 100.0).images(camera, pose, (Window.of_sensor(camera),), (0.0, 1.0))
+    background, _ = evenly_lit(scene, 100.0).images(camera, pose, (Roi.of_sensor(camera),), (0.0, 1.0))
     pixel, _ = project(camera, pose, at)
     u, v = np.meshgrid(np.arange(400) + 0.5, np.arange(300) + 0.5)
     near = np.hypot(u - pixel[0], v - pixel[1]) < 25

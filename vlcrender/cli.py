@@ -20,7 +20,7 @@ from vlcrender.dataset.recipe import ScaleMode, load_plan
 from vlcrender.dataset.verify import problems_of
 from vlcrender.errors import InputError
 from vlcrender.scene.loader import load_scene
-from vlcrender.scene.visibility import ENOUGH_LEDS, level_coverage, tilted_coverage
+from vlcrender.scene.visibility import ENOUGH_LEDS, level_visibility, tilted_visibility
 
 if TYPE_CHECKING:
     from vlcrender.emva1288.datasheet import Datasheet
@@ -149,9 +149,9 @@ def show(
     table.add_column("share", justify="right")
     for height in HEIGHTS_M:
         for coverage in (
-            level_coverage(camera, loaded, height, 0.0),
-            level_coverage(camera, loaded, height, 90.0),
-            tilted_coverage(camera, loaded, height),
+            level_visibility(camera, loaded, height, 0.0),
+            level_visibility(camera, loaded, height, 90.0),
+            tilted_visibility(camera, loaded, height),
         ):
             share = f"{100 * coverage.share:.2f} %"
             table.add_row(f"{height:g}", coverage.attitude, str(coverage.poses), str(coverage.seen), share)

@@ -52,7 +52,7 @@ def draw(scene: Scene, camera: Camera, path: Path, reference: bool = False) -> N
     if reference:
         electrons = _reference_electrons(scene, camera, pose)
     else:
-        electrons = Renderer(scene).view(camera, pose).expected_electrons(EXPOSURE_S)
+        electrons = Renderer(scene).expected_image(camera, pose).expected_electrons(EXPOSURE_S)
     figure = Figure(figsize=(14, 6.2), layout="constrained")
     plan, image = figure.subplots(1, 2, width_ratios=[1, 1.25])
     discs = _draw_plan(plan, scene, camera, pose)

@@ -7,9 +7,9 @@ from estimator.errors import EstimationFailure
 from estimator.io.dataset import Accelerometer
 
 # A ray lower than this above the horizon meets the ceiling some thousand room heights away.
-LOWEST_SINE = 1e-3
+MIN_SINE = 1e-3
 # An accelerometer said to be without error is taken to have this one: 0.06 um at 3.5 m.
-BEST_TILT_DEG = 1e-6
+MIN_TILT_SIGMA_DEG = 1e-6
 
 
 def tilt_from_gravity(accelerometer_m_s2: tuple[float, float, float]) -> tuple[float, float]:
@@ -27,9 +27,9 @@ def tilt_from_gravity(accelerometer_m_s2: tuple[float, float, float]) -> tuple[f
 
 def tilt_sigmas(accelerometer: Accelerometer, tilt_y: float) -> NDArray[np.float64]:
     """Standard deviations of the angles `tilt_from_gravity` gives, (2,), radians; never below BEST_TILT_DEG."""
-    sigma = np.radians(max(accelerometer.error_deg, BEST_TILT_DEG))
+    sigma = np.radians(max(accelerometer.error_deg, MIN_TILT_SIGMA_DEG))
     # tilt_x turns gravity's direction by cos(tilt_y) alone; where it is upright, tilt_x means nothing.
-    lever = max(np.cos(tilt_y), LOWEST_SINE) if accelerometer.kind == "imu" else 1.0
+    lever = max(np.cos(tilt_y), MIN_SINE) if accelerometer.kind == "imu" else 1.0
     return np.array([sigma / lever, sigma])
 
 
@@ -47,7 +47,7 @@ def printed_eq6(tilt_x: float, tilt_y: float) -> NDArray[np.float64]:
     return np.array([[cy, 0, -sy], [sx * sy, cx, sx], [0, -sx, cx * cy]])
 
 
-def levelling_homography(K: NDArray[np.float64], R_cam_world: NDArray[np.float64]) -> NDArray[np.float64]:
+def leveling_homography(K: NDArray[np.float64], R_cam_world: NDArray[np.float64]) -> NDArray[np.float64]:
     """`K R^T K^-1`, (3, 3): takes pixels to those of a level camera at the same place (Eq. 10 without translation)."""
     return np.asarray(K @ R_cam_world.T @ np.linalg.inv(K))
 
@@ -58,8 +58,8 @@ def level(pixels: NDArray[np.float64], K: NDArray[np.float64], R_cam_world: NDAr
     Raises EstimationFailure where a pixel looks at or below the horizon: no level camera looking up sees that.
     """
     homogeneous = np.column_stack([pixels, np.ones(len(pixels))])
-    levelled = homogeneous @ levelling_homography(K, R_cam_world).T
+    leveled = homogeneous @ leveling_homography(K, R_cam_world).T
     rays = homogeneous @ np.linalg.inv(K).T
-    if (levelled[:, 2] <= LOWEST_SINE * np.linalg.norm(rays, axis=1)).any():
+    if (leveled[:, 2] <= MIN_SINE * np.linalg.norm(rays, axis=1)).any():
         raise EstimationFailure("rectify", "a spot is at or below the horizon")
-    return np.asarray(levelled[:, :2] / levelled[:, 2:])
+    return np.asarray(leveled[:, :2] / leveled[:, 2:])

@@ -13,7 +13,7 @@ Floats = NDArray[np.float64]
 POSE_PARAMETERS = 6
 """Position x, y, z in metres, then tilt_x, tilt_y and yaw in radians: the order of every derivative by the pose."""
 # What is less than this in front of a perspective lens, as a share of its distance, is beside it: 89.9 deg.
-SHALLOWEST = 1e-3
+MIN_DEPTH_SHARE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +106,7 @@ def _rotation_slopes(pose: TiltedPose) -> tuple[Floats, Floats, Floats]:
 def _perspective(p_cam: Floats, camera: Camera) -> tuple[Floats, Floats]:
     """Places on the sensor (n, 2) in units of the image distance, and slopes (n, 2, 3) by the point."""
     x, y, z = p_cam.T
-    seen = z > SHALLOWEST * np.linalg.norm(p_cam, axis=1)
+    seen = z > MIN_DEPTH_SHARE * np.linalg.norm(p_cam, axis=1)
     z = np.where(seen, z, np.nan)
     a, b = x / z, y / z
     slopes = np.zeros((len(p_cam), 2, 3))

@@ -10,9 +10,9 @@ from estimator.io.dataset import Camera, Distortion
 Floats = NDArray[np.float64]
 
 # A pinhole's pixels go off to infinity towards 90 deg: at 80 an error of a pixel has become one of 33.
-WIDEST_DEG = 80.0
+MAX_FIELD_ANGLE_DEG = 80.0
 # Newton's method doubles the digits a step; a lens that takes more all but folds the image.
-MOST_STEPS = 20
+MAX_STEPS = 20
 # In units of the image distance: 1e-8 px of a sensor with 15 000 pixels to the image distance.
 TOLERANCE = 1e-12
 
@@ -49,8 +49,8 @@ def lens_pixels(pixels: Floats, camera: Camera) -> Floats:
 def _from_angles(on_sensor: Floats) -> Floats:
     """Positions (n, 2) at a distance theta from the axis to those at tan(theta)."""
     theta = np.linalg.norm(on_sensor, axis=1, keepdims=True)
-    if not (theta < np.radians(WIDEST_DEG)).all():
-        raise EstimationFailure("undistort", f"a spot is {WIDEST_DEG:.0f} deg or more off the optical axis")
+    if not (theta < np.radians(MAX_FIELD_ANGLE_DEG)).all():
+        raise EstimationFailure("undistort", f"a spot is {MAX_FIELD_ANGLE_DEG:.0f} deg or more off the optical axis")
     # On the axis itself the limit is 1.
     scale = np.divide(np.tan(theta), theta, out=np.ones_like(theta), where=theta > 0)
     return np.asarray(on_sensor * scale)
@@ -61,7 +61,7 @@ def _undistorted(on_sensor: Floats, distortion: Distortion) -> Floats:
     coefficients = _coefficients(distortion)
     plane = on_sensor
     with np.errstate(all="ignore"):
-        for _ in range(MOST_STEPS):
+        for _ in range(MAX_STEPS):
             again, slope = _distorted(plane, coefficients)
             # A folded image has a second place for the same pixel, where it is the wrong way round.
             if (np.linalg.norm(again - on_sensor, axis=1) <= TOLERANCE).all() and (np.linalg.det(slope) > 0).all():

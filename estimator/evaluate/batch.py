@@ -48,8 +48,10 @@ def estimate_shot(dataset: Dataset, records: Sequence[FrameRecord], variants: Se
             if isinstance(frame, EstimationFailure):
                 row = _failed(record.frame, frame, dataset.leds, time_s=0.0)
             else:
-                mates = tuple(mate for _, mate in shot if isinstance(mate, DeviceFrame) and mate is not frame)
-                row = estimate_frame(variant, replace(frame, mates=mates), record.frame)
+                other_cameras = tuple(
+                    other for _, other in shot if isinstance(other, DeviceFrame) and other is not frame
+                )
+                row = estimate_frame(variant, replace(frame, other_cameras=other_cameras), record.frame)
             rows[variant.name].append(row)
     return rows
 

@@ -80,7 +80,7 @@ class VariantScore(Row):
     frames: int
     ok: int
     failed: int
-    coverage: float | None = Field(ge=0, le=1)
+    success_rate: float | None = Field(ge=0, le=1)
     ambiguous: int
     failures: dict[str, int]
     of_all: OfAll | None
@@ -129,7 +129,7 @@ def score_variant(
         frames=len(rows),
         ok=len(good),
         failed=len(rows) - len(good),
-        coverage=len(good) / len(rows) if rows else None,
+        success_rate=len(good) / len(rows) if rows else None,
         ambiguous=sum(row.ambiguous for row in good),
         failures=dict(Counter(row.reason for row in rows if row.status == "failed").most_common()),
         of_all=of_all([row.error_3d_m for row in rows]),

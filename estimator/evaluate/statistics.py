@@ -14,9 +14,9 @@ CONFIDENCE = 0.95
 RESAMPLES = 1999
 """50 of them lie beyond each limit, so that the share beyond it is 2.5 % give or take 0.35."""
 BOOTSTRAP_KEY = 20161118
-MOST_RESAMPLED_AT_ONCE = 2_000_000
+MAX_RESAMPLED_AT_ONCE = 2_000_000
 NEES_CONFIDENCE = 0.99
-SMALLEST_ERROR_M = 1e-100
+MIN_ERROR_M = 1e-100
 """What is below is zero; nothing is divided by it."""
 
 
@@ -132,7 +132,7 @@ def _interval(values_m: Sequence[float], statistic: Callable[..., Floats]) -> In
         (np.array(values_m, dtype=np.float64),),
         statistic,
         n_resamples=RESAMPLES,
-        batch=max(1, MOST_RESAMPLED_AT_ONCE // len(values_m)),
+        batch=max(1, MAX_RESAMPLED_AT_ONCE // len(values_m)),
         vectorized=True,
         confidence_level=CONFIDENCE,
         method="percentile",
@@ -150,7 +150,7 @@ def against_bound(errors_m: Sequence[float], bounds_m: Sequence[float]) -> Again
         frames=len(errors_m),
         bound_rms_m=bound_rms_m,
         rmse_m=rmse_m,
-        efficiency=bound_rms_m / rmse_m if rmse_m >= SMALLEST_ERROR_M else None,
+        efficiency=bound_rms_m / rmse_m if rmse_m >= MIN_ERROR_M else None,
     )
 
 

@@ -16,7 +16,7 @@ from estimator.errors import InputError
 from estimator.io.records import NotNegative, Number, Positive, Row, Triple, first_line, first_problem, read_rows
 
 INT64_MAX = 2**63 - 1
-MOST_PIXELS = 16
+MAX_PIXELS = 16
 """How many times the sensor's pixels the windows of a frame may hold, which may reach beyond it."""
 FULL_SIGMA = 4.0
 LedId = Annotated[int, Field(ge=0, le=INT64_MAX)]
@@ -232,7 +232,7 @@ class DeviceFrame:
     exposure_s: float
     spots: tuple[DecodedSpot, ...]
     leds: dict[int, Led]
-    mates: "tuple[DeviceFrame, ...]" = ()
+    other_cameras: "tuple[DeviceFrame, ...]" = ()
     """What the rig's other cameras took at the same time; theirs are left empty."""
 
     def electrons(self, part: Part) -> NDArray[np.float32]:
@@ -369,6 +369,6 @@ def _check_headers(record: FrameRecord, headers: list[dict[str, object]], camera
             raise InputError(f"{record.file}: dataWindow {box.tolist()} overlaps another part's")
         boxes.append(box)
     pixels = sum(int((box[1] - box[0] + 1).prod()) for box in boxes)
-    if pixels > MOST_PIXELS * camera.width_px * camera.height_px:
-        raise InputError(f"{record.file}: {pixels} pixels, more than {MOST_PIXELS} times the sensor's")
+    if pixels > MAX_PIXELS * camera.width_px * camera.height_px:
+        raise InputError(f"{record.file}: {pixels} pixels, more than {MAX_PIXELS} times the sensor's")
     return boxes

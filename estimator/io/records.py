@@ -28,10 +28,10 @@ Size = Annotated[float, Field(ge=0)]
 # Arrow hands over lists; only the container is converted, the numbers in it stay strict.
 Triple = Annotated[tuple[Number, Number, Number], Strict(False)]
 
-SMALLEST_VARIANCE = 1e-60
+MIN_VARIANCE = 1e-60
 """A covariance below this would overflow where an error is measured by it."""
-MOST_ASYMMETRY = 1e-6
-LEAST_EIGENVALUE = 1e-14
+MAX_ASYMMETRY = 1e-6
+MIN_EIGENVALUE = 1e-14
 """Of the correlations: below it the inverse, in double precision, has not two digits left."""
 
 
@@ -40,12 +40,12 @@ def is_covariance(values: Sequence[float]) -> bool:
     matrix = np.reshape(np.asarray(values, dtype=np.float64), (3, 3))
     variances = np.diag(matrix)
     # Also false for NaN.
-    if not (variances >= SMALLEST_VARIANCE).all() or not np.abs(matrix).max() <= LARGEST:
+    if not (variances >= MIN_VARIANCE).all() or not np.abs(matrix).max() <= LARGEST:
         return False
     correlations = matrix / np.sqrt(np.outer(variances, variances))
-    if np.abs(correlations - correlations.T).max() > MOST_ASYMMETRY:
+    if np.abs(correlations - correlations.T).max() > MAX_ASYMMETRY:
         return False
-    return bool(np.linalg.eigvalsh(correlations).min() >= LEAST_EIGENVALUE)
+    return bool(np.linalg.eigvalsh(correlations).min() >= MIN_EIGENVALUE)
 
 
 def _check_covariance(values: tuple[float, ...]) -> tuple[float, ...]:

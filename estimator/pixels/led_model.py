@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from estimator.camera.projection import POSE_PARAMETERS, TiltedPose, project
 from estimator.io.dataset import Camera, Led
-from estimator.pixels.polygon_raster import LONGEST_EDGE_PX, Canvas, Outlines, Pieces, cover
+from estimator.pixels.polygon_raster import MAX_EDGE_PX, Canvas, Outlines, Pieces, cover
 from estimator.pixels.psf import LensBlur
 
 Floats = NDArray[np.float64]
@@ -27,7 +27,7 @@ Ints = NDArray[np.int64]
 
 # A rim's points in the first place, to see how large it is; and the fewest, for LEDs of a few pixels.
 COARSE_POINTS = 32
-FEWEST_POINTS = 128
+MIN_POINTS = 128
 # Edges have to stay within LONGEST_EDGE_PX while the pose is looked for, and points further off are further apart.
 SPARE = 1.25
 
@@ -109,12 +109,12 @@ class Drawing:
         if not lens.kernels:
             index = np.full(self._canvas.cells(), len(cells))
             index[cells] = np.arange(len(cells))
-            at = index[self._canvas.cell(pieces.window, pieces.row, pieces.column)]
+            at = index[self._canvas.cell(pieces.roi, pieces.row, pieces.column)]
             gained = [np.bincount(at, slope, len(cells) + 1)[:-1] for slope in pieces.slopes.T]
             return np.stack(gained, axis=1)
-        fine = self._canvas.grown(lens.reach_px).finer(lens.slope_finer)
-        coarser = (lens.finer // lens.slope_finer)[pieces.window]
-        at = fine.cell(pieces.window, pieces.row // coarser, pieces.column // coarser)
+        fine = self._canvas.padded(lens.reach_px).finer(lens.slope_finer)
+        coarser = (lens.finer // lens.slope_finer)[pieces.roi]
+        at = fine.cell(pieces.roi, pieces.row // coarser, pieces.column // coarser)
         slopes = np.empty((len(cells), POSE_PARAMETERS))
         for parameter, slope in enumerate(pieces.slopes.T):
             sharp: Floats = np.asarray(np.bincount(at, slope / coarser**2, fine.cells()), dtype=np.float64)
@@ -133,7 +133,7 @@ class LedImages:
         self.canvas = canvas
         self._camera = camera
         self._lens = lens
-        wanted = np.maximum(FEWEST_POINTS, SPARE * seen.longest_edge_px * COARSE_POINTS / LONGEST_EDGE_PX)
+        wanted = np.maximum(MIN_POINTS, SPARE * seen.longest_edge_px * COARSE_POINTS / MAX_EDGE_PX)
         counts = 4 * np.ceil(wanted * lens.finer / 4).astype(np.int64)
         last = np.cumsum(counts)
         self._following = np.arange(1, last[-1] + 1)
@@ -147,7 +147,7 @@ class LedImages:
         """All LEDs under a pose, each alone in its window."""
         lens, scale = self._lens, self._lens.finer[self._led, None]
         rims = project(self._rims_m, pose, self._camera)
-        fine = self.canvas.grown(lens.reach_px).finer(lens.finer)
+        fine = self.canvas.padded(lens.reach_px).finer(lens.finer)
         outlines = Outlines(rims.pixels * scale, self._following, self._led, rims.slopes * scale[:, None])
         covered, pieces = cover(fine, outlines)
         share = _blurred(covered, fine, self.canvas, lens, lens.kernels) if lens.kernels else covered
@@ -158,11 +158,11 @@ def _blurred(image: Floats, fine: Canvas, canvas: Canvas, lens: LensBlur, kernel
     """An image of the canvas's windows with a margin, on finer pixels, to one after the lens, on the canvas."""
     blurred = np.zeros(canvas.cells())
     for k, kernel in enumerate(kernels):
-        after = _filtered(fine.window(image, k), kernel)
+        after = _filtered(fine.roi(image, k), kernel)
         rows, columns = (int(size[k]) + 2 * lens.reach_px for size in (canvas.heights, canvas.widths))
         whole = after.reshape(rows, after.shape[0] // rows, columns, after.shape[1] // columns).mean(axis=(1, 3))
         inner = slice(lens.reach_px, -lens.reach_px)
-        canvas.window(blurred, k)[:] = whole[inner, inner]
+        canvas.roi(blurred, k)[:] = whole[inner, inner]
     return blurred
 
 

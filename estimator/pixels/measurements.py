@@ -31,13 +31,13 @@ FLAT = 1e-3
 # An LED takes part once the pose says to this where it is, one standard deviation.
 CERTAIN_PX = 0.5
 # Of the pixels inside an LED so many have to be known, that is read out and not full.
-LEAST_KNOWN = 0.5
+MIN_KNOWN = 0.5
 # A square's corner is 1.4 half sides away; a slanted lens's scale varies over a face.
-FARTHEST = 3.0
+MAX_DISTANCE = 3.0
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class Measurements:
     """Readings around n LEDs: the first e are pixels at edges, the rest are sums over flat ones; m in all.
 
     A group is what shares an amplitude and a background: an LED, or an LED's pixels of one colour; there are g.
@@ -76,7 +76,7 @@ class Evidence:
         return np.asarray(sums)
 
 
-def gather(frame: DeviceFrame, pose: TiltedPose, covariance: Floats) -> Evidence:
+def gather(frame: DeviceFrame, pose: TiltedPose, covariance: Floats) -> Measurements:
     """What a frame shows of the LEDs of the map that are seen from a pose known to a covariance (6, 6).
 
     LEDs whose place is not sure to CERTAIN_PX are left out, and so are full pixels, pixels that another LED of the map
@@ -88,7 +88,7 @@ def gather(frame: DeviceFrame, pose: TiltedPose, covariance: Floats) -> Evidence
     canvas = _windows(frame, seen, EDGE_PX + RING_PX + lens.reach_px)
     images = LedImages(leds, seen, frame.camera, lens, canvas)
     drawing = images.draw(pose)
-    shares = [canvas.window(drawing.share, k) for k in range(len(leds))]
+    shares = [canvas.roi(drawing.share, k) for k in range(len(leds))]
     near = [_near_edge_and_lit(of_led) for of_led in shares]
     readings = [_readings(frame, canvas, k) for k in range(len(leds))]
     full = np.array([_is_full(share, known) for share, (_, known) in zip(shares, readings, strict=True)])
@@ -126,7 +126,7 @@ def gather(frame: DeviceFrame, pose: TiltedPose, covariance: Floats) -> Evidence
     cells, weights, electrons = (np.concatenate(column) for column in zip(*edges, strict=True))
     counts = np.array([len(edge[0]) for edge in edges])
     flat_group, flat_pixels, flat_electrons, flat_light = np.array(flats).reshape(-1, 4).T
-    return Evidence(
+    return Measurements(
         leds=leds,
         images=images,
         pose=pose,
@@ -155,7 +155,7 @@ def _in_view(frame: DeviceFrame, pose: TiltedPose, covariance: Floats) -> tuple[
     with np.errstate(invalid="ignore"):
         # By how much an image moves with the camera, a face's reaches from its middle.
         scale = np.linalg.norm(middles.slopes[:, :, :3], axis=(1, 2))
-        beside_px = (FARTHEST * reach_m * scale)[:, None]
+        beside_px = (MAX_DISTANCE * reach_m * scale)[:, None]
         near = ((middles.pixels > low - beside_px) & (middles.pixels < high + beside_px)).all(axis=1)
     candidates = np.flatnonzero(near)
     if len(candidates) == 0:
@@ -215,7 +215,7 @@ def _readings(frame: DeviceFrame, canvas: Canvas, k: int) -> tuple[Floats, Mask]
 def _is_full(share: Floats, known: Mask) -> bool:
     """Whether of the pixels that an LED fills, if there are any, most are not known."""
     inside = share > 1 - FLAT
-    return bool(inside.any() and not known[inside].mean() > LEAST_KNOWN)
+    return bool(inside.any() and not known[inside].mean() > MIN_KNOWN)
 
 
 def _neighbours(canvas: Canvas, k: int) -> Sequence[int]:

@@ -15,7 +15,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 # Shorter than a pixel, so that an edge crosses at most one line between rows and one between columns.
-LONGEST_EDGE_PX = 0.75
+MAX_EDGE_PX = 0.75
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +31,7 @@ class Canvas:
     heights: Ints
     widths: Ints
 
-    def grown(self, by_px: int) -> "Canvas":
+    def padded(self, by_px: int) -> "Canvas":
         """Each window with a margin on all sides."""
         return Canvas(self.rows - by_px, self.columns - by_px, self.heights + 2 * by_px, self.widths + 2 * by_px)
 
@@ -43,7 +43,7 @@ class Canvas:
         """How many cells there are."""
         return int((self.heights * (self.widths + 1)).sum())
 
-    def window(self, cells: Floats, k: int) -> Floats:
+    def roi(self, cells: Floats, k: int) -> Floats:
         """Window k of a flat array of cells, (rows, columns): a view of it."""
         start, height, width = int(self.starts()[k]), int(self.heights[k]), int(self.widths[k])
         return cells[start : start + height * (width + 1)].reshape(height, width + 1)[:, :width]
@@ -52,13 +52,10 @@ class Canvas:
         """The first cell of each window, (n + 1,); the last is the number of cells."""
         return np.concatenate([[0], np.cumsum(self.heights * (self.widths + 1))])
 
-    def cell(self, window: Ints, row: Ints, column: Ints) -> Ints:
+    def cell(self, roi: Ints, row: Ints, column: Ints) -> Ints:
         """The cells of pixels of the sensor that lie in the given windows, elementwise."""
         return np.asarray(
-            self.starts()[window]
-            + (row - self.rows[window]) * (self.widths[window] + 1)
-            + column
-            - self.columns[window]
+            self.starts()[roi] + (row - self.rows[roi]) * (self.widths[roi] + 1) + column - self.columns[roi]
         )
 
 
@@ -72,7 +69,7 @@ class Outlines:
 
     points: Floats
     following: Ints
-    window: Ints
+    roi: Ints
     slopes: Floats
 
 
@@ -83,7 +80,7 @@ class Pieces:
     `slopes` (m, p) is what the pixel gains as the piece moves.
     """
 
-    window: Ints
+    roi: Ints
     row: Ints
     column: Ints
     slopes: Floats
@@ -105,15 +102,15 @@ def cover(canvas: Canvas, outlines: Outlines) -> tuple[Floats, Pieces]:
     dv = step[edge, 1] * length[:, 0]
     u, v = (start[edge] + step[edge] * middle).T
 
-    window = outlines.window[edge]
+    roi = outlines.roi[edge]
     row, column = np.floor(v).astype(np.int64), np.floor(u).astype(np.int64)
-    inside = (row >= canvas.rows[window]) & (row < canvas.rows[window] + canvas.heights[window])
-    edge, window, row, column, u, dv = (values[inside] for values in (edge, window, row, column, u, dv))
-    left, right = canvas.columns[window], canvas.columns[window] + canvas.widths[window]
+    inside = (row >= canvas.rows[roi]) & (row < canvas.rows[roi] + canvas.heights[roi])
+    edge, roi, row, column, u, dv = (values[inside] for values in (edge, roi, row, column, u, dv))
+    left, right = canvas.columns[roi], canvas.columns[roi] + canvas.widths[roi]
     within = (column >= left) & (column < right)
     # What is left of a window covers its first pixel, what is right of it the cell beyond, from side to side.
     to_the_right = np.where(within, column + 1 - u, 1.0)
-    cell = canvas.cell(window, row, np.clip(column, left, right))
+    cell = canvas.cell(roi, row, np.clip(column, left, right))
     cells = canvas.cells()
     climbed = np.bincount(cell, -dv * to_the_right, cells + 1)
     climbed += np.bincount(cell + 1, -dv * (1 - to_the_right), cells + 1)
@@ -123,4 +120,4 @@ def cover(canvas: Canvas, outlines: Outlines) -> tuple[Floats, Pieces]:
     velocity = (outlines.slopes + outlines.slopes[outlines.following]) / 2
     gained = velocity[:, 0] * step[:, 1:] - velocity[:, 1] * step[:, :1]
     slopes = gained[edge[within]] * length[inside][within]
-    return covered, Pieces(window[within], row[within], column[within], slopes)
+    return covered, Pieces(roi[within], row[within], column[within], slopes)

@@ -11,12 +11,12 @@ from scipy.signal import convolve
 from scipy.special import j1
 
 from estimator.io.dataset import Camera
-from estimator.pixels.polygon_raster import LONGEST_EDGE_PX, Canvas, Outlines, cover
+from estimator.pixels.polygon_raster import MAX_EDGE_PX, Canvas, Outlines, cover
 
 Floats = NDArray[np.float64]
 
 # A disc this small moves no light that could be seen: an edge's step by some 0.05^2 / 48 of a pixel.
-SMALLEST_DISC_PX = 0.05
+MIN_DISC_PX = 0.05
 # The Airy pattern is followed to here, in units of lambda N: beyond is 1 % of the light, spread like background.
 AIRY_REACH = 20.5
 AIRY_SAMPLES = 8
@@ -25,7 +25,7 @@ AIRY_WIDTH = 2.0
 # A kernel has so many pixels across, see `LensBlur`; pixels are split at most 2^MOST_DOUBLINGS times either way, and
 # 2^AIRY_DOUBLINGS times for the Airy pattern, which is smooth and wide.
 CELLS_ACROSS = 20.0
-MOST_DOUBLINGS = 4
+MAX_DOUBLINGS = 4
 AIRY_DOUBLINGS = 2
 # Slopes need not be so good: pixels split so many times are enough.
 DISC_SLOPES = 4
@@ -54,11 +54,11 @@ class LensBlur:
         self.finer = np.ones(len(depth_m), dtype=np.int64)
         self.slope_finer = self.finer
         self.reach_px = 0
-        if camera.psf == "none" and (discs_px < SMALLEST_DISC_PX).all():
+        if camera.psf == "none" and (discs_px < MIN_DISC_PX).all():
             return
         wide = np.maximum(discs_px, AIRY_WIDTH * airy_px)
-        narrow = wide > SMALLEST_DISC_PX
-        most, slopes = (AIRY_DOUBLINGS, AIRY_SLOPES) if airy_px > 0 else (MOST_DOUBLINGS, DISC_SLOPES)
+        narrow = wide > MIN_DISC_PX
+        most, slopes = (AIRY_DOUBLINGS, AIRY_SLOPES) if airy_px > 0 else (MAX_DOUBLINGS, DISC_SLOPES)
         doublings = np.clip(np.ceil(np.log2(CELLS_ACROSS / np.where(narrow, wide, CELLS_ACROSS))), 0, most)
         self.finer = 2 ** doublings.astype(np.int64)
         made: dict[tuple[int, int], Floats] = {}
@@ -92,7 +92,7 @@ def airy_scale_px(camera: Camera) -> float:
 def _kernel(camera: Camera, disc_px: float, airy_px: float, finer: int) -> Floats:
     """All blurs one after another, on pixels `finer` times finer, (n, n) with n odd, adding up to 1."""
     kernel = np.ones((1, 1))
-    if disc_px >= SMALLEST_DISC_PX:
+    if disc_px >= MIN_DISC_PX:
         kernel = _disc(disc_px * finer)
     if airy_px > 0:
         kernel = convolve(kernel, _airy(airy_px * finer))
@@ -109,7 +109,7 @@ def _disc(diameter: float) -> Floats:
     """A disc's area in each pixel, centred on the middle one."""
     reach = int(np.ceil(diameter / 2 + 0.5))
     size = 2 * reach + 1
-    points = max(64, int(np.ceil(2 * np.pi * diameter / LONGEST_EDGE_PX)))
+    points = max(64, int(np.ceil(2 * np.pi * diameter / MAX_EDGE_PX)))
     step = 2 * np.pi / points
     angles = step * np.arange(points)
     radius = diameter / 2 * np.sqrt(step / np.sin(step))
@@ -118,7 +118,7 @@ def _disc(diameter: float) -> Floats:
     canvas = Canvas(one, one, one + size, one + size)
     following = np.roll(np.arange(points), -1)
     covered, _ = cover(canvas, Outlines(rim, following, np.zeros(points, dtype=np.int64), np.zeros((points, 2, 0))))
-    return canvas.window(covered, 0) / (np.pi * diameter**2 / 4)
+    return canvas.roi(covered, 0) / (np.pi * diameter**2 / 4)
 
 
 def _airy(scale: float) -> Floats:

@@ -15,9 +15,9 @@ INNER = WIDTH - LEFT - RIGHT
 HEIGHT = 300
 """Of the axes; a variant's lane of failures has LANE more."""
 LANE = 12
-SMALLEST_SHOWN_M = 1e-6
-MOST_LABELS = 12
-MOST_LARGE_MARKS = 1000
+MIN_SHOWN_M = 1e-6
+MAX_LABELS = 12
+MAX_LARGE_MARKS = 1000
 SHARES = (0, 25, 50, 75, 95, 100)
 
 
@@ -33,17 +33,17 @@ class Decades:
         """Around all errors and bounds that are there to be shown."""
         rows = [row for variant in variants for row in variant.rows]
         errors_m = [row.error_3d_m for row in rows if row.error_3d_m is not None]
-        shown_m = [max(size_m, SMALLEST_SHOWN_M) for size_m in errors_m + [b for _, b in frames_with_bound(variants)]]
+        shown_m = [max(size_m, MIN_SHOWN_M) for size_m in errors_m + [b for _, b in frames_with_bound(variants)]]
         low = math.floor(math.log10(min(shown_m, default=1e-3)))
         return cls(low, max(math.ceil(math.log10(max(shown_m, default=1.0))), low + 1))
 
     def share(self, size_m: float) -> float:
         """How far along the axis, 0 to 1."""
-        return (math.log10(max(size_m, SMALLEST_SHOWN_M)) - self.low) / (self.high - self.low)
+        return (math.log10(max(size_m, MIN_SHOWN_M)) - self.low) / (self.high - self.low)
 
     def labelled_m(self) -> list[float]:
         """The decades to be labelled, all of them unless there are too many."""
-        step = math.ceil((self.high - self.low) / MOST_LABELS)
+        step = math.ceil((self.high - self.low) / MAX_LABELS)
         return [10.0**decade for decade in range(self.low, self.high + 1, step)]
 
 
@@ -66,13 +66,13 @@ def error_plot(variants: Sequence[VariantScore]) -> str:
     def y(error_m: float) -> float:
         return TOP + HEIGHT * (1 - decades.share(error_m))
 
-    radius = 3 if frames * len(variants) <= MOST_LARGE_MARKS else 2
+    radius = 3 if frames * len(variants) <= MAX_LARGE_MARKS else 2
     parts = []
     for decade_m in decades.labelled_m():
         parts.append(line(LEFT, y(decade_m), WIDTH - RIGHT, y(decade_m), "rule"))
         parts.append(text(LEFT - 8, y(decade_m) + 4, length_text(decade_m), "end"))
     steps = (digit * 10**decade for decade in itertools.count() for digit in (1, 2, 5))
-    ticks = range(0, frames, next(step for step in steps if MOST_LABELS * step >= frames))
+    ticks = range(0, frames, next(step for step in steps if MAX_LABELS * step >= frames))
     parts += [text(x(frame), bottom + 16, str(frame), "middle") for frame in ticks]
     parts.append(text(LEFT + INNER / 2, bottom + 34, "frame", "middle"))
     parts.append(text(LEFT - 20, (lanes_top + bottom) / 2 + 4, "failed", "end"))

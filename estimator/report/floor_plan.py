@@ -11,7 +11,7 @@ WIDTH = 460.0
 BORDER = 12.0
 
 
-def plan(room_m: Triple, leds_m: Sequence[Triple], variant: VariantScore, index: int) -> str:
+def floor_plan(room_m: Triple, leds_m: Sequence[Triple], variant: VariantScore, index: int) -> str:
     """The room, x right and y up: LEDs, true positions (rings), estimates (marks) and the errors between."""
     scale = (WIDTH - 2 * BORDER) / room_m[0]
     height = room_m[1] * scale + 2 * BORDER

@@ -19,12 +19,12 @@ from estimator.evaluate.score_table import (
     pair_cells,
 )
 from estimator.report.figures import distribution_plot, error_plot, frames_with_bound
-from estimator.report.floor_plan import outside, plan
+from estimator.report.floor_plan import floor_plan, outside
 from estimator.report.svg import key, style_of_variants
 
 # Pictures are to get an impression; a page of thousands of them would open nowhere.
-MOST_PREVIEWS = 12
-MOST_LARGE_PLANS = 6
+MAX_PREVIEWS = 12
+MAX_LARGE_PLANS = 6
 
 STYLE = """
 :root { color-scheme: light dark; --ink: #1c2024; --soft: #667078; --line: #dde2e6; --paper: #fff; --back: #f4f6f8;
@@ -105,7 +105,7 @@ def _dataset(folder: Path, scores: Scores) -> str:
     x, y, z = scores.room_m
     leds_m = [led.position_m for led in scores.led_map]
     plans = "\n".join(
-        f"<figure>{plan(scores.room_m, leds_m, variant, index)}<figcaption>{_name(scores, index)}"
+        f"<figure>{floor_plan(scores.room_m, leds_m, variant, index)}<figcaption>{_name(scores, index)}"
         f"{_outside_note(scores, variant)}</figcaption></figure>"
         for index, variant in enumerate(scores.variants)
     )
@@ -131,7 +131,7 @@ def _dataset(folder: Path, scores: Scores) -> str:
 <div class="card"><p>{legend}</p>{distribution_plot(scores.variants)}</div>
 <h3>The room from above</h3>
 <p>Yellow: LEDs. Rings: true positions. Marks: estimates, joined to the truth. Crosses: failed frames.</p>
-<div class="card grid{" many" if len(scores.variants) > MOST_LARGE_PLANS else ""}">{plans}</div>
+<div class="card grid{" many" if len(scores.variants) > MAX_LARGE_PLANS else ""}">{plans}</div>
 {_previews(folder)}
 </section>"""
 
@@ -218,7 +218,7 @@ def _previews(folder: Path) -> str:
     paths = sorted((folder / "previews").glob("*.png"))
     if not paths:
         return ""
-    count = min(len(paths), MOST_PREVIEWS)
+    count = min(len(paths), MAX_PREVIEWS)
     figures = []
     for path in (paths[index * len(paths) // count] for index in range(count)):
         data = base64.b64encode(path.read_bytes()).decode()

@@ -21,20 +21,20 @@ Pose = tuple[Floats, Floats]
 """R_cam_world (3, 3) and the projection centre (3,), world metres."""
 
 # With three LEDs up to four poses fit exactly.
-FEWEST_LEDS = 4
+MIN_LEDS = 4
 # Tilts tried for a start, on each axis, and how many of the minima among them are followed. From exact pixels of
 # Table 1's four LEDs, nearly on a line, 3 of 1000 poses up to 60 deg still end elsewhere (64 from one start, 30 in
 # steps of 15 deg); of LEDs on a square none does.
 START_STEP_DEG = 7.5
 START_REACH_DEG = 75.0
-MOST_STARTS = 4
-MOST_STEPS = 50
+MAX_STARTS = 4
+MAX_STEPS = 50
 # A step this small, in radians and of the distance, is the last: the next would be its square, or noise times it.
 TOLERANCE = 1e-9
 # Directions closer to the axis than this have the slopes of the axis itself, to 1e-12.
 ON_AXIS = 1e-6
 # A levelled ray that rises less would meet the ceiling some ten room heights away.
-LOWEST_SINE = 0.1
+MIN_SINE = 0.1
 
 
 def position_by_collinearity(leds_m: Floats, image: Floats, projection: Projection) -> Floats:
@@ -45,7 +45,7 @@ def position_by_collinearity(leds_m: Floats, image: Floats, projection: Projecti
     smallest sum of squares. Raises EstimationFailure for fewer than four LEDs, LEDs on one line, and where none is
     left.
     """
-    check_pattern(leds_m, needed=FEWEST_LEDS, flat=False)
+    check_pattern(leds_m, needed=MIN_LEDS, flat=False)
     best_error, best = np.inf, None
     for start in starts(leds_m, _directions(image, projection)):
         pose = gauss_newton(leds_m, image, projection, start)
@@ -70,7 +70,7 @@ def starts(leds_m: Floats, directions: Floats) -> list[Pose]:
     axis = np.radians(np.arange(-START_REACH_DEG, START_REACH_DEG + START_STEP_DEG / 2, START_STEP_DEG))
     levelling = np.array([[rotation(tilt_x, tilt_y) for tilt_y in axis] for tilt_x in axis])
     rays = directions @ levelling
-    up = (rays[..., 2] >= LOWEST_SINE).all(axis=-1)
+    up = (rays[..., 2] >= MIN_SINE).all(axis=-1)
     spots = (rays[..., 0] + 1j * rays[..., 1]) / np.where(up[..., None], rays[..., 2], 1.0)
     centred = spots - spots.mean(axis=-1, keepdims=True)
     ceiling = leds_m[:, 0] + 1j * leds_m[:, 1]
@@ -83,7 +83,7 @@ def starts(leds_m: Floats, directions: Floats) -> list[Pose]:
     misfits[~up] = np.inf
     lowest = np.argwhere(up & (misfits == minimum_filter(misfits, size=3, mode="nearest")))
     poses = []
-    for i, j in sorted(lowest.tolist(), key=lambda at: float(misfits[at[0], at[1]]))[:MOST_STARTS]:
+    for i, j in sorted(lowest.tolist(), key=lambda at: float(misfits[at[0], at[1]]))[:MAX_STARTS]:
         place = ceiling.mean() - spots[i, j].mean() / scale[i, j]
         c, s = scale[i, j].real / abs(scale[i, j]), -scale[i, j].imag / abs(scale[i, j])
         turn = levelling[i, j] @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
@@ -94,7 +94,7 @@ def starts(leds_m: Floats, directions: Floats) -> list[Pose]:
 def gauss_newton(leds_m: Floats, image: Floats, projection: Projection, start: Pose) -> Pose | None:
     """The pose at which the sum of squared differences from `image` (n, 2) stands still, or None where none is met."""
     R_cam_world, position_m = start
-    for _ in range(MOST_STEPS):
+    for _ in range(MAX_STEPS):
         seen = (leds_m - position_m) @ R_cam_world.T
         expected, slopes = image_of(seen, projection)
         imaged = np.isfinite(expected).all() and np.isfinite(slopes).all()

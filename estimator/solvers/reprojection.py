@@ -27,15 +27,15 @@ from estimator.camera.leveling import tilt_from_gravity, tilt_sigmas
 from estimator.camera.undistort import lens_pixels, pinhole_pixels
 from estimator.errors import EstimationFailure
 from estimator.io.dataset import Camera, DeviceFrame
-from estimator.spots.identify import Sighting
+from estimator.spots.identify import Correspondence
 
 Floats = NDArray[np.float64]
 
 # No centroid is better: keeps a covariance of nothing, of a spot without noise, from weighing without end.
-BEST_CENTROID_PX = 1e-4
+MIN_CENTROID_SIGMA_PX = 1e-4
 # Beyond so many standard deviations a robust fit weighs less and less.
 ROBUST_SIGMA = 3.0
-MOST_EVALUATIONS = 60
+MAX_EVALUATIONS = 60
 # Over 4 s^2 = r^2 for a disc, see above.
 SQUARE_TO_DISC = 4.0 / 3.0
 
@@ -100,15 +100,15 @@ class Fit:
         return float(self.spots_chi2.sum()) + self.tilt_chi2
 
 
-def observations(frame: DeviceFrame, seen: Sequence[Sighting]) -> Observations:
+def observations(frame: DeviceFrame, seen: Sequence[Correspondence]) -> Observations:
     """Spots and gravity as a fit takes them; a spot that the lens cannot be taken out of is left out.
 
     Raises EstimationFailure where gravity reads nothing or no spot is left.
     """
     camera = frame.camera
-    pixels = np.array([(sighting.spot.u_px, sighting.spot.v_px) for sighting in seen]).reshape(-1, 2)
-    covariance_px2 = np.array([sighting.spot.covariance_px2 for sighting in seen]).reshape(-1, 2, 2)
-    leds = [sighting.led for sighting in seen]
+    pixels = np.array([(correspondence.spot.u_px, correspondence.spot.v_px) for correspondence in seen]).reshape(-1, 2)
+    covariance_px2 = np.array([correspondence.spot.covariance_px2 for correspondence in seen]).reshape(-1, 2, 2)
+    leds = [correspondence.led for correspondence in seen]
     try:
         out, slope = _pinhole(pixels, camera)
     except EstimationFailure:
@@ -119,7 +119,7 @@ def observations(frame: DeviceFrame, seen: Sequence[Sighting]) -> Observations:
         out, slope = _pinhole(pixels, camera)
     from_pixels = np.linalg.inv(camera.matrix())
     to_plane = from_pixels[:2, :2] @ slope
-    covariance = to_plane @ (covariance_px2 + BEST_CENTROID_PX**2 * np.eye(2)) @ to_plane.transpose(0, 2, 1)
+    covariance = to_plane @ (covariance_px2 + MIN_CENTROID_SIGMA_PX**2 * np.eye(2)) @ to_plane.transpose(0, 2, 1)
     lift = [led.radius_m**2 * (SQUARE_TO_DISC if led.shape == "square" else 1.0) for led in leds]
     tilt = tilt_from_gravity(frame.accelerometer_m_s2)
     return Observations(
@@ -160,7 +160,7 @@ def projected(pose: Pose, leds_m: Floats, lift_m2: Floats) -> tuple[Floats, Floa
     return seen[:, :2] / depth[:, None], seen[:, 2]
 
 
-def straightened(seen: Observations, pose: Pose) -> Observations:
+def corrected_for_eccentricity(seen: Observations, pose: Pose) -> Observations:
     """The same with centroids as if the lens had not bent the spots, by the sizes they have from a pose.
 
     Each LED is four points, sqrt(2) s from its centre along x and y, which have its s^2. Their images weigh as the
@@ -218,7 +218,7 @@ def fit(seen: Observations, start: Pose, loss: Literal["linear", "soft_l1"] = "l
                 loss=loss,
                 f_scale=ROBUST_SIGMA,
                 x_scale="jac",
-                max_nfev=MOST_EVALUATIONS,
+                max_nfev=MAX_EVALUATIONS,
             )
             # Of a robust loss it would not be the information.
             slope = slopes(found.x)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from estimator.errors import EstimationFailure
-from estimator.solvers.reprojection import Fit, Observations, Pose, fit, projected, straightened
+from estimator.solvers.reprojection import Fit, Observations, Pose, corrected_for_eccentricity, fit, projected
 
 Floats = NDArray[np.float64]
 
@@ -18,9 +18,9 @@ CHANCE = 1e-6
 # Only what is further off than chance and this make it is put down to a wrong identity.
 MODEL_ERROR_PX = 0.1
 # With fewer, a spot that does not fit cannot be told from those that do.
-FEWEST_WITHOUT_DOUBT = 3
-FEWEST_AMONG_DOUBTFUL = 4
-MOST_ROBUST = 3
+MIN_WITHOUT_DOUBT = 3
+MIN_AMONG_DOUBTFUL = 4
+MAX_ROBUST = 3
 NEAR_RAD = 0.01
 NEAR_M = 0.1
 
@@ -32,7 +32,7 @@ class Consensus:
     best: Fit
     others: tuple[Fit, ...]
     """Other local minima over the same spots, from the best on."""
-    believed: NDArray[np.bool_]
+    inliers: NDArray[np.bool_]
     """Of the spots, (n,)."""
     gravity: bool
     """Whether its reading took part."""
@@ -56,7 +56,7 @@ def consensus(seen: Observations, starts: Sequence[Pose], more_starts: Callable[
     if seen.camera.projection == "perspective" and seen.camera.distortion is None:
         return agreed
     poses = [found.pose for found in (agreed.best, *agreed.others)]
-    return _consensus(straightened(seen, agreed.best.pose), poses, more_starts)
+    return _consensus(corrected_for_eccentricity(seen, agreed.best.pose), poses, more_starts)
 
 
 def _consensus(
@@ -67,24 +67,24 @@ def _consensus(
     pixel_rad = 1 / seen.camera.K[0][0]
     gravity = bool(np.isfinite(seen.tilt_sigma_rad).all())
     everything = np.ones(len(seen.leds_m), dtype=bool)
-    if len(everything) < FEWEST_WITHOUT_DOUBT:
-        why = f"LEDs identified: {len(everything)}, needed: {FEWEST_WITHOUT_DOUBT}"
+    if len(everything) < MIN_WITHOUT_DOUBT:
+        why = f"LEDs identified: {len(everything)}, needed: {MIN_WITHOUT_DOUBT}"
         raise EstimationFailure("position", why)
     fits = minima(seen, starts)
     if fits and _explains(fits[0], seen, pixel_rad):
         return Consensus(fits[0], fits[1:], everything, gravity)
-    for robust in minima(seen, [*starts, *more_starts()], robust=True)[:MOST_ROBUST]:
-        believed = _agrees(robust, seen, pixel_rad)
-        while believed.sum() >= FEWEST_AMONG_DOUBTFUL and 2 * believed.sum() > len(believed):
-            chosen = seen.only(believed)
+    for robust in minima(seen, [*starts, *more_starts()], robust=True)[:MAX_ROBUST]:
+        inliers = _agrees(robust, seen, pixel_rad)
+        while inliers.sum() >= MIN_AMONG_DOUBTFUL and 2 * inliers.sum() > len(inliers):
+            chosen = seen.only(inliers)
             fits = minima(chosen, [robust.pose, *starts])
             if fits and _explains(fits[0], chosen, pixel_rad):
-                return Consensus(fits[0], fits[1:], believed, gravity)
+                return Consensus(fits[0], fits[1:], inliers, gravity)
             if not fits or _agrees(fits[0], chosen, pixel_rad).all():
                 break
             # One at a time: the worst draws the fit, and the others with it, to itself.
-            believed = believed.copy()
-            believed[np.flatnonzero(believed)[np.argmax(fits[0].spots_chi2)]] = False
+            inliers = inliers.copy()
+            inliers[np.flatnonzero(inliers)[np.argmax(fits[0].spots_chi2)]] = False
     raise EstimationFailure("position", "no pose explains gravity and most of the spots")
 
 

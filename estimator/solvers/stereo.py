@@ -6,8 +6,8 @@ from numpy.typing import NDArray
 from estimator.camera.undistort import pinhole_pixels
 from estimator.errors import EstimationFailure
 from estimator.io.dataset import DeviceFrame
-from estimator.spots.correspondences import centroids_px, sightings
-from estimator.spots.identify import Sighting
+from estimator.spots.correspondences import centroids_px, correspondences
+from estimator.spots.identify import Correspondence
 
 Floats = NDArray[np.float64]
 
@@ -17,32 +17,32 @@ PARALLEL = 1e-6
 BESIDE = 1e-6
 
 
-def led_vectors(frame: DeviceFrame) -> tuple[list[Sighting], Floats]:
+def led_vectors(frame: DeviceFrame) -> tuple[list[Correspondence], Floats]:
     """LEDs that both cameras see, and the vectors to them, (n, 3) metres, in the axes of this frame's camera.
 
     Spots are centroids of the raw images. Raises EstimationFailure where there is no partner or nothing in common.
     """
-    mate, baseline_m = partner(frame)
-    there = {sighting.led.id: sighting for sighting in sightings(mate)}
-    seen = [sighting for sighting in sightings(frame) if sighting.led.id in there]
+    other, baseline_m = partner(frame)
+    there = {correspondence.led.id: correspondence for correspondence in correspondences(other)}
+    seen = [correspondence for correspondence in correspondences(frame) if correspondence.led.id in there]
     if not seen:
         raise EstimationFailure("stereo", "no LED is seen by both cameras")
-    image_there = _image(mate, [there[sighting.led.id] for sighting in seen])
+    image_there = _image(other, [there[correspondence.led.id] for correspondence in seen])
     return seen, triangulated(_image(frame, seen), image_there, baseline_m)
 
 
 def partner(frame: DeviceFrame) -> tuple[DeviceFrame, Floats]:
     """The frame's mate from the parallel camera furthest beside it, and where that is, (2,) metres, across the axis."""
-    if not frame.mates:
+    if not frame.other_cameras:
         raise EstimationFailure("stereo", "no second camera took this shot")
     turn = np.array(frame.camera.R_cam_rig)
     best, best_m = None, np.zeros(2)
-    for mate in frame.mates:
-        offset_m = turn @ np.subtract(mate.camera.offset_m, frame.camera.offset_m)
-        parallel = np.abs(np.array(mate.camera.R_cam_rig) @ turn.T - np.eye(3)).max() <= PARALLEL
+    for other in frame.other_cameras:
+        offset_m = turn @ np.subtract(other.camera.offset_m, frame.camera.offset_m)
+        parallel = np.abs(np.array(other.camera.R_cam_rig) @ turn.T - np.eye(3)).max() <= PARALLEL
         beside = abs(offset_m[2]) <= BESIDE * np.linalg.norm(offset_m)
         if parallel and beside and np.linalg.norm(offset_m) > np.linalg.norm(best_m):
-            best, best_m = mate, offset_m[:2]
+            best, best_m = other, offset_m[:2]
     if best is None:
         raise EstimationFailure("stereo", "no second camera is parallel to this one and beside it")
     return best, best_m
@@ -61,6 +61,6 @@ def triangulated(here: Floats, there: Floats, baseline_m: Floats) -> Floats:
     return np.asarray(np.column_stack([here, np.ones(len(here))]) * depth_m[:, None])
 
 
-def _image(frame: DeviceFrame, seen: list[Sighting]) -> Floats:
+def _image(frame: DeviceFrame, seen: list[Correspondence]) -> Floats:
     pixels = pinhole_pixels(centroids_px(seen), frame.camera)
     return np.asarray((np.column_stack([pixels, np.ones(len(seen))]) @ np.linalg.inv(frame.camera.matrix()).T)[:, :2])

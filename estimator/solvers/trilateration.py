@@ -10,10 +10,10 @@ from estimator.solvers.ranging import COMMON_HEIGHT_M
 Floats = NDArray[np.float64]
 
 # Width over length of the LEDs' pattern. Below this a position across the line is all noise; Table 1's LEDs have 0.083.
-NARROWEST_PATTERN = 0.01
+MIN_PATTERN_WIDTH = 0.01
 # Rahman's "small value" by which LEDs are moved in z; theirs is not known. Well above what rounding does to a range.
 SHIFT_M = 0.01
-FEWEST_FOR_ORIENTATION = 4
+MIN_FOR_ORIENTATION = 4
 
 
 def position_from_ranges(leds_m: Floats, ranges_m: Floats) -> Floats:
@@ -100,9 +100,9 @@ def _check_ceiling(leds_m: Floats, needed: int) -> None:
 def on_one_line(points_m: Floats) -> bool:
     """Whether points (n, 2) or (n, 3) are as good as on one line."""
     length, width = np.linalg.svd(points_m - points_m.mean(axis=0), compute_uv=False)[:2]
-    return bool(width <= NARROWEST_PATTERN * length)
+    return bool(width <= MIN_PATTERN_WIDTH * length)
 
 
 def fix_orientation(leds_m: Floats) -> bool:
     """Whether LEDs (n, 3) give the camera's orientation without gravity, and with one to spare."""
-    return len(leds_m) >= FEWEST_FOR_ORIENTATION and not on_one_line(leds_m)
+    return len(leds_m) >= MIN_FOR_ORIENTATION and not on_one_line(leds_m)

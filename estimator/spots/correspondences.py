@@ -7,13 +7,15 @@ from numpy.typing import NDArray
 
 from estimator.io.dataset import DeviceFrame
 from estimator.spots.detect import Readout, detect
-from estimator.spots.identify import Sighting, identify
+from estimator.spots.identify import Correspondence, identify
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
 
 
-def sightings(frame: DeviceFrame, denoise: Callable[[Image], Image] | None = None, reach_px: int = 0) -> list[Sighting]:
+def correspondences(
+    frame: DeviceFrame, denoise: Callable[[Image], Image] | None = None, reach_px: int = 0
+) -> list[Correspondence]:
     """The LEDs in a frame; `denoise` averages over `reach_px` pixels on each side. Raises EstimationFailure."""
     readouts = []
     for part in frame.parts:
@@ -27,11 +29,11 @@ def sightings(frame: DeviceFrame, denoise: Callable[[Image], Image] | None = Non
     return list(identify(spots, frame.spots, frame.leds))
 
 
-def led_positions_m(seen: Sequence[Sighting]) -> Floats:
+def led_positions_m(seen: Sequence[Correspondence]) -> Floats:
     """Centres of the LEDs seen, (n, 3), world metres."""
-    return np.array([sighting.led.position_m for sighting in seen])
+    return np.array([correspondence.led.position_m for correspondence in seen])
 
 
-def centroids_px(seen: Sequence[Sighting]) -> Floats:
+def centroids_px(seen: Sequence[Correspondence]) -> Floats:
     """Centroids (u, v) of their spots, (n, 2), continuous pixels with pixel centres at +0.5."""
-    return np.array([(sighting.spot.u_px, sighting.spot.v_px) for sighting in seen])
+    return np.array([(correspondence.spot.u_px, correspondence.spot.v_px) for correspondence in seen])

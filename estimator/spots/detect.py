@@ -24,20 +24,20 @@ THRESHOLD_SIGMA = 6.0
 # A demodulator's pixel is off by some 10 px: the lamp is within so many of it.
 NEAR_PX = 40.0
 # One bright pixel smoothed covers 25; smaller blobs are noise near the threshold.
-SMALLEST_BLOB_PX = 16
+MIN_BLOB_PX = 16
 # No scene has as many lamps: what is smaller than the thousand largest blobs is noise in an image that holds no lamp.
-MOST_BLOBS = 1000
+MAX_BLOBS = 1000
 # A blob over a tenth of the frame is a wall or a window.
-LARGEST_BLOB_OF_FRAME = 0.1
+MAX_BLOB_OF_FRAME = 0.1
 # Pieces of a blob above half level count as lamps of their own from a fifth of the largest piece's area on.
-SMALLEST_PIECE = 0.2
+MIN_PIECE = 0.2
 # A square of half side r has the second moments of a disc of radius 2 r / sqrt(3), and corners at sqrt(2) r.
 SQUARE_STRETCH = 1.5**0.5
 # Where a disc of blur has fallen to the threshold it has a fifth of its way to go.
 FRINGE_BEYOND = 1.25
 MARGIN_PX = 2.0
 RING_PX = 3.0
-LEAST_SIGNAL_TO_NOISE = 5.0
+MIN_SIGNAL_TO_NOISE = 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +126,7 @@ def detect(
     spots: list[Spot] = []
     for readout, image in zip(readouts, smooth, strict=True):
         stretch = SQUARE_STRETCH if corners else 1.0
-        ellipses = _ellipses(image, background_e, threshold_e, LARGEST_BLOB_OF_FRAME * sensor_px, stretch)
+        ellipses = _ellipses(image, background_e, threshold_e, MAX_BLOB_OF_FRAME * sensor_px, stretch)
         spots += _spots(readout, ellipses, reach_px)
     if not spots:
         raise EstimationFailure("detect", "no spot found")
@@ -196,22 +196,22 @@ def _ellipses(
         [outline for outline, (*_, parent) in zip(outlines, nesting[0], strict=True) if parent < 0] if outlines else []
     )
     ellipses = []
-    for outline in sorted(outer, key=len, reverse=True)[:MOST_BLOBS]:
+    for outline in sorted(outer, key=len, reverse=True)[:MAX_BLOBS]:
         left, top, width, height = cv2.boundingRect(outline)
-        window = np.s_[top : top + height, left : left + width]
+        roi = np.s_[top : top + height, left : left + width]
         column, row = outline[0, 0]
-        labels = cv2.connectedComponents(mask[window], connectivity=8)[1]
+        labels = cv2.connectedComponents(mask[roi], connectivity=8)[1]
         own = labels == labels[row - top, column - left]
-        values = smooth[window][own]
-        if not SMALLEST_BLOB_PX <= len(values) <= largest_px:
+        values = smooth[roi][own]
+        if not MIN_BLOB_PX <= len(values) <= largest_px:
             continue
         # The upper quartile is the plateau of a lamp; the maximum would be its noise.
         quartile = 3 * len(values) // 4
         half_e = background_e + (float(np.partition(values, quartile)[quartile]) - background_e) / 2
-        core = (own & (smooth[window] >= half_e)).view(np.uint8)
+        core = (own & (smooth[roi] >= half_e)).view(np.uint8)
         pieces = cv2.connectedComponents(core, connectivity=8)[1]
         areas = np.bincount(pieces.ravel())[1:]
-        for piece in np.flatnonzero(areas >= SMALLEST_PIECE * areas.max()).tolist():
+        for piece in np.flatnonzero(areas >= MIN_PIECE * areas.max()).tolist():
             ellipse = _ellipse(pieces == piece + 1, left, top, stretch)
             if len(areas) == 1:
                 box = np.array([left, top]), np.array([left + width, top + height])
@@ -255,9 +255,9 @@ def _measure(readout: Readout, ellipse: _Ellipse, others: list[_Ellipse], reach_
     reach = ellipse.half_extent(margin_px + RING_PX)
     left, top = np.maximum(np.floor(ellipse.centre_px - reach), 0).astype(int)
     right, bottom = np.minimum(np.ceil(ellipse.centre_px + reach), (width_px, height_px)).astype(int)
-    window = np.s_[top:bottom, left:right]
+    roi = np.s_[top:bottom, left:right]
     u_px, v_px = np.arange(left, right)[None, :] + 0.5, np.arange(top, bottom)[:, None] + 0.5
-    electrons = readout.image_e[window].astype(np.float64)
+    electrons = readout.image_e[roi].astype(np.float64)
 
     distance2 = ellipse.distance2(u_px, v_px, margin_px)
     support = distance2 <= 1
@@ -271,10 +271,10 @@ def _measure(readout: Readout, ellipse: _Ellipse, others: list[_Ellipse], reach_
 
     signal = np.where(support, electrons - background_e, 0.0)
     # Shot noise: a raw pixel's variance is its electrons.
-    raw_e = np.maximum(readout.raw_e[window].astype(np.float64), 0.0)
+    raw_e = np.maximum(readout.raw_e[roi].astype(np.float64), 0.0)
     variance = raw_e + readout.floor_e2 + (readout.prnu * raw_e) ** 2
     flux = signal.sum()
-    if flux <= LEAST_SIGNAL_TO_NOISE * np.sqrt(variance[support].sum()):
+    if flux <= MIN_SIGNAL_TO_NOISE * np.sqrt(variance[support].sum()):
         return None
     u, v = float(signal.sum(axis=0) @ u_px[0] / flux), float(signal.sum(axis=1) @ v_px[:, 0] / flux)
     # A centroid of box means is a sum over the raw pixels, whose weights are the box means of the centroid's weights.
@@ -295,5 +295,5 @@ def _measure(readout: Readout, ellipse: _Ellipse, others: list[_Ellipse], reach_
         area_px=ellipse.area_px,
         peak_e=float(electrons[brightest]),
         touches_border=bool((low < 0).any() or high[0] > width_px or high[1] > height_px),
-        saturated=bool(readout.clipped[window][inside].any()),
+        saturated=bool(readout.clipped[roi][inside].any()),
     )

@@ -16,14 +16,16 @@ CLEARANCE = 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class Sighting:
+class Correspondence:
     """An LED of the map and its spot in the image."""
 
     led: Led
     spot: Spot
 
 
-def identify(spots: Sequence[Spot], decoded: Sequence[DecodedSpot], leds: Mapping[int, Led]) -> tuple[Sighting, ...]:
+def identify(
+    spots: Sequence[Spot], decoded: Sequence[DecodedSpot], leds: Mapping[int, Led]
+) -> tuple[Correspondence, ...]:
     """Match spots and decoded identities one to one; the result is in the order of `decoded`.
 
     An identity gets the spot nearest to it, at most GATE_PX away, unless another spot is within CLEARANCE times that
@@ -39,13 +41,13 @@ def identify(spots: Sequence[Spot], decoded: Sequence[DecodedSpot], leds: Mappin
     nearest = np.argmin(distance_px, axis=1)
     inside = distance_px.min(axis=1) <= GATE_PX
     claimed = np.bincount(nearest[inside], minlength=len(spots))
-    sightings = []
+    correspondences = []
     for row, claim in enumerate(decoded):
         spot = spots[nearest[row]]
         second_px = np.delete(distance_px[row], nearest[row]).min(initial=np.inf)
         clear = second_px >= CLEARANCE * distance_px[row].min() and claimed[nearest[row]] == 1
         if inside[row] and clear and not spot.touches_border:
-            sightings.append(Sighting(leds[claim.led], spot))
-    if not sightings:
+            correspondences.append(Correspondence(leds[claim.led], spot))
+    if not correspondences:
         raise EstimationFailure("identify", "no whole spot matches a decoded identity")
-    return tuple(sightings)
+    return tuple(correspondences)

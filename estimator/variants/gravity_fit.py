@@ -18,8 +18,8 @@ from estimator.io.dataset import DeviceFrame
 from estimator.solvers.reprojection import Observations, Pose, observations, projected
 from estimator.solvers.robust_fit import Consensus, consensus
 from estimator.solvers.trilateration import fix_orientation
-from estimator.spots.correspondences import sightings
-from estimator.spots.identify import Sighting
+from estimator.spots.correspondences import correspondences
+from estimator.spots.identify import Correspondence
 from estimator.variants.pnp import candidates, in_a_plane
 from estimator.variants.up2p import upright_pose
 from estimator.variants.variant import Estimate, Variant
@@ -29,19 +29,19 @@ Floats = NDArray[np.float64]
 # Another minimum is taken for possible from one hundredth of the best one's likelihood on: exp(-9.21 / 2) = 1 / 100.
 AMBIGUOUS_CHI2 = 9.21
 # Every triple of 7 LEDs, or one of 12 with half of them wrong nine times over.
-MOST_TRIPLES = 72
+MAX_TRIPLES = 72
 # A pixel that a pose from three noisy spots still puts another spot within.
 TRIPLE_PX = 3.0
 BEST_TRIPLES = 3
-FEWEST_FOR_IPPE = 4
+MIN_FOR_IPPE = 4
 
 
 def gravity_fit(frame: DeviceFrame) -> Estimate:
     """Position, its covariance, and whether another position is nearly as likely; raises EstimationFailure."""
-    return fit_sightings(frame, sightings(frame))
+    return fit_correspondences(frame, correspondences(frame))
 
 
-def fit_sightings(frame: DeviceFrame, sighted: Sequence[Sighting]) -> Estimate:
+def fit_correspondences(frame: DeviceFrame, sighted: Sequence[Correspondence]) -> Estimate:
     """The same from spots that are identified already; of the frame, its camera and gravity count."""
     agreed = agreement(observations(frame, sighted))
     return Estimate(agreed.best.pose.position_m, covariance_m2=agreed.covariance_m2, ambiguous=ambiguous(agreed))
@@ -67,7 +67,7 @@ def ambiguous(agreed: Consensus) -> bool:
 def _starts(seen: Observations) -> list[Pose]:
     """Upright as gravity reads, and without it both of IPPE's poses, or SQPNP's for LEDs in no plane."""
     starts = [pose for pose in [upright_pose(seen)] if pose is not None]
-    if len(seen.leds_m) >= FEWEST_FOR_IPPE:
+    if len(seen.leds_m) >= MIN_FOR_IPPE:
         centre = seen.leds_m.mean(axis=0)
         method = cv2.SOLVEPNP_IPPE if in_a_plane(seen.leds_m) else cv2.SOLVEPNP_SQPNP
         model, image = np.ascontiguousarray(seen.leds_m - centre), np.ascontiguousarray(seen.plane)
@@ -80,9 +80,9 @@ def _from_triples(seen: Observations) -> list[Pose]:
     pixel_rad = 1 / seen.camera.K[0][0]
     count = len(seen.leds_m)
     triples = list(combinations(range(count), 3))
-    if len(triples) > MOST_TRIPLES:
+    if len(triples) > MAX_TRIPLES:
         generator = np.random.Generator(np.random.Philox(key=count))
-        triples = [triples[k] for k in generator.choice(len(triples), MOST_TRIPLES, replace=False)]
+        triples = [triples[k] for k in generator.choice(len(triples), MAX_TRIPLES, replace=False)]
     scored: list[tuple[float, int, Pose]] = []
     for triple in triples:
         chosen = list(triple)

@@ -15,21 +15,23 @@ from estimator.errors import EstimationFailure
 from estimator.io.dataset import DeviceFrame
 from estimator.solvers.ranging import PairLaw, law_of_sines, led_ranges, printed_eq3
 from estimator.solvers.trilateration import position_by_range_fit, position_by_shifted_leds, position_from_ranges
-from estimator.spots.correspondences import centroids_px, led_positions_m, sightings
+from estimator.spots.correspondences import centroids_px, correspondences, led_positions_m
 from estimator.spots.denoise import DENOISERS
-from estimator.spots.identify import Sighting
+from estimator.spots.identify import Correspondence
 from estimator.variants.options import read_options
 from estimator.variants.variant import Estimate, Variant
 
 Floats = NDArray[np.float64]
 
 
-def brightest_px(seen: Sequence[Sighting]) -> Floats:
+def brightest_px(seen: Sequence[Correspondence]) -> Floats:
     """Brightest pixels (u, v) of the spots, (n, 2), by their centres: what the paper takes."""
-    return np.array([(sighting.spot.brightest_u_px, sighting.spot.brightest_v_px) for sighting in seen])
+    return np.array(
+        [(correspondence.spot.brightest_u_px, correspondence.spot.brightest_v_px) for correspondence in seen]
+    )
 
 
-SPOTS: dict[str, Callable[[Sequence[Sighting]], Floats]] = {"centroid": centroids_px, "brightest": brightest_px}
+SPOTS: dict[str, Callable[[Sequence[Correspondence]], Floats]] = {"centroid": centroids_px, "brightest": brightest_px}
 LEVELS: dict[str, Callable[[float, float], Floats]] = {"corrected": rotation, "printed": printed_eq6}
 RANGES: dict[str, PairLaw] = {"corrected": law_of_sines, "printed": printed_eq3}
 POSITIONS: dict[str, Callable[[Floats, Floats], Floats]] = {
@@ -64,12 +66,12 @@ class Huynh2016:
     def __call__(self, frame: DeviceFrame) -> Estimate:
         """Denoise, find the LEDs, take the lens and the tilt out, ranges, position. Raises EstimationFailure."""
         denoiser, noise_e = DENOISERS[self.denoise], float(np.sqrt(frame.sensor.floor_e2()))
-        seen = sightings(frame, lambda raw_e: denoiser.apply(raw_e, noise_e), denoiser.reach_px)
+        seen = correspondences(frame, lambda raw_e: denoiser.apply(raw_e, noise_e), denoiser.reach_px)
         K, leds_m = frame.camera.matrix(), led_positions_m(seen)
         tilt = LEVELS[self.level](*tilt_from_gravity(frame.accelerometer_m_s2))
         level_px = level(pinhole_pixels(SPOTS[self.spot](seen), frame.camera), K, tilt)
         distances_m = led_ranges(level_px, K, leds_m, RANGES[self.ranges])
-        ranges_m = {sighting.led.id: float(d) for sighting, d in zip(seen, distances_m, strict=True)}
+        ranges_m = {correspondence.led.id: float(d) for correspondence, d in zip(seen, distances_m, strict=True)}
         try:
             return Estimate(POSITIONS[self.position](leds_m, distances_m), ranges_m)
         except EstimationFailure as failure:

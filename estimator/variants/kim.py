@@ -23,8 +23,8 @@ from estimator.variants.variant import Estimate, Variant
 Floats = NDArray[np.float64]
 
 # A tilt of 5 deg moves the answer by 0.09 of the depth, 0.2 m below a ceiling: no answer any more.
-MOST_TILT_DEG = 5.0
-FEWEST_LEDS = 2
+MAX_TILT_DEG = 5.0
+MIN_LEDS = 2
 
 
 def kim(frame: DeviceFrame) -> Estimate:
@@ -39,7 +39,7 @@ def kim(frame: DeviceFrame) -> Estimate:
 
 
 def _check_level(accelerometer_m_s2: tuple[float, float, float]) -> None:
-    if np.degrees(np.abs(tilt_from_gravity(accelerometer_m_s2)).max()) > MOST_TILT_DEG:
+    if np.degrees(np.abs(tilt_from_gravity(accelerometer_m_s2)).max()) > MAX_TILT_DEG:
         raise EstimationFailure("level", "the camera is tilted, and the method takes it to be parallel to the ceiling")
 
 
@@ -49,8 +49,8 @@ def position_from_vectors(leds_m: Floats, vectors_m: Floats) -> Floats:
     Yaw is the turn about z that takes the LEDs' offsets from their centre nearest to the vectors', in squares.
     Raises EstimationFailure for fewer than two LEDs.
     """
-    if len(leds_m) < FEWEST_LEDS:
-        raise EstimationFailure("position", f"LEDs identified: {len(leds_m)}, needed: {FEWEST_LEDS}")
+    if len(leds_m) < MIN_LEDS:
+        raise EstimationFailure("position", f"LEDs identified: {len(leds_m)}, needed: {MIN_LEDS}")
     led_m, vector_m = leds_m.mean(axis=0), vectors_m.mean(axis=0)
     a, v = (leds_m - led_m)[:, :2], (vectors_m - vector_m)[:, :2]
     yaw = np.arctan2((a[:, 1] * v[:, 0] - a[:, 0] * v[:, 1]).sum(), (a * v).sum())

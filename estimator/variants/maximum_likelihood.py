@@ -20,9 +20,9 @@ from estimator.camera.projection import POSE_PARAMETERS, TiltedPose, pose_of_rot
 from estimator.errors import EstimationFailure
 from estimator.io.dataset import DeviceFrame
 from estimator.pixels.likelihood import LedLight, Noise, led_light, misfit, score
-from estimator.pixels.measurements import EDGE_PX, Evidence, gather
+from estimator.pixels.measurements import EDGE_PX, Measurements, gather
 from estimator.solvers.reprojection import fit, observations
-from estimator.spots.correspondences import sightings
+from estimator.spots.correspondences import correspondences
 from estimator.variants.gravity_fit import agreement, ambiguous
 from estimator.variants.up2p import upright_pose
 from estimator.variants.variant import Estimate, Variant
@@ -31,24 +31,24 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-MOST_STEPS = 40
+MAX_STEPS = 40
 # Fisher's scoring stops after a step of a tenth of a standard deviation, squared: the next would be far shorter.
 SMALL_STEP = 1e-2
 # No LED moves further in one step: edges are where the model holds to first order.
-LONGEST_STEP_PX = 1.0
+MAX_STEP_PX = 1.0
 # A step that makes the mean deviance of a reading this many times greater was too long. Less may come from readings
 # that are left out or let in as their pixels get near to full.
 WORSE = 1.01
 # An LED has to stand out of its background by so many standard deviations of its amplitude, or it says nothing.
-LEAST_SIGNAL_TO_NOISE = 5.0
+MIN_SIGNAL_TO_NOISE = 5.0
 # LEDs whose chi2 is too great by this share of the worst one's go with it, and the rest are looked at again.
 AS_BAD = 0.25
 # Centroids are good to this, a model's error included: says which other LEDs' places are sure from the start.
 START_PX = 0.05
-FEWEST_FOR_CONSENSUS = 3
+MIN_FOR_CONSENSUS = 3
 STRAYED = "the likelihood has no maximum near where the spots are"
 # A position that the pixels leave open by more than this is none.
-WORST_SIGMA_M = 1.0
+MAX_SIGMA_M = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,19 +66,19 @@ def ml(frame: DeviceFrame) -> Estimate:
     The start is what `gravity_fit` makes of the spots' centroids, which also says whether it is ambiguous and whether
     the reading of gravity is to be believed; with two spots it is the pose that fits them and gravity.
     """
-    seen = observations(frame, sightings(frame))
-    believed, level, unsure = np.ones(len(seen.leds_m), dtype=bool), True, False
-    if len(seen.leds_m) < FEWEST_FOR_CONSENSUS:
+    seen = observations(frame, correspondences(frame))
+    inliers, level, unsure = np.ones(len(seen.leds_m), dtype=bool), True, False
+    if len(seen.leds_m) < MIN_FOR_CONSENSUS:
         upright = upright_pose(seen)
         if upright is None:
             raise EstimationFailure("position", "too few LEDs identified to fix a position")
         begin = fit(seen, upright).pose
     else:
         agreed = agreement(seen)
-        begin, believed, level, unsure = agreed.best.pose, agreed.believed, agreed.gravity, ambiguous(agreed)
+        begin, inliers, level, unsure = agreed.best.pose, agreed.inliers, agreed.gravity, ambiguous(agreed)
     gravity = Gravity.of(frame) if level else NO_GRAVITY
     start = pose_of_rotation(begin.position_m, begin.R_cam_world, frame.camera)
-    slopes = project(seen.leds_m[believed], start, frame.camera).slopes.reshape(-1, POSE_PARAMETERS)
+    slopes = project(seen.leds_m[inliers], start, frame.camera).slopes.reshape(-1, POSE_PARAMETERS)
     information = slopes.T @ slopes / START_PX**2 + gravity.information()
     found = maximize(frame, gravity, start, _covariance(information))
     return Estimate(found.pose.position_m, covariance_m2=found.covariance[:3, :3], ambiguous=unsure)
@@ -88,19 +88,19 @@ def maximize(frame: DeviceFrame, gravity: "Gravity", start: TiltedPose, covarian
     """Climb from a pose known to a covariance (6, 6). Raises EstimationFailure."""
     pose, left_out = start, set[int]()
     before: set[int] = set()
-    for _ in range(MOST_STEPS):
-        evidence = gather(frame, pose, covariance)
-        seen = {led.id for led in evidence.leds}
-        used = np.array([led.id not in left_out for led in evidence.leds])
-        climb = _climb(frame, evidence, gravity, used, pose)
+    for _ in range(MAX_STEPS):
+        measurements = gather(frame, pose, covariance)
+        seen = {led.id for led in measurements.leds}
+        used = np.array([led.id not in left_out for led in measurements.leds])
+        climb = _climb(frame, measurements, gravity, used, pose)
         while climb.settled and (bad := _unlike(climb)).any():
             used &= ~bad
-            climb = _climb(frame, evidence, gravity, used, climb.pose)
+            climb = _climb(frame, measurements, gravity, used, climb.pose)
         pose = climb.pose
-        left_out |= {led.id for led, use in zip(evidence.leds, used, strict=True) if not use}
+        left_out |= {led.id for led, use in zip(measurements.leds, used, strict=True) if not use}
         if climb.settled:
             covariance = _covariance(climb.information)
-            if not evidence.more or seen == before:
+            if not measurements.more or seen == before:
                 return Maximum(pose, covariance, tuple(sorted(seen - left_out)))
             # Now that more is known of the pose, more LEDs' places may be.
             before = seen
@@ -155,27 +155,27 @@ class _Climb:
     """By how much their chi2 is too much."""
 
 
-def _climb(frame: DeviceFrame, evidence: Evidence, gravity: Gravity, used: Mask, pose: TiltedPose) -> _Climb:
+def _climb(frame: DeviceFrame, measurements: Measurements, gravity: Gravity, used: Mask, pose: TiltedPose) -> _Climb:
     """Fisher's scoring with the LEDs used, (n,), until it stands or the images have left the gathered pixels."""
-    middles_m = np.array([led.position_m for led in evidence.leds])
-    origin = project(middles_m, evidence.pose, frame.camera).pixels
+    middles_m = np.array([led.position_m for led in measurements.leds])
+    origin = project(middles_m, measurements.pose, frame.camera).pixels
     noise = Noise.of(frame)
     light: LedLight | None = None
     step, reached, least = np.zeros(POSE_PARAMETERS), pose, np.inf
-    for _ in range(MOST_STEPS):
-        drawing = evidence.drawing if pose is evidence.pose else evidence.images.draw(pose)
-        now = led_light(evidence, drawing, used, noise, light)
-        surprise = now.deviance + gravity.deviance(pose) / len(evidence.cells)
+    for _ in range(MAX_STEPS):
+        drawing = measurements.drawing if pose is measurements.pose else measurements.images.draw(pose)
+        now = led_light(measurements, drawing, used, noise, light)
+        surprise = now.deviance + gravity.deviance(pose) / len(measurements.cells)
         if surprise > WORSE * least:  # too long a step: light is not linear in the pose
             step = step / 4
             pose = reached.moved(step)
             continue
         light, reached, least = now, pose, surprise
-        information, gradient = score(evidence, drawing, light)
+        information, gradient = score(measurements, drawing, light)
         information, gradient = information + gravity.information(), gradient + gravity.gradient(pose)
         step = _solved(information, gradient)
         middles = project(middles_m, pose, frame.camera)
-        step *= min(1.0, LONGEST_STEP_PX / max(float(np.linalg.norm(middles.slopes @ step, axis=1).max()), 1e-12))
+        step *= min(1.0, MAX_STEP_PX / max(float(np.linalg.norm(middles.slopes @ step, axis=1).max()), 1e-12))
         settled = float(step @ information @ step) < SMALL_STEP
         pose = pose.moved(step)
         inside = bool((np.linalg.norm(middles.pixels + middles.slopes @ step - origin, axis=1) < EDGE_PX - 1).all())
@@ -183,11 +183,13 @@ def _climb(frame: DeviceFrame, evidence: Evidence, gravity: Gravity, used: Mask,
             break
     else:
         raise EstimationFailure("fit", STRAYED)
-    count = len(evidence.leds)
+    count = len(measurements.leds)
     strongest = np.zeros(count)
-    np.maximum.at(strongest, evidence.led, light.signal_to_noise)
-    excess: Floats = np.asarray(np.bincount(evidence.led, misfit(evidence, drawing, light), count), dtype=np.float64)
-    return _Climb(pose, settled, information, used, used & (strongest < LEAST_SIGNAL_TO_NOISE), excess)
+    np.maximum.at(strongest, measurements.led, light.signal_to_noise)
+    excess: Floats = np.asarray(
+        np.bincount(measurements.led, misfit(measurements, drawing, light), count), dtype=np.float64
+    )
+    return _Climb(pose, settled, information, used, used & (strongest < MIN_SIGNAL_TO_NOISE), excess)
 
 
 def _solved(information: Floats, gradient: Floats) -> Floats:
@@ -202,7 +204,7 @@ def _solved(information: Floats, gradient: Floats) -> Floats:
 
 def _covariance(information: Floats) -> Floats:
     covariance = np.stack([_solved(information, unit) for unit in np.eye(POSE_PARAMETERS)])
-    if not np.trace(covariance[:3, :3]) < WORST_SIGMA_M**2:
+    if not np.trace(covariance[:3, :3]) < MAX_SIGMA_M**2:
         raise EstimationFailure("fit", "the LEDs that are seen do not fix a position")
     return (covariance + covariance.T) / 2
 

@@ -17,7 +17,7 @@ import numpy as np
 from estimator.errors import EstimationFailure
 from estimator.io.dataset import DeviceFrame
 from estimator.solvers.collinearity import position_by_collinearity
-from estimator.spots.correspondences import centroids_px, led_positions_m, sightings
+from estimator.spots.correspondences import centroids_px, correspondences, led_positions_m
 from estimator.variants.variant import Estimate, Variant
 
 
@@ -25,7 +25,7 @@ def nakazawa2013(frame: DeviceFrame) -> Estimate:
     """Position from the centroids of one frame of a fish-eye lens. May fail by name."""
     if frame.camera.projection != "equidistant":
         raise EstimationFailure("camera", "has a normal lens, needed a fish-eye")
-    seen = sightings(frame)
+    seen = correspondences(frame)
     on_sensor = np.column_stack([centroids_px(seen), np.ones(len(seen))]) @ np.linalg.inv(frame.camera.matrix()).T
     return Estimate(position_by_collinearity(led_positions_m(seen), on_sensor[:, :2], "equidistant"))
 

@@ -14,13 +14,13 @@ from estimator.camera.undistort import pinhole_pixels
 from estimator.errors import EstimationFailure
 from estimator.io.dataset import DeviceFrame
 from estimator.solvers.trilateration import check_pattern
-from estimator.spots.correspondences import centroids_px, led_positions_m, sightings
+from estimator.spots.correspondences import centroids_px, correspondences, led_positions_m
 from estimator.variants.variant import Estimate, Variant
 
 Floats = NDArray[np.float64]
 
 # Depth over length: from here on the planar solver starts from a wrong model.
-FLATTEST_PATTERN = 1e-3
+MIN_PATTERN_DETERMINANT = 1e-3
 
 
 def pnp(frame: DeviceFrame) -> Estimate:
@@ -39,7 +39,7 @@ def sqpnp(frame: DeviceFrame) -> Estimate:
 
 
 def _estimate(frame: DeviceFrame, methods: Sequence[int]) -> Estimate:
-    seen = sightings(frame)
+    seen = correspondences(frame)
     pixels = pinhole_pixels(centroids_px(seen), frame.camera)
     return Estimate(position_from_pixels(led_positions_m(seen), pixels, frame.camera.matrix(), methods))
 
@@ -79,7 +79,7 @@ def position_from_pixels(leds_m: Floats, pixels: Floats, K: Floats, methods: Seq
 def in_a_plane(leds_m: Floats) -> bool:
     """Whether a planar solver may take these LEDs (n, 3)."""
     length, _, depth = np.linalg.svd(leds_m - leds_m.mean(axis=0), compute_uv=False)
-    return bool(depth < FLATTEST_PATTERN * length)
+    return bool(depth < MIN_PATTERN_DETERMINANT * length)
 
 
 def candidates(model: Floats, image: Floats, method: int, refined: bool) -> list[tuple[Floats, Floats]]:

@@ -27,7 +27,7 @@ def rahman2011(frame: DeviceFrame) -> Estimate:
     """Position from ranges by disparity, by linear least squares. May fail by name."""
     seen, vectors_m = led_vectors(frame)
     distances_m = np.linalg.norm(vectors_m, axis=1)
-    ranges_m = {sighting.led.id: float(d) for sighting, d in zip(seen, distances_m, strict=True)}
+    ranges_m = {correspondence.led.id: float(d) for correspondence, d in zip(seen, distances_m, strict=True)}
     try:
         return Estimate(position_from_ranges(led_positions_m(seen), distances_m), ranges_m)
     except EstimationFailure as failure:

@@ -13,14 +13,14 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.camera.leveling import LOWEST_SINE, rotation
+from estimator.camera.leveling import MIN_SINE, rotation
 from estimator.errors import EstimationFailure
 from estimator.io.dataset import DeviceFrame
 from estimator.solvers.reprojection import Observations, Pose, observations, projected
 from estimator.solvers.robust_fit import consensus
 from estimator.solvers.trilateration import fix_orientation
-from estimator.spots.correspondences import sightings
-from estimator.spots.identify import Sighting
+from estimator.spots.correspondences import correspondences
+from estimator.spots.identify import Correspondence
 from estimator.variants.variant import Estimate, Variant
 
 try:
@@ -31,7 +31,7 @@ except ImportError:
 Floats = NDArray[np.float64]
 
 # Every pair of 16 LEDs.
-MOST_PAIRS = 120
+MAX_PAIRS = 120
 # Spots are counted for a pose up to this many standard deviations of the reading, and some pixels for their centroids.
 GATE_SIGMA = 3.0
 GATE_PX = 3.0
@@ -44,10 +44,10 @@ def up2p(frame: DeviceFrame) -> Estimate:
     """Upright two-point RANSAC and refinement; raises EstimationFailure, also where PoseLib is not installed."""
     if poselib is None:
         raise EstimationFailure("up2p", "PoseLib is not installed (pip install vlcrender[poselib])")
-    return fit_sightings(frame, sightings(frame))
+    return fit_correspondences(frame, correspondences(frame))
 
 
-def fit_sightings(frame: DeviceFrame, sighted: Sequence[Sighting]) -> Estimate:
+def fit_correspondences(frame: DeviceFrame, sighted: Sequence[Correspondence]) -> Estimate:
     """The same from spots that are identified already; of the frame, its camera and gravity count."""
     seen = observations(frame, sighted)
     starts = _from_pairs(seen)
@@ -60,12 +60,12 @@ def fit_sightings(frame: DeviceFrame, sighted: Sequence[Sighting]) -> Estimate:
 def _from_pairs(seen: Observations) -> list[Pose]:
     """The poses from two spots each that put most of the other spots about right, the best first."""
     pixel_rad = 1 / seen.camera.K[0][0]
-    level, above = _levelled(seen)
+    level, above = _leveled(seen)
     tilt = rotation(*seen.tilt_rad)
     pairs = list(combinations(np.flatnonzero(above).tolist(), 2))
-    if len(pairs) > MOST_PAIRS:
+    if len(pairs) > MAX_PAIRS:
         generator = np.random.Generator(np.random.Philox(key=len(pairs)))
-        pairs = [pairs[k] for k in generator.choice(len(pairs), MOST_PAIRS, replace=False)]
+        pairs = [pairs[k] for k in generator.choice(len(pairs), MAX_PAIRS, replace=False)]
     gate = GATE_SIGMA * float(seen.tilt_sigma_rad.max()) + GATE_PX * pixel_rad
     scored: list[tuple[float, int, Pose]] = []
     for pair in pairs:
@@ -85,7 +85,7 @@ def upright_pose(seen: Observations) -> Pose | None:
     With LEDs at one height the levelled plane is theirs turned by the yaw, made smaller by the height and moved, which
     is linear in complex numbers. The position is then the point nearest to all lines of sight.
     """
-    level, above = _levelled(seen)
+    level, above = _leveled(seen)
     if above.sum() < 2:
         return None
     rays, leds_m = level[above], seen.leds_m[above]
@@ -107,11 +107,11 @@ def upright_pose(seen: Observations) -> Pose | None:
     return Pose(R_cam_world, position_m)
 
 
-def _levelled(seen: Observations) -> tuple[Floats, NDArray[np.bool_]]:
+def _leveled(seen: Observations) -> tuple[Floats, NDArray[np.bool_]]:
     """Lines of sight with the tilt as read taken out, (n, 3) of unit length, and which of them go up."""
     rays = np.column_stack([seen.plane, np.ones(len(seen.plane))])
     rays = rays / np.linalg.norm(rays, axis=1, keepdims=True) @ rotation(*seen.tilt_rad)
-    return rays, rays[:, 2] > LOWEST_SINE
+    return rays, rays[:, 2] > MIN_SINE
 
 
 def _about_z(yaw: float) -> Floats:

@@ -16,7 +16,7 @@ from estimator.camera.undistort import pinhole_pixels
 from estimator.errors import EstimationFailure
 from estimator.io.dataset import DeviceFrame
 from estimator.solvers.collinearity import position_by_collinearity
-from estimator.spots.correspondences import centroids_px, led_positions_m, sightings
+from estimator.spots.correspondences import centroids_px, correspondences, led_positions_m
 from estimator.variants.variant import Estimate, Variant
 
 
@@ -24,7 +24,7 @@ def yoshino2008(frame: DeviceFrame) -> Estimate:
     """Position from the centroids of one frame of a normal lens, whose distortion is undone. May fail by name."""
     if frame.camera.projection != "perspective":
         raise EstimationFailure("camera", "has a fish-eye lens, needed a normal one")
-    seen = sightings(frame)
+    seen = correspondences(frame)
     pixels = pinhole_pixels(centroids_px(seen), frame.camera)
     image = (np.column_stack([pixels, np.ones(len(seen))]) @ np.linalg.inv(frame.camera.matrix()).T)[:, :2]
     return Estimate(position_by_collinearity(led_positions_m(seen), image, "perspective"))

@@ -21,12 +21,12 @@ Array = NDArray[np.float64]
 
 AIRY_TAIL = 0.01
 """Share of the light in the Airy pattern's rings that is left out, and made up for by the rest."""
-MOST_AIRY_PX = 150
+MAX_AIRY_PX = 150
 """How far the Airy pattern is followed at the most; at 1.2 um and f/16 it would leave out AIRY_TAIL there."""
 PARTS_OF_DISC = 12.0
 PARTS_OF_AIRY = 8.0
 """Parts across a pixel that a disc of 1 px and an Airy pattern of lambda N = 1 px take."""
-MOST_PARTS = 64
+MAX_PARTS = 64
 """A disc narrower than a part then is none: it takes up to 0.2 % of the light from a pixel at an edge."""
 
 
@@ -128,12 +128,12 @@ def split_for(camera: Camera, depth_m: float) -> int:
     4000 e beside a background of 24 e, the ceiling's beside a quickstart's LED (tested).
     """
     disc_px = float(defocus_diameter_px(camera, depth_m))
-    needed = PARTS_OF_DISC / disc_px**0.5 if disc_px > 1 / MOST_PARTS else 1.0
+    needed = PARTS_OF_DISC / disc_px**0.5 if disc_px > 1 / MAX_PARTS else 1.0
     if camera.psf == "diffraction":
         airy = PARTS_OF_AIRY / _airy_scale_px(camera) ** 0.9
         # light blurred twice is as smooth as the smoother of the two makes it
-        needed = min(needed, airy) if disc_px > 1 / MOST_PARTS else airy
-    return min(1 << max(0, int(np.ceil(np.log2(needed)))), MOST_PARTS)
+        needed = min(needed, airy) if disc_px > 1 / MAX_PARTS else airy
+    return min(1 << max(0, int(np.ceil(np.log2(needed)))), MAX_PARTS)
 
 
 def split_kernel(camera: Camera, depth_m: float) -> SplitKernel | None:
@@ -201,7 +201,7 @@ def _airy(scale_px: float, finer: int) -> Array:
 
     Encircled energy is 1 - 2 / (pi x) far out, on average, with x = pi r / (lambda N).
     """
-    reach_px = min(int(np.ceil(2 / (np.pi**2 * AIRY_TAIL) * scale_px)), MOST_AIRY_PX)
+    reach_px = min(int(np.ceil(2 / (np.pi**2 * AIRY_TAIL) * scale_px)), MAX_AIRY_PX)
     reach = reach_px * finer + finer // 2
     # a ring is lambda N wide: four nodes for each that a pixel holds, and four to start with
     nodes, weights = np.polynomial.legendre.leggauss(4 + int(np.ceil(4 / (scale_px * finer))))

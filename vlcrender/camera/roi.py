@@ -12,7 +12,7 @@ from vlcrender.camera.intrinsics import Camera
 from vlcrender.config.toml_model import Settings
 
 
-class LedWindows(Settings):
+class LedRegions(Settings):
     """Read out a window around each LED alone."""
 
     kind: Literal["leds"]
@@ -23,7 +23,7 @@ class LedWindows(Settings):
 
 
 @dataclass(frozen=True)
-class Window:
+class Roi:
     """A rectangle of pixels, `rows` x `columns` from pixel (row, column) of the sensor on; may reach beyond it."""
 
     row: int
@@ -57,56 +57,56 @@ class Window:
         v = np.arange(self.row, self.end_row, dtype=np.float64) + 0.5
         return u[None, :], v[:, None]
 
-    def grown(self, by_px: int) -> "Window":
+    def padded(self, by_px: int) -> "Roi":
         """The window with `by_px` pixels more on each side."""
-        return Window(self.row - by_px, self.column - by_px, self.rows + 2 * by_px, self.columns + 2 * by_px)
+        return Roi(self.row - by_px, self.column - by_px, self.rows + 2 * by_px, self.columns + 2 * by_px)
 
-    def overlaps(self, other: "Window") -> bool:
+    def overlaps(self, other: "Roi") -> bool:
         """Whether the two share a pixel."""
         down = self.row < other.end_row and other.row < self.end_row
         return down and self.column < other.end_column and other.column < self.end_column
 
-    def holds(self, other: "Window") -> bool:
+    def contains(self, other: "Roi") -> bool:
         """Whether every pixel of the other is in this one."""
         down = self.row <= other.row and other.end_row <= self.end_row
         return down and self.column <= other.column and other.end_column <= self.end_column
 
-    def around(self, other: "Window") -> "Window":
+    def union(self, other: "Roi") -> "Roi":
         """The smallest window that holds both."""
         row, column = min(self.row, other.row), min(self.column, other.column)
         rows = max(self.end_row, other.end_row) - row
-        return Window(row, column, rows, max(self.end_column, other.end_column) - column)
+        return Roi(row, column, rows, max(self.end_column, other.end_column) - column)
 
-    def common(self, other: "Window") -> "Window":
+    def intersection(self, other: "Roi") -> "Roi":
         """The pixels in both, which have to be some."""
         row, column = max(self.row, other.row), max(self.column, other.column)
         rows = min(self.end_row, other.end_row) - row
-        return Window(row, column, rows, min(self.end_column, other.end_column) - column)
+        return Roi(row, column, rows, min(self.end_column, other.end_column) - column)
 
-    def slices(self, inner: "Window") -> tuple[slice, slice]:
+    def slices(self, inner: "Roi") -> tuple[slice, slice]:
         """Where `inner` lies in an array that holds this window's pixels."""
         row, column = inner.row - self.row, inner.column - self.column
         return slice(row, row + inner.rows), slice(column, column + inner.columns)
 
 
-def led_windows(lit: Iterable[Window], camera: Camera, settings: LedWindows) -> tuple[Window, ...]:
+def led_regions(lit: Iterable[Roi], camera: Camera, settings: LedRegions) -> tuple[Roi, ...]:
     """Windows around the pixels that LEDs light, apart from each other, by first row, then column.
 
     Pixel (0, 0) alone where no LED lights any: a frame has to hold something.
     """
-    sensor = Window.of_sensor(camera)
+    sensor = Roi.of_sensor(camera)
     margin = int(np.ceil(settings.margin_px))
     # What is whole on the sensor is read out as by the real one, overscan or not.
-    grown = [w.grown(margin).common(sensor) if sensor.holds(w) else w.grown(margin) for w in lit]
-    return tuple(sorted(merged(grown), key=lambda w: (w.row, w.column))) or (Window(0, 0, 1, 1),)
+    padded = [w.padded(margin).intersection(sensor) if sensor.contains(w) else w.padded(margin) for w in lit]
+    return tuple(sorted(merged(padded), key=lambda w: (w.row, w.column))) or (Roi(0, 0, 1, 1),)
 
 
-def merged(windows: Iterable[Window]) -> list[Window]:
+def merged(regions: Iterable[Roi]) -> list[Roi]:
     """Windows that overlap become the one around them, until none do."""
-    apart: list[Window] = []
-    for window in windows:
-        while touching := next((w for w in apart if w.overlaps(window)), None):
+    apart: list[Roi] = []
+    for roi in regions:
+        while touching := next((w for w in apart if w.overlaps(roi)), None):
             apart.remove(touching)
-            window = window.around(touching)
-        apart.append(window)
+            roi = roi.union(touching)
+        apart.append(roi)
     return apart

@@ -17,9 +17,9 @@ from pathlib import Path
 
 from vlcrender.errors import InputError
 
-VARIANTS = ("llvm_ad_mono", "cuda_ad_mono")
+MITSUBA_VARIANTS = ("llvm_ad_mono", "cuda_ad_mono")
 """The first is taken where nothing is said. Monochromatic: numbers pass unchanged, so that a film holds cd/m2."""
-OLDEST_LLVM = 17
+MIN_LLVM = 17
 SYSTEM_FOLDERS = ("/usr/lib", "/usr/lib64", "/usr/local/lib", "/opt/homebrew/opt/llvm/lib", "/usr/local/opt/llvm/lib")
 
 
@@ -55,9 +55,9 @@ def find_llvm() -> Path:
     chosen = os.environ.get("DRJIT_LIBLLVM_PATH")
     if chosen:
         version = llvm_version(Path(chosen))
-        if version < OLDEST_LLVM:
+        if version < MIN_LLVM:
             raise InputError(
-                f"DRJIT_LIBLLVM_PATH={chosen}: is not a loadable LLVM {OLDEST_LLVM} or newer; "
+                f"DRJIT_LIBLLVM_PATH={chosen}: is not a loadable LLVM {MIN_LLVM} or newer; "
                 f"unset it, or install karellen-llvm-core (pip) or libllvm19 (Debian)"
             )
         return Path(chosen)
@@ -65,36 +65,36 @@ def find_llvm() -> Path:
     for path in candidates(Path(sys.prefix)):
         seen.append(path.name)
         # Names lie less often than they crash: a library whose name says 14 is not loaded at all.
-        if (_number_in(path.name) or OLDEST_LLVM) >= OLDEST_LLVM and llvm_version(path) >= OLDEST_LLVM:
+        if (_number_in(path.name) or MIN_LLVM) >= MIN_LLVM and llvm_version(path) >= MIN_LLVM:
             return path
     found = f"found only {', '.join(sorted(set(seen)))}" if seen else "none was found"
     raise InputError(
-        f"LLVM {OLDEST_LLVM} or newer is needed ({found}): install karellen-llvm-core with pip (x86-64 Linux) "
+        f"LLVM {MIN_LLVM} or newer is needed ({found}): install karellen-llvm-core with pip (x86-64 Linux) "
         f"or libllvm19 with apt, or point DRJIT_LIBLLVM_PATH at libLLVM"
     )
 
 
 def chosen_variant() -> str:
     """What VLCRENDER_VARIANT says, or the first of VARIANTS. Raises InputError for any other."""
-    variant = os.environ.get("VLCRENDER_VARIANT") or VARIANTS[0]
-    if variant not in VARIANTS:
-        raise InputError(f"VLCRENDER_VARIANT={variant}: allowed are {', '.join(VARIANTS)}")
+    variant = os.environ.get("VLCRENDER_VARIANT") or MITSUBA_VARIANTS[0]
+    if variant not in MITSUBA_VARIANTS:
+        raise InputError(f"VLCRENDER_VARIANT={variant}: allowed are {', '.join(MITSUBA_VARIANTS)}")
     return variant
 
 
-VARIANT = chosen_variant()
-if VARIANT.startswith("llvm"):
+MITSUBA_VARIANT = chosen_variant()
+if MITSUBA_VARIANT.startswith("llvm"):
     os.environ["DRJIT_LIBLLVM_PATH"] = str(find_llvm())
 
 import drjit as dr  # noqa: E402  the path has to be set first
 import mitsuba as mi  # noqa: E402
 
-if VARIANT.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
+if MITSUBA_VARIANT.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
     raise InputError(
-        f"VLCRENDER_VARIANT={VARIANT}: no CUDA device and driver that Dr.Jit can use are found; "
+        f"VLCRENDER_VARIANT={MITSUBA_VARIANT}: no CUDA device and driver that Dr.Jit can use are found; "
         f"unset it to render on the processor"
     )
-mi.set_variant(VARIANT)
+mi.set_variant(MITSUBA_VARIANT)
 
 
 def exact_math() -> AbstractContextManager[None]:

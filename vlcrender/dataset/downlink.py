@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vlcrender.rendering.expected_image import ViewPart
+from vlcrender.rendering.expected_image import ExpectedRegion
 
 ROUGH_PX = 10.0
 """Standard deviation of a decoded spot's pixel on the 4000-pixel-wide sensor; scales with the width."""
@@ -16,22 +16,22 @@ DECODABLE_FRACTION = 0.5
 
 
 def decoded_spots(
-    parts: Sequence[ViewPart], width_px: int, generator: np.random.Generator
+    parts: Sequence[ExpectedRegion], width_px: int, generator: np.random.Generator
 ) -> list[dict[str, int | float]]:
     """Identities with rough pixels, one dict (led, u_px, v_px) a decoded LED, sorted by LED id.
 
     `width_px` is the whole sensor's. A rough pixel stays in the window that shows its LED.
     """
     sigma = ROUGH_PX * width_px / 4000
-    seen = ((patch, part.window) for part in parts for patch in part.patches)
+    seen = ((patch, part.roi) for part in parts for patch in part.patches)
     spots: list[dict[str, int | float]] = []
-    for patch, window in sorted(seen, key=lambda pair: pair[0].led_id):
+    for patch, roi in sorted(seen, key=lambda pair: pair[0].led_id):
         error_u, error_v = sigma * generator.standard_normal(2)
         u, v = patch.center_px
-        inside = window.column <= u < window.end_column and window.row <= v < window.end_row
+        inside = roi.column <= u < roi.end_column and roi.row <= v < roi.end_row
         if patch.imaged_fraction < DECODABLE_FRACTION or not inside:
             continue
-        rough_u = float(np.clip(u + error_u, window.column, window.end_column))
-        rough_v = float(np.clip(v + error_v, window.row, window.end_row))
+        rough_u = float(np.clip(u + error_u, roi.column, roi.end_column))
+        rough_v = float(np.clip(v + error_v, roi.row, roi.end_row))
         spots.append({"led": patch.led_id, "u_px": rough_u, "v_px": rough_v})
     return spots

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from vlcrender.camera.distortion import Distortion
 from vlcrender.camera.intrinsics import Camera
 from vlcrender.camera.rig import Mounted
-from vlcrender.camera.roi import Window
+from vlcrender.camera.roi import Roi
 from vlcrender.config.toml_model import Settings, check
 from vlcrender.errors import InputError
 from vlcrender.scene.loader import Leds
@@ -27,7 +27,7 @@ from vlcrender.scene.loader import Leds
 FRAMES, EXPECTED, PREVIEWS, PROCESSED = "frames", "expected", "previews", "processed"
 """Folders with a file of each frame; the last three where asked for."""
 PREVIEW_PX = 800
-Shown = tuple[Window, NDArray[np.uint32] | NDArray[np.float32]]
+Shown = tuple[Roi, NDArray[np.uint32] | NDArray[np.float32]]
 """A window and its pixels (rows, columns)."""
 SPOT = pa.struct([("led", pa.int64()), ("u_px", pa.float64()), ("v_px", pa.float64())])
 FRAMES_SCHEMA = pa.schema(
@@ -155,7 +155,7 @@ def led_map(leds: Leds) -> tuple[LedMapEntry, ...]:
     )
 
 
-def write_exr(path: Path, images: Sequence[Shown], sensor: Window, attributes: Mapping[str, Any]) -> str:
+def write_exr(path: Path, images: Sequence[Shown], sensor: Roi, attributes: Mapping[str, Any]) -> str:
     """Write windows of a sensor, one channel (Y), losslessly and return the file's SHA-256.
 
     The file appears whole or not at all. Raises InputError where it cannot be written.
@@ -168,8 +168,8 @@ def write_exr(path: Path, images: Sequence[Shown], sensor: Window, attributes: M
     }
     names = [f"window {number}" for number in range(len(images))] if len(images) > 1 else [""]
     parts = [
-        OpenEXR.Part({**header, "dataWindow": _box(window)}, {"Y": np.ascontiguousarray(image)}, name)
-        for name, (window, image) in zip(names, images, strict=True)
+        OpenEXR.Part({**header, "dataWindow": _box(roi)}, {"Y": np.ascontiguousarray(image)}, name)
+        for name, (roi, image) in zip(names, images, strict=True)
     ]
     partial = path.with_suffix(".partial")
     try:
@@ -182,18 +182,18 @@ def write_exr(path: Path, images: Sequence[Shown], sensor: Window, attributes: M
     return digest
 
 
-def _box(window: Window) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+def _box(roi: Roi) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """First and last pixel, (column, row) each, as EXR has it."""
-    first = np.array([window.column, window.row], dtype=np.int32)
-    return first, first + np.array([window.columns - 1, window.rows - 1], dtype=np.int32)
+    first = np.array([roi.column, roi.row], dtype=np.int32)
+    return first, first + np.array([roi.columns - 1, roi.rows - 1], dtype=np.int32)
 
 
 @dataclass(frozen=True)
 class ExrPart:
     """What one part of an EXR file holds: its window, the sensor's, and the type of its pixels."""
 
-    window: Window
-    sensor: Window
+    roi: Roi
+    sensor: Roi
     dtype: np.dtype[Any]
 
 
@@ -203,8 +203,8 @@ def read_exr_parts(path: Path) -> list[ExrPart]:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             return [
                 ExrPart(
-                    _window(part.header["dataWindow"]),
-                    _window(part.header["displayWindow"]),
+                    _roi(part.header["dataWindow"]),
+                    _roi(part.header["displayWindow"]),
                     part.channels["Y"].pixels.dtype,
                 )
                 for part in file.parts
@@ -213,9 +213,9 @@ def read_exr_parts(path: Path) -> list[ExrPart]:
         raise InputError(f"{path}: cannot be read as an EXR with a channel Y: {error}") from None
 
 
-def _window(box: tuple[NDArray[np.int32], NDArray[np.int32]]) -> Window:
+def _roi(box: tuple[NDArray[np.int32], NDArray[np.int32]]) -> Roi:
     (column, row), (last_column, last_row) = (corner.tolist() for corner in box)
-    return Window(row, column, last_row - row + 1, last_column - column + 1)
+    return Roi(row, column, last_row - row + 1, last_column - column + 1)
 
 
 def exr_attributes(camera: Camera, camera_name: str, exposure_s: float, frame: int) -> dict[str, Any]:
@@ -232,21 +232,21 @@ def exr_attributes(camera: Camera, camera_name: str, exposure_s: float, frame: i
     }
 
 
-def write_preview(path: Path, images: Sequence[Shown], sensor: Window, white_dn: int, black_dn: int = 0) -> None:
+def write_preview(path: Path, images: Sequence[Shown], sensor: Roi, white_dn: int, black_dn: int = 0) -> None:
     """Write a small grey picture: block means above the black level, gamma 2.2.
 
     It shows the sensor and all windows; what was not read out is black.
     """
     whole = sensor
-    for window, _ in images:
-        whole = whole.around(window)
+    for roi, _ in images:
+        whole = whole.union(roi)
     block = max(1, -(-max(whole.columns, whole.rows) // PREVIEW_PX))
     sums = np.zeros((-(-whole.rows // block), -(-whole.columns // block)))
-    for window, image in images:
-        row, column = window.row - whole.row, window.column - whole.column
+    for roi, image in images:
+        row, column = roi.row - whole.row, roi.column - whole.column
         before, after = (
             (row % block, column % block),
-            (-(row + window.rows) % block, -(column + window.columns) % block),
+            (-(row + roi.rows) % block, -(column + roi.columns) % block),
         )
         padded = np.pad(np.maximum(image, black_dn) - black_dn, tuple(zip(before, after, strict=True)))
         rows, columns = padded.shape[0] // block, padded.shape[1] // block

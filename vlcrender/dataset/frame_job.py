@@ -10,7 +10,7 @@ import numpy as np
 
 from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.rig import Mounted
-from vlcrender.camera.roi import Window
+from vlcrender.camera.roi import Roi
 from vlcrender.core.random_keys import stream
 from vlcrender.dataset.downlink import decoded_spots
 from vlcrender.dataset.files import EXPECTED, FRAMES, PREVIEWS, PROCESSED, exr_attributes, write_exr, write_preview
@@ -20,7 +20,7 @@ from vlcrender.dataset.recipe import Recipe
 from vlcrender.light.lightmap import bake
 from vlcrender.rendering.bayer import MosaicRenderer
 from vlcrender.rendering.crlb import position_bound_m2
-from vlcrender.rendering.expected_image import Image, View
+from vlcrender.rendering.expected_image import ExpectedImage, Image
 from vlcrender.rendering.renderer import Renderer
 from vlcrender.scene.loader import Scene, build_scene
 from vlcrender.scene.schema import SceneSettings
@@ -48,13 +48,13 @@ def make_frame(job: Job, frame: int) -> Record:
     directory = Path(job.directory)
     pose_number, shot, which = recipe.place_of_frame(frame)
     mounted = recipe.cameras[which]
-    camera, sensor = mounted.camera, Window.of_sensor(mounted.camera)
+    camera, sensor = mounted.camera, Roi.of_sensor(mounted.camera)
     seen = _seen(job, pose_number, which)
     main, pose, view, exposure_s, expected = seen.main, seen.pose, seen.view, seen.exposure_s, seen.expected
     noise = f"{recipe.seed}/{frame}/shot-noise"
     dn = [
-        (window, expose(recipe.sensor, image, noise, window.row, window.column, exposure_s, mounted.name))
-        for window, image in expected
+        (roi, expose(recipe.sensor, image, noise, roi.row, roi.column, exposure_s, mounted.name))
+        for roi, image in expected
     ]
     attributes = exr_attributes(camera, mounted.name, exposure_s, frame)
     file = f"{FRAMES}/{frame:06d}.exr"
@@ -76,7 +76,7 @@ def make_frame(job: Job, frame: int) -> Record:
         "sha256": digest,
         "camera": mounted.name,
         "exposure_s": exposure_s,
-        "capturable": all(sensor.holds(part.window) for part in view.parts),
+        "capturable": all(sensor.contains(part.roi) for part in view.parts),
         "accelerometer_m_s2": reading.tolist(),
         "spots": decoded_spots(view.parts, camera.width_px, stream(recipe.seed, frame, "demodulator")),
     }
@@ -103,9 +103,9 @@ class _Seen:
 
     main: Pose
     pose: Pose
-    view: View
+    view: ExpectedImage
     exposure_s: float
-    expected: list[tuple[Window, Image]]
+    expected: list[tuple[Roi, Image]]
     bound_m2: list[float] | None
 
 
@@ -115,9 +115,9 @@ def _seen(job: Job, pose_number: int, which: int) -> _Seen:
     recipe, renderer = _renderer(job.recipe_json, job.scene_json, job.scene_folder)
     mounted = recipe.cameras[which]
     main, during = poses_of(recipe, renderer.scene, pose_number, which)
-    view = renderer.view(mounted.camera, mounted.pose(main), recipe.windows, during)
+    view = renderer.expected_image(mounted.camera, mounted.pose(main), recipe.regions, during)
     exposure_s = recipe.time_s(view)
-    expected = [(part.window, part.expected_electrons(exposure_s)) for part in view.parts]
+    expected = [(part.roi, part.expected_electrons(exposure_s)) for part in view.parts]
     bound = _bound_m2(recipe, renderer, mounted, main, exposure_s, expected)
     return _Seen(main, mounted.pose(main), view, exposure_s, expected, bound)
 
@@ -128,7 +128,7 @@ def _bound_m2(
     mounted: Mounted,
     main: Pose,
     exposure_s: float,
-    expected: Sequence[tuple[Window, Image]],
+    expected: Sequence[tuple[Roi, Image]],
 ) -> list[float] | None:
     """The frame's Cramér-Rao bound, row by row; None where it is not asked for or nothing is determined."""
     if not recipe.bound:
@@ -137,12 +137,12 @@ def _bound_m2(
     bound = position_bound_m2(
         mounted.camera,
         main,
-        lambda pose: renderer.led_patches(mounted.camera, mounted.pose(pose), recipe.windows, mounted.pose(main)),
+        lambda pose: renderer.led_patches(mounted.camera, mounted.pose(pose), recipe.regions, mounted.pose(main)),
         exposure_s,
-        [(window, variance_e2(recipe.sensor, image, exposure_s)) for window, image in expected],
+        [(roi, variance_e2(recipe.sensor, image, exposure_s)) for roi, image in expected],
         float(np.median(np.linalg.norm(renderer.scene.leds.centers_m - position, axis=1))),
         recipe.accelerometer.tilt_errors_deg(main),
-        recipe.windows is not None and recipe.windows.overscan,
+        recipe.regions is not None and recipe.regions.overscan,
         mounted.pose,
     )
     return None if bound is None else bound.ravel().tolist()

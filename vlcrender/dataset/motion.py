@@ -16,7 +16,7 @@ from vlcrender.scene.loader import Scene
 STEP_PX = 0.5
 """Images move by less than this from one pose to the next: the midpoint rule then smooths an edge by (1/4 px) / sqrt(3)
 at most beside what the pixel itself does."""
-MOST_STEPS = 2000
+MAX_STEPS = 2000
 
 AngularVelocity = Annotated[float, Field(ge=-1e5, le=1e5)]
 LinearVelocity = Annotated[float, Field(ge=-1e3, le=1e3)]
@@ -50,10 +50,10 @@ def poses_during(
     ends = [mounted.pose(motion.pose_at(middle, time_s)) for time_s in (-exposure_s / 2, exposure_s / 2)]
     way_px = _longest_way_px(mounted.camera, ends, scene)
     steps = max(1, int(np.ceil(way_px / STEP_PX)))
-    if steps > MOST_STEPS:
+    if steps > MAX_STEPS:
         raise InputError(
             f"motion: moves the image by {way_px:.0f} px during the exposure of {exposure_s} s; at most "
-            f"{MOST_STEPS * STEP_PX:.0f} px are allowed"
+            f"{MAX_STEPS * STEP_PX:.0f} px are allowed"
         )
     times_s = ((np.arange(steps) + 0.5) / steps - 0.5) * exposure_s
     return tuple(mounted.pose(motion.pose_at(middle, float(time_s))) for time_s in times_s)

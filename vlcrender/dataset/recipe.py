@@ -10,14 +10,14 @@ from pydantic import Field, model_validator
 
 from vlcrender.camera.intrinsics import Camera
 from vlcrender.camera.rig import MAIN, Mounted, RigCamera, mounted_cameras
-from vlcrender.camera.roi import LedWindows
+from vlcrender.camera.roi import LedRegions
 from vlcrender.config.presets import with_presets
 from vlcrender.config.toml_model import Settings, check, read_toml
 from vlcrender.dataset.auto_exposure import Metering, NoiseLevelMetering
 from vlcrender.dataset.motion import Motion
 from vlcrender.dataset.pose_sampling import AimedPoses, Poses
 from vlcrender.errors import InputError
-from vlcrender.rendering.expected_image import View
+from vlcrender.rendering.expected_image import ExpectedImage
 from vlcrender.scene.loader import Scene, load_scene
 from vlcrender.sensor.accelerometer import Accelerometer, TiltError
 from vlcrender.sensor.isp import Processed
@@ -52,7 +52,7 @@ class Recipe(Settings):
     sensor: Sensor = Sensor()
     accelerometer: Accelerometer = TiltError()
     poses: Poses
-    windows: LedWindows | None = None
+    regions: LedRegions | None = None
     """What is read out of the sensor; all of it where not given."""
     motion: Motion | None = None
     rig: tuple[RigCamera, ...] = ()
@@ -74,7 +74,7 @@ class Recipe(Settings):
 
     @model_validator(mode="after")
     def _processed_is_of_full_frames(self) -> Self:
-        if self.processed is not None and self.windows is not None:
+        if self.processed is not None and self.regions is not None:
             raise ValueError("processed: is made of full frames; leave windows out, or it")
         return self
 
@@ -99,9 +99,9 @@ class Recipe(Settings):
     @model_validator(mode="after")
     def _overscan_needs_a_lens_that_goes_on(self) -> Self:
         bent = [c.name for c in self.cameras if c.camera.distortion is not None]
-        if self.windows is not None and self.windows.overscan and bent:
+        if self.regions is not None and self.regions.overscan and bent:
             raise ValueError(
-                f"windows.overscan = true: camera {bent[0]!r} has a distortion, which says nothing of what lies far "
+                f"regions.overscan = true: camera {bent[0]!r} has a distortion, which says nothing of what lies far "
                 "beyond the sensor; leave one of them out"
             )
         return self
@@ -116,7 +116,7 @@ class Recipe(Settings):
         """One frame for each camera, pose and repeat."""
         return self.poses.count * self.repeats * len(self.cameras)
 
-    def time_s(self, view: View) -> float:
+    def time_s(self, view: ExpectedImage) -> float:
         """Exposure time of a view, seconds."""
         if self.exposure is not None:
             return self.exposure.time_s(view, self.sensor.saturation_e)
@@ -177,14 +177,14 @@ def scaled(recipe: Recipe, by: int, mode: ScaleMode) -> Recipe:
     }
     if isinstance(recipe.poses, AimedPoses):
         changes["poses"] = recipe.poses.model_copy(update={"border_px": recipe.poses.border_px / by})
-    if recipe.windows is not None:
-        changes["windows"] = recipe.windows.model_copy(update={"margin_px": recipe.windows.margin_px / by})
+    if recipe.regions is not None:
+        changes["regions"] = recipe.regions.model_copy(update={"margin_px": recipe.regions.margin_px / by})
     if mode == "same-photons":
         if recipe.exposure_s is not None:
             changes["exposure_s"] = recipe.exposure_s / by**2
         else:  # what is metered are electrons in a pixel
             changes["exposure"] = recipe.exposure and recipe.exposure.model_copy(
-                update={"longest_s": recipe.exposure.longest_s / by**2}
+                update={"longest_s": recipe.exposure.max_s / by**2}
             )
     else:
         changes["sensor"] = recipe.sensor.binned(by)

@@ -9,7 +9,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from vlcrender.camera.intrinsics import Camera, image_of_points, transform
-from vlcrender.camera.roi import Window
+from vlcrender.camera.roi import Roi
 from vlcrender.config.toml_model import check
 from vlcrender.dataset.files import (
     EXPECTED,
@@ -117,17 +117,17 @@ def _problems_of_frame(directory: Path, row: Mapping[str, Any], dataset: Dataset
     if sha256_of(path) != row["sha256"]:
         return [f"{path}: its SHA-256 is not the one in frames.parquet: the file was changed or cut short"]
     camera = dataset.cameras[row["camera"]]
-    sensor = Window(0, 0, camera.height_px, camera.width_px)
+    sensor = Roi(0, 0, camera.height_px, camera.width_px)
     try:
         parts = read_exr_parts(path)
     except InputError as error:
         return [str(error)]
-    windows = [part.window for part in parts]
+    regions = [part.roi for part in parts]
     if not parts or any(part.dtype != np.uint32 or part.sensor != sensor for part in parts):
         return [f"{path}: is not uint32 of a sensor of {camera.height_px, camera.width_px} pixels in every part"]
-    if any(a.overlaps(b) for i, a in enumerate(windows) for b in windows[:i]):
+    if any(a.overlaps(b) for i, a in enumerate(regions) for b in regions[:i]):
         return [f"{path}: has windows that overlap"]
-    if row["capturable"] != all(sensor.holds(window) for window in windows):
+    if row["capturable"] != all(sensor.contains(roi) for roi in regions):
         return [f"{path}: capturable is {row['capturable']}, but its windows say otherwise"]
     return []
 

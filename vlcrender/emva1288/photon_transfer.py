@@ -33,9 +33,9 @@ STACK = 64
 """Frames averaged for the fixed patterns."""
 DARK_TIMES = 6
 """Exposure times of a series of dark frames; the standard asks for 6 at least."""
-LONGEST_DARK_S = 100.0
+MAX_DARK_S = 100.0
 WARMER_C = (0.0, 10.0, 20.0)
-MOST_PHOTONS = 1e9
+MAX_PHOTONS = 1e9
 ROUNDING_DN2 = 1 / 12
 """Variance of rounding where noise is about half a digital number or more."""
 UNDITHERED_DN2 = 0.25
@@ -191,8 +191,8 @@ def collapse(shoot: Shoot, dark: Point) -> tuple[float, tuple[Point, ...]]:
     way = [take_pair(shoot, 1.0)]
     signal = previous = 0.0
     while signal < 5 or signal > 1.5 * previous:  # the first numbers are rounding's
-        if way[-1].photons > MOST_PHOTONS:
-            raise InputError(f"the sensor does not saturate at up to {MOST_PHOTONS:g} photons a pixel")
+        if way[-1].photons > MAX_PHOTONS:
+            raise InputError(f"the sensor does not saturate at up to {MAX_PHOTONS:g} photons a pixel")
         way.append(take_pair(shoot, 2 * way[-1].photons))
         signal, previous = (point.mean_dn - dark.mean_dn for point in (way[-1], way[-2]))
     largest = max(point.variance_dn2 for point in way)
@@ -235,8 +235,8 @@ def fit_responsivity(dark: Point, points: Sequence[Point], bright: Patterns) -> 
 def dark_series(shoot: Shoot, swing_dn: float, warmer_c: float) -> list[Point]:
     """Dark pairs of times from 0 on, evenly up to where the dark signal is a tenth of `swing_dn`, or LONGEST_DARK_S."""
     start = float(shoot(0.0, 0.0, warmer_c).mean())
-    longest = LONGEST_DARK_S / 2**14
-    while longest < LONGEST_DARK_S and shoot(0.0, longest, warmer_c).mean() - start < 0.1 * swing_dn:
+    longest = MAX_DARK_S / 2**14
+    while longest < MAX_DARK_S and shoot(0.0, longest, warmer_c).mean() - start < 0.1 * swing_dn:
         longest *= 2
     return [take_pair(shoot, 0.0, float(t), warmer_c) for t in np.linspace(0.0, longest, DARK_TIMES)]
 

@@ -23,12 +23,12 @@ from numpy.typing import NDArray
 
 from vlcrender.core.backend import dr, exact_math, mi
 from vlcrender.light.mitsuba_room import mitsuba_scene
-from vlcrender.scene.fresnel import pane_reflectance
+from vlcrender.scene.fresnel import glazing_reflectance
 from vlcrender.scene.furniture import furniture_meshes
 from vlcrender.scene.loader import Scene
 from vlcrender.scene.mesh import Mesh, join, mesh_of_surfaces
 from vlcrender.scene.sources import Sources, point_sources
-from vlcrender.scene.surfaces import Pane
+from vlcrender.scene.surfaces import Glazing
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -44,7 +44,7 @@ OFFSET_M = 1e-4
 
 
 @dataclass(frozen=True)
-class Light:
+class Lightmap:
     """Illuminance in lux at the corners of `mesh` and then on the faces of the scene's LEDs, (corners + LEDs,) each.
 
     `led_lux` is light that left an LED, `surround_lux` all other; `sigma_lux` is the Monte Carlo standard error of
@@ -61,7 +61,7 @@ class Light:
         """Luminance of the surfaces by light from LEDs: albedo * illuminance / pi."""
         return self.albedo * self.led_lux / np.pi
 
-    def surround_cd_m2(self) -> Array:
+    def ambient_cd_m2(self) -> Array:
         """Luminance of the surfaces by all other light."""
         return self.albedo * self.surround_lux / np.pi
 
@@ -72,7 +72,7 @@ def room_mesh(scene: Scene) -> Mesh:
     return join([rectangles, *furniture_meshes(scene, len(scene.surfaces))])
 
 
-def bake(scene: Scene, cache: Path | None = None, progress: Progress = lambda stage, share: None) -> Light:
+def bake(scene: Scene, cache: Path | None = None, progress: Progress = lambda stage, share: None) -> Lightmap:
     """Compute the room's light, or take it from the cache folder (`default_cache()` where None).
 
     `progress` is told (stage, share done). Raises InputError for furniture that cannot be used.
@@ -85,7 +85,7 @@ def bake(scene: Scene, cache: Path | None = None, progress: Progress = lambda st
         stored = _compute(scene, mesh, progress)
         _store(file, stored)
     led, surround, sigma = stored
-    return Light(mesh, albedo, led, surround + scene.settings.ambient.illuminance_lux, sigma)
+    return Lightmap(mesh, albedo, led, surround + scene.settings.ambient.illuminance_lux, sigma)
 
 
 def default_cache() -> Path:
@@ -95,7 +95,7 @@ def default_cache() -> Path:
 
 
 def led_illuminance_lux(
-    blockers: Any, points_m: Array, normals: Array, sources: Sources, panes: tuple[Pane, ...] = ()
+    blockers: Any, points_m: Array, normals: Array, sources: Sources, glazings: tuple[Glazing, ...] = ()
 ) -> Array:
     """Illuminance straight from the LEDs, and by way of one pane, on surface points (n, 3) with unit normals, (n,).
 
@@ -112,22 +112,22 @@ def led_illuminance_lux(
         point, source = np.nonzero(lux > 0)
         seen = ~_blocked(blockers, origins[point], sources.centers_m[source] - [0, 0, OFFSET_M])
         np.add.at(total[here], point, lux[point, source] * seen)
-        for pane in panes:
-            images_m = pane.mirrored(sources.centers_m)
+        for glazing in glazings:
+            images_m = glazing.mirrored(sources.centers_m)
             lux = _unshadowed_lux(points_m[here], normals[here], sources, images_m)
             towards = images_m[None] - points_m[here, None]
-            slope = (towards * pane.normal).sum(axis=2)
-            height = ((points_m[here] - pane.corner_m) * pane.normal).sum(axis=1)
+            slope = (towards * glazing.normal).sum(axis=2)
+            height = ((points_m[here] - glazing.corner_m) * glazing.normal).sum(axis=1)
             point, source = np.nonzero((lux > 0) & (slope < 0) & (height[:, None] > OFFSET_M))
             share = height[point] / -slope[point, source]
-            on_pane = points_m[here][point] + share[:, None] * towards[point, source]
-            within = pane.holds(on_pane)
-            point, source, on_pane = point[within], source[within], on_pane[within]
-            before = on_pane + OFFSET_M * pane.normal
+            on_glazing = points_m[here][point] + share[:, None] * towards[point, source]
+            within = glazing.contains(on_glazing)
+            point, source, on_glazing = point[within], source[within], on_glazing[within]
+            before = on_glazing + OFFSET_M * glazing.normal
             seen = ~_blocked(blockers, origins[point], before)
             seen &= ~_blocked(blockers, before, sources.centers_m[source] - [0, 0, OFFSET_M])
             cosine = -slope[point, source] / np.linalg.norm(towards[point, source], axis=1)
-            dimmed = lux[point, source] * pane_reflectance(cosine, pane.refractive_index, np.sqrt)
+            dimmed = lux[point, source] * glazing_reflectance(cosine, glazing.refractive_index, np.sqrt)
             np.add.at(total[here], point, dimmed * seen)
     return total
 
@@ -232,14 +232,14 @@ def _compute(scene: Scene, mesh: Mesh, progress: Progress) -> tuple[Array, Array
     dark = np.zeros(len(mesh.vertices_m))
     progress("light from the LEDs", 0.0)
     blockers = mitsuba_scene(mesh, dark, (), panes_glow=False)
-    direct = led_illuminance_lux(blockers, points, normals, point_sources(leds), scene.panes)
+    direct = led_illuminance_lux(blockers, points, normals, point_sources(leds), scene.glazings)
     progress("light from the LEDs", 1.0)
     paths = scene.settings.bake.paths
-    lit = mitsuba_scene(mesh, mesh.albedo * direct[: len(dark)] / np.pi, scene.panes, panes_glow=False)
+    lit = mitsuba_scene(mesh, mesh.albedo * direct[: len(dark)] / np.pi, scene.glazings, panes_glow=False)
     bounced, sigma = path_traced_lux(lit, points, normals, paths, lambda share: progress("reflected light", share))
     surround = np.zeros(len(points))
-    if any(pane.luminance_cd_m2 > 0 for pane in scene.panes):
-        by_day = mitsuba_scene(mesh, dark, scene.panes, panes_glow=True)
+    if any(glazing.luminance_cd_m2 > 0 for glazing in scene.glazings):
+        by_day = mitsuba_scene(mesh, dark, scene.glazings, panes_glow=True)
         surround, more = path_traced_lux(
             by_day, points, normals, paths, lambda share: progress("light from windows", share)
         )
@@ -255,16 +255,16 @@ def _key(scene: Scene, mesh: Mesh) -> str:
     arrays += [scene.leds.centers_m, sources.centers_m, sources.intensities_cd, sources.orders]
     for array in arrays:
         digest.update(np.ascontiguousarray(array).tobytes())
-    digest.update(repr(list(map(_pane_key, scene.panes))).encode())
+    digest.update(repr(list(map(_glazing_key, scene.glazings))).encode())
     for surface in scene.surfaces:
         if surface.texture is not None:
             digest.update(np.ascontiguousarray(surface.texture.reflectances).tobytes())
     return digest.hexdigest()[:32]
 
 
-def _pane_key(pane: Pane) -> tuple[object, ...]:
-    edges = (pane.corner_m.tolist(), pane.edge_u_m.tolist(), pane.edge_v_m.tolist())
-    return (*edges, pane.luminance_cd_m2, pane.refractive_index)
+def _glazing_key(glazing: Glazing) -> tuple[object, ...]:
+    edges = (glazing.corner_m.tolist(), glazing.edge_u_m.tolist(), glazing.edge_v_m.tolist())
+    return (*edges, glazing.luminance_cd_m2, glazing.refractive_index)
 
 
 def _load(file: Path, corners: int) -> tuple[Array, Array, Array] | None:

@@ -8,22 +8,22 @@ from numpy.typing import NDArray
 
 from vlcrender.core.backend import mi
 from vlcrender.scene.mesh import Mesh
-from vlcrender.scene.surfaces import Pane
+from vlcrender.scene.surfaces import Glazing
 
 BEHIND_M = 1e-3
 """What is outside lies this far behind its pane, and is larger by this part."""
-PANE_FACES = np.array([[0, 1, 2], [0, 2, 3]])
+GLAZING_FACES = np.array([[0, 1, 2], [0, 2, 3]])
 
 Array = NDArray[np.float64]
 
 
-def mitsuba_scene(mesh: Mesh, glow_cd_m2: Array, panes: tuple[Pane, ...], panes_glow: bool) -> Any:
+def mitsuba_scene(mesh: Mesh, glow_cd_m2: Array, glazings: tuple[Glazing, ...], panes_glow: bool) -> Any:
     """Mesh and panes as a Mitsuba scene whose every shape has an attribute `vertex_glow`, in cd/m2."""
     shapes = {"room": room_shape(mesh, glow_cd_m2)}
-    for i, pane in enumerate(panes):
-        shapes[f"pane{i}"] = pane_shape(pane)
+    for i, glazing in enumerate(glazings):
+        shapes[f"pane{i}"] = glazing_shape(glazing)
         if panes_glow:
-            shapes[f"outside{i}"] = outside_shape(pane)
+            shapes[f"outside{i}"] = outside_shape(glazing)
     return mi.load_dict({"type": "scene", **shapes}, optimize=False)
 
 
@@ -36,22 +36,22 @@ def room_shape(mesh: Mesh, glow_cd_m2: Array) -> "mi.Mesh":
     return shape
 
 
-def pane_shape(pane: Pane) -> "mi.Mesh":
+def glazing_shape(glazing: Glazing) -> "mi.Mesh":
     """A window pane for Mitsuba: thin glass by Fresnel's law."""
-    return _shape(pane.name, pane.corners_m, PANE_FACES, pane_bsdf(pane), np.zeros(4))
+    return _shape(glazing.name, glazing.corners_m, GLAZING_FACES, glazing_bsdf(glazing), np.zeros(4))
 
 
-def outside_shape(pane: Pane) -> "mi.Mesh":
+def outside_shape(glazing: Glazing) -> "mi.Mesh":
     """What is seen through a pane: black where it does not glow, just behind it and a little larger."""
-    middle = pane.corners_m.mean(axis=0)
-    corners = middle + (1 + BEHIND_M) * (pane.corners_m - middle) - BEHIND_M * pane.normal
+    middle = glazing.corners_m.mean(axis=0)
+    corners = middle + (1 + BEHIND_M) * (glazing.corners_m - middle) - BEHIND_M * glazing.normal
     black = {"type": "diffuse", "reflectance": 0.0}
-    return _shape(f"outside {pane.name}", corners, PANE_FACES, black, np.full(4, pane.luminance_cd_m2))
+    return _shape(f"outside {glazing.name}", corners, GLAZING_FACES, black, np.full(4, glazing.luminance_cd_m2))
 
 
-def pane_bsdf(pane: Pane) -> dict[str, object]:
+def glazing_bsdf(glazing: Glazing) -> dict[str, object]:
     """Thin glass: mirrors by Fresnel's law at both faces and lets the rest through."""
-    return {"type": "thindielectric", "int_ior": pane.refractive_index, "ext_ior": 1.0}
+    return {"type": "thindielectric", "int_ior": glazing.refractive_index, "ext_ior": 1.0}
 
 
 def _shape(

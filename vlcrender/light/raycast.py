@@ -17,15 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlcrender.core.backend import dr, mi
-from vlcrender.light.lightmap import Light
-from vlcrender.scene.fresnel import pane_reflectance
+from vlcrender.light.lightmap import Lightmap
+from vlcrender.scene.fresnel import glazing_reflectance
 from vlcrender.scene.mesh import Mesh
-from vlcrender.scene.surfaces import Pane, Surface
+from vlcrender.scene.surfaces import Glazing, Surface
 
 Array = NDArray[np.float64]
 
 PIECES = 2
-MOST_SPREAD_PX = 1e6
+MAX_SPREAD_PX = 1e6
 """Of a texture seen by one pixel: far beyond one tile, which is all that counts."""
 GRAZING = 1e-9
 
@@ -47,17 +47,17 @@ class Hit:
 class Room:
     """The room's mesh in Mitsuba with its panes, ready for rays."""
 
-    def __init__(self, mesh: Mesh, panes: tuple[Pane, ...], surfaces: tuple[Surface, ...]) -> None:
+    def __init__(self, mesh: Mesh, glazings: tuple[Glazing, ...], surfaces: tuple[Surface, ...]) -> None:
         """Put mesh and panes into one Mitsuba mesh. `surfaces` are the mesh's, by owner, for their textures."""
-        self.first_pane = int(mesh.owners.max()) + 1
-        self.nothing = self.first_pane + len(panes)
-        self._panes = panes
+        self.first_glazing = int(mesh.owners.max()) + 1
+        self.nothing = self.first_glazing + len(glazings)
+        self._panes = glazings
         vertices, faces, owners = [mesh.vertices_m], [mesh.faces], [mesh.owners]
-        for number, pane in enumerate(panes):
+        for number, glazing in enumerate(glazings):
             first = len(mesh.vertices_m) + 4 * number
-            vertices.append(pane.corners_m)
+            vertices.append(glazing.corners_m)
             faces.append(np.array([[0, 1, 2], [0, 2, 3]]) + first)
-            owners.append(np.full(2, self.first_pane + number))
+            owners.append(np.full(2, self.first_glazing + number))
         all_faces = np.concatenate(faces)
         shape = mi.Mesh("room", sum(map(len, vertices)), len(all_faces))
         parameters = mi.traverse(shape)
@@ -69,9 +69,9 @@ class Room:
         self._owners = mi.UInt32(np.append(np.concatenate(owners), self.nothing).astype(np.uint32))
         normals = np.zeros((self.nothing + 1, 3))
         indices = np.ones(self.nothing + 1)
-        for number, pane in enumerate(panes):
-            normals[self.first_pane + number] = pane.normal
-            indices[self.first_pane + number] = pane.refractive_index
+        for number, glazing in enumerate(glazings):
+            normals[self.first_glazing + number] = glazing.normal
+            indices[self.first_glazing + number] = glazing.refractive_index
         self._pane_normal = mi.Vector3f(*normals.T.astype(np.float32))
         self._pane_index = mi.Float(indices.astype(np.float32))
         self._triangles = len(all_faces)
@@ -81,19 +81,19 @@ class Room:
             if surface.texture is not None:
                 self._textured[mesh.faces[mesh.owners == number]] = True
 
-    def values(self, light: Light, led_rate: float, surround_rate: float) -> "mi.Float":
+    def values(self, light: Lightmap, led_rate: float, surround_rate: float) -> "mi.Float":
         """What corners are worth in `look`: light from LEDs times one factor plus other light times another.
 
         Of textured surfaces that is what they would be worth if they reflected all.
         """
         corners = len(light.mesh.vertices_m)
-        surfaces = led_rate * light.led_cd_m2()[:corners] + surround_rate * light.surround_cd_m2()[:corners]
+        surfaces = led_rate * light.led_cd_m2()[:corners] + surround_rate * light.ambient_cd_m2()[:corners]
         lux = led_rate * light.led_lux[:corners] + surround_rate * light.surround_lux[:corners]
         surfaces = np.where(self._textured, lux / np.pi, surfaces)
-        panes = np.repeat([surround_rate * pane.luminance_cd_m2 for pane in self._panes], 4)
-        return mi.Float(np.concatenate([surfaces, panes]).astype(np.float32))
+        glazings = np.repeat([surround_rate * glazing.luminance_cd_m2 for glazing in self._panes], 4)
+        return mi.Float(np.concatenate([surfaces, glazings]).astype(np.float32))
 
-    def look(
+    def trace(
         self, origin: Any, direction: Any, values: Any, coherent: bool = True, spread: tuple[Any, Any] | None = None
     ) -> Hit:
         """Cast rays (Dr.Jit points and unit directions, world).
@@ -106,19 +106,19 @@ class Room:
             point = dr.fma(direction, distance, origin)
             value *= self.textures.reflectance(surface, point, direction, distance, spread)
         if self._panes:
-            on_pane = (surface >= self.first_pane) & (surface < self.nothing)
+            on_glazing = (surface >= self.first_glazing) & (surface < self.nothing)
             normal = dr.gather(mi.Vector3f, self._pane_normal, surface)
             cosine = dr.abs(dr.dot(direction, normal))
             onward = _mirrored(direction, normal)
             start = dr.fma(direction, distance, origin) + normal * 1e-5
-            second, shown, beyond = self._meet(start, onward, values, False, on_pane)
+            second, shown, beyond = self._meet(start, onward, values, False, on_glazing)
             if self.textures is not None and spread is not None:
                 turned = _mirrored(spread[0], normal), _mirrored(spread[1], normal)
                 point = dr.fma(onward, beyond, start)
                 second *= self.textures.reflectance(shown, point, onward, distance + beyond, turned)
-            reflectance = pane_reflectance(cosine, dr.gather(mi.Float, self._pane_index, surface), dr.sqrt)
-            value = dr.select(on_pane, dr.lerp(value, second, reflectance), value)
-            path = dr.select(on_pane, distance + beyond, distance)
+            reflectance = glazing_reflectance(cosine, dr.gather(mi.Float, self._pane_index, surface), dr.sqrt)
+            value = dr.select(on_glazing, dr.lerp(value, second, reflectance), value)
+            path = dr.select(on_glazing, distance + beyond, distance)
         return Hit(value, surface, distance, path)
 
     def _meet(self, origin: Any, direction: Any, values: Any, coherent: bool, active: Any) -> tuple[Any, Any, Any]:
@@ -178,7 +178,7 @@ class Textures:
         facing = dr.select(dr.abs(facing) > GRAZING, facing, GRAZING)
         sides = [path_m * (side - direction * (dr.dot(side, normal) / facing)) for side in spread]
         ux, uy, vx, vy = (
-            dr.clip(dr.dot(side, axis), -MOST_SPREAD_PX, MOST_SPREAD_PX) for side in sides for axis in (across, down)
+            dr.clip(dr.dot(side, axis), -MAX_SPREAD_PX, MAX_SPREAD_PX) for side in sides for axis in (across, down)
         )
         x, y = dr.dot(point - origin, across), dr.dot(point - origin, down)
         # a piece's spread, and that of the blur by one pixel of the image

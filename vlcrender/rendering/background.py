@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from vlcrender.camera.intrinsics import Camera, Pose, ray_of_pixel
 from vlcrender.camera.lens import relative_illumination
-from vlcrender.camera.roi import Window
+from vlcrender.camera.roi import Roi
 from vlcrender.core.backend import dr, exact_math, mi
-from vlcrender.light.lightmap import Light
+from vlcrender.light.lightmap import Lightmap
 from vlcrender.light.raycast import Hit, Room
 from vlcrender.rendering.expected_image import Image
 from vlcrender.scene.loader import Scene
@@ -29,13 +29,13 @@ class Background:
     rates: of light that left an LED, and of all other light.
     """
 
-    def __init__(self, scene: Scene, light: Light) -> None:
+    def __init__(self, scene: Scene, light: Lightmap) -> None:
         """Prepare a scene with its baked light."""
-        self.room = Room(light.mesh, scene.panes, scene.surfaces)
+        self.room = Room(light.mesh, scene.glazings, scene.surfaces)
         self._light = light
         self._values: dict[tuple[float, float], Any] = {}
 
-    def look(
+    def trace(
         self,
         camera: Camera,
         pose: Pose,
@@ -61,36 +61,36 @@ class Background:
             half = size_px / 2
             spread = ray(u + half, v) - ray(u - half, v), ray(u, v + half) - ray(u, v - half)
         origin = mi.Point3f(*_opaque(np.array([pose.position_m]))[0])
-        hit = self.room.look(origin, ray(u, v), self._values[rates], spread=spread)
+        hit = self.room.trace(origin, ray(u, v), self._values[rates], spread=spread)
         value = relative_illumination(camera, u, v, dr, hit.value)
         return replace(hit, value=value)
 
     def images(
-        self, camera: Camera, pose: Pose, frames: Sequence[Window], rates: tuple[float, float]
+        self, camera: Camera, pose: Pose, frames: Sequence[Roi], rates: tuple[float, float]
     ) -> tuple[list[Image], list[NDArray[np.uint32]]]:
         """Window by window: the mean over each pixel, and the number of the surface at its centre."""
-        sensor = Window.of_sensor(camera)
+        sensor = Roi.of_sensor(camera)
         # A border pixel's neighbours say whether two surfaces meet in it; beyond the sensor nobody looks.
-        wider = [w.grown(1).common(sensor) if sensor.holds(w) else w.grown(1) for w in frames]
+        wider = [w.padded(1).intersection(sensor) if sensor.contains(w) else w.padded(1) for w in frames]
         with exact_math():
-            hit = self.look(camera, pose, *_pixel_centers(wider, sensor), rates)
+            hit = self.trace(camera, pose, *_pixel_centers(wider, sensor), rates)
             dr.eval(hit.value, hit.surface)
             values, surfaces = hit.value.numpy(), hit.surface.numpy()
             starts = np.cumsum([0, *(w.pixels for w in wider)])
             images, labels, edges = [], [], []
-            for window, frame, start in zip(wider, frames, starts, strict=False):
-                here, inner = slice(start, start + window.pixels), window.slices(frame)
-                label = surfaces[here].reshape(window.rows, window.columns)
-                images.append(values[here].reshape(window.rows, window.columns)[inner])
+            for roi, frame, start in zip(wider, frames, starts, strict=False):
+                here, inner = slice(start, start + roi.pixels), roi.slices(frame)
+                label = surfaces[here].reshape(roi.rows, roi.columns)
+                images.append(values[here].reshape(roi.rows, roi.columns)[inner])
                 labels.append(label[inner])
-                edges.append(_edges(label, window, sensor)[inner])
+                edges.append(_edges(label, roi, sensor)[inner])
             pixels = [np.nonzero(edge) for edge in edges]
             rows = np.concatenate([r + frame.row for (r, _), frame in zip(pixels, frames, strict=True)])
             columns = np.concatenate([c + frame.column for (_, c), frame in zip(pixels, frames, strict=True)])
             if len(rows):
                 u, v = sub_pixels(rows, columns)
                 means = (
-                    self.look(camera, pose, u, v, rates, 1 / EDGE_GRID)
+                    self.trace(camera, pose, u, v, rates, 1 / EDGE_GRID)
                     .value.numpy()
                     .reshape(len(rows), -1)
                     .mean(axis=1)
@@ -112,15 +112,15 @@ def sub_pixels(rows: NDArray[np.int64], columns: NDArray[np.int64]) -> "tuple[mi
     return left + (mi.Float(sub - sub_row * grid) + 0.5) / grid, top + (mi.Float(sub_row) + 0.5) / grid
 
 
-def _pixel_centers(windows: Sequence[Window], sensor: Window) -> "tuple[mi.Float, mi.Float]":
+def _pixel_centers(regions: Sequence[Roi], sensor: Roi) -> "tuple[mi.Float, mi.Float]":
     """(u, v) of all pixels of all windows, window by window, row by row."""
-    if list(windows) == [sensor]:
+    if list(regions) == [sensor]:
         index = dr.arange(mi.UInt32, sensor.pixels)
         row = index // sensor.columns
         return mi.Float(index - row * sensor.columns) + 0.5, mi.Float(row) + 0.5
     # As data, not reckoned in the kernel: windows of any number and size are then one launch of the same kernel.
-    u = [np.tile(np.arange(w.column, w.end_column, dtype=np.float32) + np.float32(0.5), w.rows) for w in windows]
-    v = [np.repeat(np.arange(w.row, w.end_row, dtype=np.float32) + np.float32(0.5), w.columns) for w in windows]
+    u = [np.tile(np.arange(w.column, w.end_column, dtype=np.float32) + np.float32(0.5), w.rows) for w in regions]
+    v = [np.repeat(np.arange(w.row, w.end_row, dtype=np.float32) + np.float32(0.5), w.columns) for w in regions]
     return mi.Float(np.concatenate(u)), mi.Float(np.concatenate(v))
 
 
@@ -129,11 +129,11 @@ def _opaque(matrix: NDArray[np.float64]) -> "list[list[mi.Float]]":
     return [[dr.opaque(mi.Float, number) for number in row] for row in matrix.tolist()]
 
 
-def _edges(surfaces: NDArray[np.uint32], window: Window, sensor: Window) -> NDArray[np.bool_]:
+def _edges(surfaces: NDArray[np.uint32], roi: Roi, sensor: Roi) -> NDArray[np.bool_]:
     """Pixels of a window in which surfaces may meet, whose numbers at the pixel centres are given."""
     edges = differs_from_neighbour(surfaces)
-    if not sensor.holds(window) and sensor.overlaps(window):
-        on_sensor = window.slices(window.common(sensor))  # as in a full frame, which has no neighbours beyond
+    if not sensor.contains(roi) and sensor.overlaps(roi):
+        on_sensor = roi.slices(roi.intersection(sensor))  # as in a full frame, which has no neighbours beyond
         edges[on_sensor] = differs_from_neighbour(surfaces[on_sensor])
     return edges
 

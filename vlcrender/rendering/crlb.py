@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlcrender.camera.intrinsics import Camera, Pose
-from vlcrender.camera.roi import LedWindows, Window, led_windows
+from vlcrender.camera.roi import LedRegions, Roi, led_regions
 from vlcrender.rendering.expected_image import LedPatch
 
 Array = NDArray[np.float64]
@@ -32,11 +32,11 @@ STEP_PX = 1e-5
 enters or leaves the pixel: so small a step hits such a place in hardly any pixel, which matters because
 directions that are hardly determined live on small differences between slopes. Images are exact to some 1e-12, slopes
 then to 1e-7."""
-WORST_CONDITION = 1e12
+MAX_CONDITION = 1e12
 """Of the information, in units of the steps: beyond it a direction has no more of it than rounding makes."""
 
 Render = Callable[[Pose], Sequence[LedPatch]]
-Variance = Sequence[tuple[Window, Array]]
+Variance = Sequence[tuple[Roi, Array]]
 
 
 def position_bound_m2(
@@ -69,12 +69,12 @@ def position_bound_m2(
         for i, step in enumerate(steps)
     ]
     information = np.zeros((6, 6))
-    around = LedWindows(kind="leds", margin_px=MARGIN_PX, overscan=overscan)
-    for box in led_windows((patch.window for patch in at_pose), camera, around):
-        for window, variance in variance_e2:
-            if window.overlaps(box):
-                here = window.common(box)
-                inside = [patch for patch in at_pose if here.overlaps(patch.window)]
+    around = LedRegions(kind="leds", margin_px=MARGIN_PX, overscan=overscan)
+    for box in led_regions((patch.roi for patch in at_pose), camera, around):
+        for roi, variance in variance_e2:
+            if roi.overlaps(box):
+                here = roi.intersection(box)
+                inside = [patch for patch in at_pose if here.overlaps(patch.roi)]
                 slopes = np.stack(
                     [
                         (_image(here, plus, inside) - _image(here, minus, inside)) * exposure_s / (2 * step)
@@ -84,7 +84,7 @@ def position_bound_m2(
                 now = {patch.led_id: patch for patch in inside}
                 nuisances = [_image(here, now, [patch]) * exposure_s for patch in inside]
                 nuisances.append(np.ones((here.rows, here.columns)))
-                weight = 1 / variance[window.slices(here)].astype(np.float64)
+                weight = 1 / variance[roi.slices(here)].astype(np.float64)
                 information += _marginal(slopes, np.stack(nuisances), weight)
     ends = [[mounted(_moved(pose, i, sign * step)).position_m for sign in (1, -1)] for i, step in enumerate(steps)]
     lever = np.diff(ends, axis=1)[:, 0].T / (-2 * np.array(steps))
@@ -99,14 +99,14 @@ def _moved(pose: Pose, unknown: int, by: float) -> Pose:
     return Pose((numbers[0], numbers[1], numbers[2]), *numbers[3:])
 
 
-def _image(window: Window, patches: Mapping[int, LedPatch], of: Sequence[LedPatch]) -> Array:
+def _image(roi: Roi, patches: Mapping[int, LedPatch], of: Sequence[LedPatch]) -> Array:
     """The light of some LEDs in a window, electrons a second."""
-    image = np.zeros((window.rows, window.columns))
+    image = np.zeros((roi.rows, roi.columns))
     for wanted in of:
         patch = patches.get(wanted.led_id)
-        if patch is not None and window.overlaps(patch.window):
-            both = window.common(patch.window)
-            image[window.slices(both)] += patch.electrons_per_s[patch.window.slices(both)]
+        if patch is not None and roi.overlaps(patch.roi):
+            both = roi.intersection(patch.roi)
+            image[roi.slices(both)] += patch.electrons_per_s[patch.roi.slices(both)]
     return image
 
 
@@ -131,7 +131,7 @@ def _position_covariance(information: Array, tilt_sigmas: Array, steps: Sequence
         total[[3, 4], [3, 4]] += tilt_sigmas**-2
     units = np.array(steps)[free]
     scaled = total[np.ix_(free, free)] * np.outer(units, units)
-    if not np.isfinite(scaled).all() or np.linalg.cond(scaled) > WORST_CONDITION:
+    if not np.isfinite(scaled).all() or np.linalg.cond(scaled) > MAX_CONDITION:
         return None
     covariance = np.linalg.inv(scaled) * np.outer(units, units)
     bound: Array = lever[:, free] @ covariance @ lever[:, free].T

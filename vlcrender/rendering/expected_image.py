@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vlcrender.camera.roi import Window
+from vlcrender.camera.roi import Roi
 
 Image = NDArray[np.float32]
 
@@ -27,13 +27,13 @@ class LedPatch:
     """Share of the LED's image that is in the view: more where windows reach beyond the sensor."""
 
     @property
-    def window(self) -> Window:
+    def roi(self) -> Roi:
         """The pixels of the patch."""
-        return Window(self.row, self.column, *self.electrons_per_s.shape)
+        return Roi(self.row, self.column, *self.electrons_per_s.shape)
 
 
 @dataclass(frozen=True)
-class Reflection:
+class SpecularReflection:
     """An LED's light by way of a window pane: a false image of it, which flickers with the LED."""
 
     led_id: int
@@ -42,35 +42,35 @@ class Reflection:
     electrons_per_s: Image
 
     @property
-    def window(self) -> Window:
+    def roi(self) -> Roi:
         """The pixels of the reflection."""
-        return Window(self.row, self.column, *self.electrons_per_s.shape)
+        return Roi(self.row, self.column, *self.electrons_per_s.shape)
 
 
 @dataclass(frozen=True)
-class ViewPart:
+class ExpectedRegion:
     """The view in one window: `background_e_per_s` (rows, columns), and a patch for each LED that lights a pixel."""
 
-    window: Window
+    roi: Roi
     background_e_per_s: Image
     patches: tuple[LedPatch, ...]
-    reflections: tuple[Reflection, ...] = ()
+    reflections: tuple[SpecularReflection, ...] = ()
 
     def expected_electrons(self, exposure_s: float, gains: Mapping[int, float] | None = None) -> Image:
         """Mean electrons of an exposure, (rows, columns). `gains`: by LED id, 1 where not given."""
         image = self.background_e_per_s * np.float32(exposure_s)
-        lights: list[LedPatch | Reflection] = [*self.patches, *self.reflections]
+        lights: list[LedPatch | SpecularReflection] = [*self.patches, *self.reflections]
         for patch in lights:
             gain = 1.0 if gains is None else gains.get(patch.led_id, 1.0)
-            image[self.window.slices(patch.window)] += patch.electrons_per_s * np.float32(gain * exposure_s)
+            image[self.roi.slices(patch.roi)] += patch.electrons_per_s * np.float32(gain * exposure_s)
         return image
 
 
 @dataclass(frozen=True)
-class View:
+class ExpectedImage:
     """A camera's view of a scene: parts that share no pixel. A full frame is one part."""
 
-    parts: tuple[ViewPart, ...]
+    parts: tuple[ExpectedRegion, ...]
 
     @property
     def patches(self) -> tuple[LedPatch, ...]:

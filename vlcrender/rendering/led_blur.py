@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from vlcrender.camera.intrinsics import Camera, Pose, transform
 from vlcrender.camera.lens import SplitKernel, blur, blur_kernel, split_for, split_kernel
-from vlcrender.camera.roi import Window
+from vlcrender.camera.roi import Roi
 from vlcrender.rendering.led_coverage import leds_that_may_be_seen
 from vlcrender.rendering.led_edges import LedEdges
 from vlcrender.scene.loader import Leds
@@ -47,7 +47,7 @@ class LedBlur:
         kernel = self.splits[i]
         return 1 if kernel is None else kernel.split
 
-    def blurred(self, i: int, light: Array, window: Window, edges: Sequence[LedEdges], worth: float) -> Array:
+    def blurred(self, i: int, light: Array, roi: Roi, edges: Sequence[LedEdges], worth: float) -> Array:
         """The light of LED `i` in a window after the lens, in the window grown by the radius of its kernel.
 
         edges: of its images at one or more poses; worth: what 1 of their excess is in terms of `light`.
@@ -60,7 +60,7 @@ class LedBlur:
         parts = kernel.parts.reshape(n * n, m * m)
         for at in edges:
             excess = worth / n**2 * at.excess.reshape(-1, n * n)
-            for row, column, of_pixel in zip(at.rows - window.row, at.columns - window.column, excess, strict=True):
+            for row, column, of_pixel in zip(at.rows - roi.row, at.columns - roi.column, excess, strict=True):
                 # not `@`: the last bits of a matrix product may depend on threads and processor
                 spread[row : row + m, column : column + m] += np.einsum("p,pq->q", of_pixel, parts).reshape(m, m)
         positive: Array = np.maximum(spread, 0.0)

@@ -34,7 +34,7 @@ CELLS_AT_ONCE = 500_000
 
 
 @dataclass(frozen=True)
-class LedImage:
+class LedCoverage:
     """A window of the sensor around one LED. `coverage` (rows, columns) starts at pixel (row, column)."""
 
     row: int
@@ -44,9 +44,9 @@ class LedImage:
     """Share of the LED's whole image, by area, that falls on the sensor."""
 
 
-def image_of_led(
+def coverage_of_led(
     camera: Camera, pose: Pose, center_m: Array, shape: Disc | Rectangle, margin_px: int = 0
-) -> LedImage | None:
+) -> LedCoverage | None:
     """Image of a horizontal face that faces down, or None where no pixel sees it.
 
     center_m: (3,), world. The window may reach `margin_px` pixels beyond the sensor (row and column may be negative),
@@ -77,7 +77,7 @@ def image_of_led(
             max(0, -row) : max(0, camera.height_px - row), max(0, -column) : max(0, camera.width_px - column)
         ]
         fraction = float(min(on_sensor.sum() / shape.image_area_px(outline), 1.0))
-    return LedImage(row, column, coverage, fraction)
+    return LedCoverage(row, column, coverage, fraction)
 
 
 def leds_that_may_be_seen(

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlcrender.camera.intrinsics import Camera, Pose, rays_world
-from vlcrender.camera.roi import Window
+from vlcrender.camera.roi import Roi
 from vlcrender.core.planar_shapes import Disc, Rectangle, quadrilateral_area
-from vlcrender.rendering.led_coverage import LedImage
+from vlcrender.rendering.led_coverage import LedCoverage
 
 Array = NDArray[np.float64]
 
@@ -36,14 +36,14 @@ class LedEdges:
     columns: NDArray[np.int64]
     excess: Array
 
-    def times(self, image: Array, window: Window) -> "LedEdges":
+    def times(self, image: Array, roi: Roi) -> "LedEdges":
         """The excess times what an image (rows, columns) of the window holds in each pixel."""
-        factor = image[self.rows - window.row, self.columns - window.column]
+        factor = image[self.rows - roi.row, self.columns - roi.column]
         return replace(self, excess=self.excess * factor[:, None, None])
 
 
 def edges_of_led(
-    camera: Camera, pose: Pose, center_m: Array, shape: Disc | Rectangle, image: LedImage, split: int
+    camera: Camera, pose: Pose, center_m: Array, shape: Disc | Rectangle, image: LedCoverage, split: int
 ) -> LedEdges:
     """The edge pixels of an LED's image, split x split parts each; `split` is a power of 2.
 

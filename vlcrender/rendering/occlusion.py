@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlcrender.camera.intrinsics import Camera, Pose, ray_of_pixel
-from vlcrender.camera.roi import Window, merged
+from vlcrender.camera.roi import Roi, merged
 from vlcrender.core.backend import dr, exact_math, mi
 from vlcrender.rendering.background import Background, differs_from_neighbour, sub_pixels
 from vlcrender.scene.loader import Scene
@@ -19,7 +19,7 @@ OUTSIDE = np.uint8(2)
 Array = NDArray[np.float64]
 
 
-class Obstacles:
+class Occlusion:
     """What may stand between a camera and the LEDs of one scene, found by rays through its surfaces."""
 
     def __init__(self, scene: Scene, background: Background) -> None:
@@ -38,7 +38,7 @@ class Obstacles:
         self,
         camera: Camera,
         pose: Pose,
-        images: Sequence[tuple[float, Window, NDArray[np.bool_]]],
+        images: Sequence[tuple[float, Roi, NDArray[np.bool_]]],
         mirror: tuple[int, Pose] | None = None,
     ) -> list[Array | float]:
         """Share of each lit pixel from which nothing hides the plane of an LED, (rows, columns); 1.0 where nowhere.
@@ -48,13 +48,13 @@ class Obstacles:
         """
         shares: list[Array | float] = [1.0] * len(images)
         for height_m in dict.fromkeys(height for height, _, _ in images):
-            same = [(n, window, lit) for n, (height, window, lit) in enumerate(images) if height == height_m]
+            same = [(n, roi, lit) for n, (height, roi, lit) in enumerate(images) if height == height_m]
             # LEDs behind one diffuser light the same pixels: each pixel's ray is cast once.
-            for around in merged(window for _, window, _ in same):
-                inside = [(n, window, lit) for n, window, lit in same if around.holds(window)]
+            for around in merged(roi for _, roi, _ in same):
+                inside = [(n, roi, lit) for n, roi, lit in same if around.contains(roi)]
                 asked = np.zeros((around.rows, around.columns), dtype=bool)
-                for _, window, lit in inside:
-                    asked[around.slices(window)] |= lit
+                for _, roi, lit in inside:
+                    asked[around.slices(roi)] |= lit
                 rows, columns = np.nonzero(asked)
                 with exact_math():
                     u, v = (
@@ -63,10 +63,10 @@ class Obstacles:
                     )
                     clear = np.ones(asked.shape, dtype=bool)
                     clear[rows, columns] = self._reaches(camera, pose, height_m, mirror, u, v)
-                    for n, window, lit in inside:
-                        here = clear[around.slices(window)]
+                    for n, roi, lit in inside:
+                        here = clear[around.slices(roi)]
                         if not here[lit].all():
-                            shares[n] = self._finer(camera, pose, height_m, mirror, window, lit, here)
+                            shares[n] = self._finer(camera, pose, height_m, mirror, roi, lit, here)
         return shares
 
     def _finer(
@@ -75,7 +75,7 @@ class Obstacles:
         pose: Pose,
         height_m: float,
         mirror: tuple[int, Pose] | None,
-        window: Window,
+        roi: Roi,
         lit: NDArray[np.bool_],
         clear: NDArray[np.bool_],
     ) -> Array:
@@ -84,7 +84,7 @@ class Obstacles:
         if clear[lit].any():  # an edge crosses the LED
             labels = np.where(lit, clear, OUTSIDE)
             rows, columns = np.nonzero(lit & differs_from_neighbour(labels))
-            u, v = sub_pixels(rows + window.row, columns + window.column)
+            u, v = sub_pixels(rows + roi.row, columns + roi.column)
             each = self._reaches(camera, pose, height_m, mirror, u, v)
             share[rows, columns] = each.reshape(len(rows), -1).mean(axis=1)
         return share
@@ -93,12 +93,12 @@ class Obstacles:
         self, camera: Camera, pose: Pose, height_m: float, mirror: tuple[int, Pose] | None, u: "mi.Float", v: "mi.Float"
     ) -> NDArray[np.bool_]:
         """Whether the ray of a pixel position gets to this height, with nothing in its way."""
-        hit = self._background.look(camera, pose, u, v)
+        hit = self._background.trace(camera, pose, u, v)
         if mirror is None:
             way_m, seen_from = hit.distance_m, pose
         else:
-            pane, seen_from = mirror
-            way_m = dr.select(hit.surface == self._background.room.first_pane + pane, hit.path_m, 0.0)
+            glazing, seen_from = mirror
+            way_m = dr.select(hit.surface == self._background.room.first_glazing + glazing, hit.path_m, 0.0)
         # Double precision, and numbers as data: as literals each pose would compile a kernel of its own.
         x, y, z = ray_of_pixel(camera, mi.Float64(u), mi.Float64(v), dr)
         up = [dr.opaque(mi.Float64, number) for number in seen_from.rotation[:, 2].tolist()]

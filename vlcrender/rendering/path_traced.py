@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from vlcrender.camera.intrinsics import Camera, Pose, mitsuba_to_world, ray_of_pixel
 from vlcrender.core.backend import dr, mi
 from vlcrender.errors import InputError
-from vlcrender.light.mitsuba_room import BEHIND_M, pane_bsdf, room_shape
+from vlcrender.light.mitsuba_room import BEHIND_M, glazing_bsdf, room_shape
 from vlcrender.scene.furniture import furniture_meshes
 from vlcrender.scene.loader import Scene
 from vlcrender.scene.surfaces import TOUCH_M, Surface
@@ -29,7 +29,7 @@ LED_STANDOFF_M = 1e-5
 SHEET_PIXELS = 16
 """Pixels, linear in between, of a diffuser's image in the distance that LEDs are behind it."""
 MAX_DEPTH = 24
-MOST_PANES = 4
+MAX_GLAZINGS = 4
 """Panes met one after the other on the way to what is looked at."""
 
 
@@ -45,7 +45,7 @@ def reference_cd_m2(
     """
     if camera.psf != "none":
         raise InputError(f"camera.psf = {camera.psf!r}: the reference renderer has no diffraction; it has to be 'none'")
-    bare = np.array([sheet is None for sheet in scene.leds.sheets])
+    bare = np.array([diffuser is None for diffuser in scene.leds.diffusers])
     if not np.allclose(scene.leds.orders[bare], 1.0):
         raise InputError("half_power_deg: the reference renderer's LEDs are Lambertian; it has to be 60")
     loaded = mi.load_dict(scene_dict(scene, camera, pose), optimize=False)
@@ -74,26 +74,28 @@ class _FirstSurface(mi.SamplingIntegrator):
 
     def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True) -> Any:
         """Mitsuba's interface: (luminance, whether anything was met, no further channels)."""
-        luminance, met = _look(scene, sampler, mi.Ray3f(ray), mi.Bool(active))
+        luminance, met = _trace(scene, sampler, mi.Ray3f(ray), mi.Bool(active))
         return self._flat_cd_m2 * luminance, met, []
 
 
 @dr.syntax
-def _look(scene: Any, sampler: Any, ray: Any, active: Any) -> Any:
-    met, panes = mi.Bool(False), mi.UInt32(0)
+def _trace(scene: Any, sampler: Any, ray: Any, active: Any) -> Any:
+    met, glazings = mi.Bool(False), mi.UInt32(0)
     reflectance: Any = mi.Float(0.0)
     while active:
         si = scene.ray_intersect(ray, active)
         bsdf = si.bsdf()
         active &= si.is_valid()
-        on_pane = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) & (panes < MOST_PANES)
-        diffuse = mi.unpolarized_spectrum(bsdf.eval_diffuse_reflectance(si, active & ~on_pane))[0]
-        reflectance = dr.select(active & ~on_pane, diffuse, reflectance)
+        on_glazing = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) & (glazings < MAX_GLAZINGS)
+        diffuse = mi.unpolarized_spectrum(bsdf.eval_diffuse_reflectance(si, active & ~on_glazing))[0]
+        reflectance = dr.select(active & ~on_glazing, diffuse, reflectance)
         met |= active
-        sample, _ = bsdf.sample(mi.BSDFContext(), si, sampler.next_1d(on_pane), sampler.next_2d(on_pane), on_pane)
+        sample, _ = bsdf.sample(
+            mi.BSDFContext(), si, sampler.next_1d(on_glazing), sampler.next_2d(on_glazing), on_glazing
+        )
         ray = si.spawn_ray(si.to_world(sample.wo))
-        panes += 1
-        active &= on_pane
+        glazings += 1
+        active &= on_glazing
     return reflectance, met
 
 
@@ -165,16 +167,16 @@ def scene_dict(scene: Scene, camera: Camera, pose: Pose) -> dict[str, object]:
             number += 1
     for i, mesh in enumerate(furniture_meshes(scene, 0)):
         tree[f"furniture{i}"] = room_shape(mesh, np.zeros(len(mesh.vertices_m)))
-    for i, pane in enumerate(scene.panes):
-        frame = _frame(pane.corner_m, pane.edge_u_m, pane.edge_v_m)
-        tree[f"pane{i}"] = _shape("rectangle", frame, pane_bsdf(pane), 0.0)
+    for i, glazing in enumerate(scene.glazings):
+        frame = _frame(glazing.corner_m, glazing.edge_u_m, glazing.edge_v_m)
+        tree[f"pane{i}"] = _shape("rectangle", frame, glazing_bsdf(glazing), 0.0)
         behind = frame.copy()
         behind[:3, 3] -= BEHIND_M * frame[:3, 2]
         behind[:3, :2] *= 1 + BEHIND_M
-        tree[f"outside{i}"] = _shape("rectangle", behind, _diffuse(0.0), pane.luminance_cd_m2)
+        tree[f"outside{i}"] = _shape("rectangle", behind, _diffuse(0.0), glazing.luminance_cd_m2)
     leds, face = scene.leds, scene.settings.led_reflectance
     for i in range(len(leds)):
-        if leds.sheets[i] is not None:
+        if leds.diffusers[i] is not None:
             continue  # its sheet shines
         radius = leds.radii_m[i]
         frame = np.diag([radius, -radius, -1.0, 1.0])  # faces down
@@ -217,23 +219,23 @@ def _sheet_cd_m2(scene: Scene, surface: Surface) -> "mi.Bitmap | None":
     low = surface.corner_m
     high = low + surface.edge_u_m + surface.edge_v_m
     lit = [
-        (sheet, scene.leds.luminances_cd_m2[i])
-        for i, sheet in enumerate(scene.leds.sheets)
-        if sheet is not None
+        (diffuser, scene.leds.luminances_cd_m2[i])
+        for i, diffuser in enumerate(scene.leds.diffusers)
+        if diffuser is not None
         and abs(low[2] - scene.leds.centers_m[i, 2]) + abs(high[2] - low[2]) < TOUCH_M
-        and np.allclose(sheet.opening_m, [*low[:2], *high[:2]], rtol=0, atol=TOUCH_M)
+        and np.allclose(diffuser.opening_m, [*low[:2], *high[:2]], rtol=0, atol=TOUCH_M)
     ]
     if not lit:
         return None
-    step_m = min(sheet.distance_m for sheet, _ in lit) / SHEET_PIXELS
+    step_m = min(diffuser.distance_m for diffuser, _ in lit) / SHEET_PIXELS
     columns, rows = (int(np.ceil(np.linalg.norm(edge) / step_m)) for edge in (surface.edge_u_m, surface.edge_v_m))
     b, a = np.meshgrid((np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij")
     at = low + a[..., None] * surface.edge_u_m + b[..., None] * surface.edge_v_m
     total = np.zeros((rows, columns))
-    for sheet, luminance in lit:
-        x0, y0, x1, y1 = sheet.lit_m
+    for diffuser, luminance in lit:
+        x0, y0, x1, y1 = diffuser.lit_m
         within = (at[..., 0] >= x0) & (at[..., 0] <= x1) & (at[..., 1] >= y0) & (at[..., 1] <= y1)
-        total += luminance * within * sheet.luminance(at[..., 0], at[..., 1])
+        total += luminance * within * diffuser.luminance(at[..., 0], at[..., 1])
     return mi.Bitmap(total[:, :, None].astype(np.float32))
 
 

@@ -16,20 +16,20 @@ from numpy.typing import NDArray
 
 from vlcrender.camera.intrinsics import Camera, Pose, project
 from vlcrender.camera.lens import blur
-from vlcrender.camera.roi import LedWindows, Window, led_windows
+from vlcrender.camera.roi import LedRegions, Roi, led_regions
 from vlcrender.core.backend import dr
 from vlcrender.errors import InputError
-from vlcrender.light.lightmap import Light, bake
+from vlcrender.light.lightmap import Lightmap, bake
 from vlcrender.rendering.background import Background
-from vlcrender.rendering.expected_image import Image, LedPatch, Reflection, View, ViewPart
+from vlcrender.rendering.expected_image import ExpectedImage, ExpectedRegion, Image, LedPatch, SpecularReflection
 from vlcrender.rendering.led_blur import LedBlur, led_blur, radius_px
-from vlcrender.rendering.led_radiance import LedLight, led_lights
-from vlcrender.rendering.occlusion import Obstacles
-from vlcrender.rendering.specular_reflection import blurred, false_images
+from vlcrender.rendering.led_radiance import LedImage, led_images
+from vlcrender.rendering.occlusion import Occlusion
+from vlcrender.rendering.specular_reflection import blurred, specular_reflections
 from vlcrender.scene.loader import Scene
 from vlcrender.sensor.radiometry import Detector, Silicon, electron_rate_per_cd_m2
 
-MOST_PIXELS = 16
+MAX_PIXELS = 16
 """How many times the sensor's pixels windows may hold."""
 
 Array = NDArray[np.float64]
@@ -38,17 +38,17 @@ Array = NDArray[np.float64]
 class Renderer:
     """Renders views of one scene."""
 
-    def __init__(self, scene: Scene, light: Light | None = None, detector: Detector | None = None) -> None:
+    def __init__(self, scene: Scene, light: Lightmap | None = None, detector: Detector | None = None) -> None:
         """Prepare a scene. `light` is its bake, made or taken from the cache where not given; `detector`, silicon."""
         self.scene = scene
         self.detector = detector or Silicon()
         self._light = light or bake(scene)
         self._background = Background(scene, self._light)
-        self._obstacles = Obstacles(scene, self._background)
+        self._obstacles = Occlusion(scene, self._background)
 
-    def view(
-        self, camera: Camera, pose: Pose, windows: LedWindows | None = None, during: Sequence[Pose] | None = None
-    ) -> View:
+    def expected_image(
+        self, camera: Camera, pose: Pose, regions: LedRegions | None = None, during: Sequence[Pose] | None = None
+    ) -> ExpectedImage:
         """Render one view, of the whole sensor or of windows alone, which costs the windows alone.
 
         Of a camera that moves, `during` are poses spread evenly over the exposure, whose mean is the view, and `pose`
@@ -59,38 +59,38 @@ class Renderer:
         for place in places:
             check_inside(self.scene, place)
         leds, blurs = self.scene.leds, led_blur(self.scene.leds, camera, pose)
-        lights = [led_lights(leds, self._obstacles, camera, place, windows, blurs) for place in places]
-        lit = _lit_windows(camera, lights, blurs, windows)
-        frames = (Window.of_sensor(camera),) if windows is None else led_windows(lit.values(), camera, windows)
+        lights = [led_images(leds, self._obstacles, camera, place, regions, blurs) for place in places]
+        lit = _lit_regions(camera, lights, blurs, regions)
+        frames = (Roi.of_sensor(camera),) if regions is None else led_regions(lit.values(), camera, regions)
         _check_size(frames, camera)
         backgrounds, reflections = self._rooms(camera, places, frames, lights, blurs)
         patches = self._patches(camera, pose, lights, lit, blurs)
-        return View(
+        return ExpectedImage(
             tuple(
-                ViewPart(
+                ExpectedRegion(
                     frame,
                     background,
-                    tuple(p for p in patches if frame.holds(p.window)),
-                    tuple(r for r in reflections if frame.holds(r.window)),
+                    tuple(p for p in patches if frame.contains(p.roi)),
+                    tuple(r for r in reflections if frame.contains(r.roi)),
                 )
                 for frame, background in zip(frames, backgrounds, strict=True)
             )
         )
 
     def led_patches(
-        self, camera: Camera, pose: Pose, windows: LedWindows | None = None, blurred_at: Pose | None = None
+        self, camera: Camera, pose: Pose, regions: LedRegions | None = None, blurred_at: Pose | None = None
     ) -> tuple[LedPatch, ...]:
         """The LEDs' own light alone: the patches of `view` in double precision, without the room behind them.
 
         Blurred as at the pose `blurred_at` where given: kernels change in steps of depth, which differences would see.
         """
         leds, blurs = self.scene.leds, led_blur(self.scene.leds, camera, blurred_at or pose)
-        lights = [led_lights(leds, self._obstacles, camera, pose, windows, blurs)]
-        return self._patches(camera, pose, lights, _lit_windows(camera, lights, blurs, windows), blurs, np.float64)
+        lights = [led_images(leds, self._obstacles, camera, pose, regions, blurs)]
+        return self._patches(camera, pose, lights, _lit_regions(camera, lights, blurs, regions), blurs, np.float64)
 
     def background_cd_m2(self, camera: Camera, pose: Pose) -> Image:
         """Luminance of the room times relative illumination, mean over each pixel, (height, width); sharp, no LEDs."""
-        images, _ = self._background.images(camera, pose, (Window.of_sensor(camera),), (1.0, 1.0))
+        images, _ = self._background.images(camera, pose, (Roi.of_sensor(camera),), (1.0, 1.0))
         return images[0]
 
     def _rates(self, camera: Camera) -> tuple[float, float]:
@@ -106,50 +106,50 @@ class Renderer:
         self,
         camera: Camera,
         places: Sequence[Pose],
-        frames: Sequence[Window],
-        lights: Sequence[Mapping[int, LedLight]],
+        frames: Sequence[Roi],
+        lights: Sequence[Mapping[int, LedImage]],
         blurs: LedBlur,
-    ) -> tuple[list[Image], list[Reflection]]:
+    ) -> tuple[list[Image], list[SpecularReflection]]:
         """The windows without the LEDs' own light, and its reflections: means over the places, blurred."""
-        sensor = Window.of_sensor(camera)
-        grown = [frame.grown(blurs.spread_px) for frame in frames]
-        wide = [w.common(sensor) if sensor.holds(f) else w for f, w in zip(frames, grown, strict=True)]
+        sensor = Roi.of_sensor(camera)
+        padded = [frame.padded(blurs.spread_px) for frame in frames]
+        wide = [w.intersection(sensor) if sensor.contains(f) else w for f, w in zip(frames, padded, strict=True)]
         rates = self._rates(camera)
         totals: list[Image] | None = None
-        reflections: list[Reflection] = []
+        reflections: list[SpecularReflection] = []
         for place, seen in zip(places, lights, strict=True):
             backgrounds, surfaces = self._background.images(camera, place, wide, rates)
             self._hide_behind_leds(wide, backgrounds, seen, rates)
             totals = backgrounds if totals is None else [t + b for t, b in zip(totals, backgrounds, strict=True)]
-            for number in range(len(self.scene.panes)):
-                label = self._background.room.first_pane + number
+            for number in range(len(self.scene.glazings)):
+                label = self._background.room.first_glazing + number
                 if any((s == label).any() for s in surfaces):
                     lamp = rates[0] / len(places)
-                    reflections += false_images(self.scene, self._obstacles, camera, place, number, wide, lamp)
+                    reflections += specular_reflections(self.scene, self._obstacles, camera, place, number, wide, lamp)
         assert totals is not None  # there is at least one place
         means = []
-        for total, window, frame in zip(totals, wide, frames, strict=True):
+        for total, roi, frame in zip(totals, wide, frames, strict=True):
             mean = total if len(places) == 1 else total / np.float32(len(places))
-            means.append(np.ascontiguousarray(blur(mean, blurs.typical, "edge")[window.slices(frame)]))
+            means.append(np.ascontiguousarray(blur(mean, blurs.typical, "edge")[roi.slices(frame)]))
         return means, blurred(reflections, blurs.typical, frames, sensor)
 
     def _hide_behind_leds(
         self,
-        frames: Sequence[Window],
+        frames: Sequence[Roi],
         backgrounds: list[Image],
-        lights: Mapping[int, LedLight],
+        lights: Mapping[int, LedImage],
         rates: tuple[float, float],
     ) -> None:
         """LED faces cover what is behind them and reflect the room's light; changes the backgrounds."""
         corners = len(self._light.mesh.vertices_m)
-        faces = rates[0] * self._light.led_cd_m2()[corners:] + rates[1] * self._light.surround_cd_m2()[corners:]
+        faces = rates[0] * self._light.led_cd_m2()[corners:] + rates[1] * self._light.ambient_cd_m2()[corners:]
         for i, light in lights.items():
-            if self.scene.leds.sheets[i] is not None:
+            if self.scene.leds.diffusers[i] is not None:
                 continue  # a diffuser is one of the room's surfaces
             for frame, background in zip(frames, backgrounds, strict=True):
-                if frame.overlaps(light.window):
-                    both = frame.common(light.window)
-                    here, there = frame.slices(both), light.window.slices(both)
+                if frame.overlaps(light.roi):
+                    both = frame.intersection(light.roi)
+                    here, there = frame.slices(both), light.roi.slices(both)
                     coverage = light.coverage[there]
                     hidden = background[here] * (1 - coverage)
                     background[here] = hidden + faces[i] * coverage * light.weight[there]
@@ -158,8 +158,8 @@ class Renderer:
         self,
         camera: Camera,
         pose: Pose,
-        lights: Sequence[Mapping[int, LedLight]],
-        lit: Mapping[int, Window],
+        lights: Sequence[Mapping[int, LedImage]],
+        lit: Mapping[int, Roi],
         blurs: LedBlur,
         precision: type[np.floating] = np.float32,
     ) -> tuple[LedPatch, ...]:
@@ -169,23 +169,23 @@ class Renderer:
         center_px, _ = project(camera, pose, leds.centers_m)
         around = _around(lights)
         patches = []
-        for i, window in lit.items():
+        for i, roi in lit.items():
             light = np.zeros((around[i].rows, around[i].columns))
             seen = [of_pose[i] for of_pose in lights if i in of_pose]
             for image in seen:
-                light[around[i].slices(image.window)] += (
+                light[around[i].slices(image.roi)] += (
                     lamp * leds.luminances_cd_m2[i] * image.coverage * image.weight * image.pattern
                 )
             edges = [image.edges for image in seen if image.edges is not None]
             worth = lamp * float(leds.luminances_cd_m2[i]) / len(lights)
             spread = blurs.blurred(i, light / len(lights), around[i], edges, worth)
-            spread = spread[around[i].grown(radius_px(blurs.kernels[i])).slices(window)]
+            spread = spread[around[i].padded(radius_px(blurs.kernels[i])).slices(roi)]
             patches.append(
                 LedPatch(
                     led_id=int(leds.ids[i]),
                     center_px=(float(center_px[i, 0]), float(center_px[i, 1])),
-                    row=window.row,
-                    column=window.column,
+                    row=roi.row,
+                    column=roi.column,
                     electrons_per_s=np.ascontiguousarray(spread, dtype=precision),
                     visible_fraction=sum(image.visible_fraction for image in seen) / len(lights),
                     imaged_fraction=sum(image.imaged_fraction for image in seen) / len(lights),
@@ -194,32 +194,32 @@ class Renderer:
         return tuple(patches)
 
 
-def _around(lights: Sequence[Mapping[int, LedLight]]) -> dict[int, Window]:
+def _around(lights: Sequence[Mapping[int, LedImage]]) -> dict[int, Roi]:
     """Around all that each LED lights, by the LED's index."""
-    lit: dict[int, Window] = {}
+    lit: dict[int, Roi] = {}
     for of_pose in lights:
         for i, light in of_pose.items():
-            lit[i] = lit[i].around(light.window) if i in lit else light.window
+            lit[i] = lit[i].union(light.roi) if i in lit else light.roi
     return dict(sorted(lit.items()))
 
 
-def _lit_windows(
-    camera: Camera, lights: Sequence[Mapping[int, LedLight]], blurs: LedBlur, windows: LedWindows | None
-) -> dict[int, Window]:
+def _lit_regions(
+    camera: Camera, lights: Sequence[Mapping[int, LedImage]], blurs: LedBlur, regions: LedRegions | None
+) -> dict[int, Roi]:
     """The pixels of the view that each LED lights, blur included, by the LED's index."""
-    lit = {i: window.grown(radius_px(blurs.kernels[i])) for i, window in _around(lights).items()}
-    if windows is not None and windows.overscan:
+    lit = {i: roi.padded(radius_px(blurs.kernels[i])) for i, roi in _around(lights).items()}
+    if regions is not None and regions.overscan:
         return lit
-    sensor = Window.of_sensor(camera)
-    return {i: window.common(sensor) for i, window in lit.items() if sensor.overlaps(window)}
+    sensor = Roi.of_sensor(camera)
+    return {i: roi.intersection(sensor) for i, roi in lit.items() if sensor.overlaps(roi)}
 
 
-def _check_size(frames: Sequence[Window], camera: Camera) -> None:
+def _check_size(frames: Sequence[Roi], camera: Camera) -> None:
     """Raise InputError where windows hold too many pixels."""
-    pixels, most = sum(frame.pixels for frame in frames), MOST_PIXELS * Window.of_sensor(camera).pixels
+    pixels, most = sum(frame.pixels for frame in frames), MAX_PIXELS * Roi.of_sensor(camera).pixels
     if pixels > most:
         raise InputError(
-            f"windows: overscan makes {pixels} pixels of LED windows; at most {most}, {MOST_PIXELS} times the "
+            f"windows: overscan makes {pixels} pixels of LED windows; at most {most}, {MAX_PIXELS} times the "
             "sensor's, are allowed: lower margin_px, or leave overscan out"
         )
 

@@ -8,15 +8,15 @@ from numpy.typing import NDArray
 
 from vlcrender.camera.intrinsics import Camera, Pose, ray_world
 from vlcrender.camera.lens import blur, relative_illumination
-from vlcrender.camera.roi import Window
-from vlcrender.rendering.expected_image import Reflection
+from vlcrender.camera.roi import Roi
+from vlcrender.rendering.expected_image import SpecularReflection
 from vlcrender.rendering.led_blur import radius_px
-from vlcrender.rendering.led_coverage import image_of_led, leds_that_may_be_seen
+from vlcrender.rendering.led_coverage import coverage_of_led, leds_that_may_be_seen
 from vlcrender.rendering.led_radiance import face_of_led, luminance_pattern
-from vlcrender.rendering.occlusion import Obstacles
-from vlcrender.scene.fresnel import pane_reflectance
+from vlcrender.rendering.occlusion import Occlusion
+from vlcrender.scene.fresnel import glazing_reflectance
 from vlcrender.scene.loader import Scene
-from vlcrender.scene.surfaces import Pane
+from vlcrender.scene.surfaces import Glazing
 
 Array = NDArray[np.float64]
 
@@ -34,10 +34,10 @@ class MirroredPose(Pose):
         return product
 
 
-def mirrored_pose(pose: Pose, pane: Pane) -> MirroredPose:
+def mirrored_pose(pose: Pose, glazing: Glazing) -> MirroredPose:
     """A camera's mirror image in a pane."""
-    mirror = np.eye(3) - 2 * np.outer(pane.normal, pane.normal)
-    behind = pane.mirrored(np.array(pose.position_m))
+    mirror = np.eye(3) - 2 * np.outer(glazing.normal, glazing.normal)
+    behind = glazing.mirrored(np.array(pose.position_m))
     return MirroredPose(
         (float(behind[0]), float(behind[1]), float(behind[2])),
         pose.tilt_x_deg,
@@ -47,62 +47,60 @@ def mirrored_pose(pose: Pose, pane: Pane) -> MirroredPose:
     )
 
 
-def false_images(
+def specular_reflections(
     scene: Scene,
-    obstacles: Obstacles,
+    occlusion: Occlusion,
     camera: Camera,
     pose: Pose,
     number: int,
-    frames: Sequence[Window],
+    frames: Sequence[Roi],
     e_per_s_per_cd_m2: float,
-) -> list[Reflection]:
+) -> list[SpecularReflection]:
     """LEDs in the pane of this number, as far as it reaches and nothing stands in the way to it or from it.
 
     `e_per_s_per_cd_m2`: what 1 cd/m2 of an LED is worth on the axis. In parts, one for each frame that a false image
     reaches into; not blurred.
     """
-    leds, pane = scene.leds, scene.panes[number]
-    mirrored = mirrored_pose(pose, pane)
+    leds, glazing = scene.leds, scene.glazings[number]
+    mirrored = mirrored_pose(pose, glazing)
     found = []
     for i in leds_that_may_be_seen(camera, mirrored, leds.centers_m, leds.reaches_m).tolist():
-        image = image_of_led(camera, mirrored, *face_of_led(leds, i))
+        image = coverage_of_led(camera, mirrored, *face_of_led(leds, i))
         if image is None:
             continue
-        window = Window(image.row, image.column, *image.coverage.shape)
-        if not any(frame.overlaps(window) for frame in frames):
+        roi = Roi(image.row, image.column, *image.coverage.shape)
+        if not any(frame.overlaps(roi) for frame in frames):
             continue
         lit = image.coverage > 0
-        (clear,) = obstacles.clear_shares(
-            camera, pose, [(float(leds.centers_m[i, 2]), window, lit)], (number, mirrored)
-        )
-        u, v = window.centers_px()
+        (clear,) = occlusion.clear_shares(camera, pose, [(float(leds.centers_m[i, 2]), roi, lit)], (number, mirrored))
+        u, v = roi.centers_px()
         x, y, z = ray_world(camera, mirrored, u, v)
-        east, north, up = pane.normal.tolist()
+        east, north, up = glazing.normal.tolist()
         cosine = np.abs(x * east + y * north + z * up) / np.sqrt(x * x + y * y + z * z)
-        weight = relative_illumination(camera, u, v) * pane_reflectance(cosine, pane.refractive_index, np.sqrt)
-        pattern = luminance_pattern(leds, i, camera, mirrored, window)
+        weight = relative_illumination(camera, u, v) * glazing_reflectance(cosine, glazing.refractive_index, np.sqrt)
+        pattern = luminance_pattern(leds, i, camera, mirrored, roi)
         light = e_per_s_per_cd_m2 * leds.luminances_cd_m2[i] * image.coverage * clear * weight * pattern
         for frame in frames:
-            if frame.overlaps(window):
-                both = frame.common(window)
-                part = light[window.slices(both)]
+            if frame.overlaps(roi):
+                both = frame.intersection(roi)
+                part = light[roi.slices(both)]
                 if part.any():
-                    found.append(Reflection(int(leds.ids[i]), both.row, both.column, part.astype(np.float32)))
+                    found.append(SpecularReflection(int(leds.ids[i]), both.row, both.column, part.astype(np.float32)))
     return found
 
 
 def blurred(
-    images: Iterable[Reflection], kernel: Array | None, frames: Sequence[Window], sensor: Window
-) -> list[Reflection]:
+    images: Iterable[SpecularReflection], kernel: Array | None, frames: Sequence[Roi], sensor: Roi
+) -> list[SpecularReflection]:
     """False images after the lens's blur, in parts, one for each frame that they reach into."""
     parts = []
     for image in images:
-        window = image.window.grown(radius_px(kernel))
-        if sensor.overlaps(window):
+        roi = image.roi.padded(radius_px(kernel))
+        if sensor.overlaps(roi):
             light = blur(image.electrons_per_s, kernel)
             for frame in frames:
-                both = sensor.common(window)
+                both = sensor.intersection(roi)
                 if frame.overlaps(both):
-                    both = frame.common(both)
-                    parts.append(Reflection(image.led_id, both.row, both.column, light[window.slices(both)]))
+                    both = frame.intersection(both)
+                    parts.append(SpecularReflection(image.led_id, both.row, both.column, light[roi.slices(both)]))
     return parts

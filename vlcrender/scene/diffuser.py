@@ -18,14 +18,14 @@ Array = NDArray[np.float64]
 
 DIM_SHARE = 1e-3
 """What is darker than this part of the foot is left out: 3 % of the light of an LED of order 1, less of narrower."""
-NEAREST_RADII = 3.0
+MIN_DISTANCE_RADII = 3.0
 """An LED is at least this many of its radii behind the sheet: at the foot E is then too large by 11 % at the most."""
 NODES = 32
 """Of the quadrature along each side of a quadrant."""
 
 
 @dataclass(frozen=True)
-class Sheet:
+class Diffuser:
     """The part of a diffuser that one LED lights, a rectangle. Places are the room's (x, y)."""
 
     foot_m: tuple[float, float]

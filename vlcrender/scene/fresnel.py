@@ -3,7 +3,7 @@
 from typing import Any
 
 
-def pane_reflectance(cosine: Any, index: Any, sqrt: Any) -> Any:
+def glazing_reflectance(cosine: Any, index: Any, sqrt: Any) -> Any:
     """Reflectance of a thin pane: Fresnel's F for unpolarised light at both faces, 2 F / (1 + F).
 
     `cosine` is that of the angle of incidence; NumPy or Dr.Jit arrays, with their square root.

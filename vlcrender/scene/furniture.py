@@ -10,7 +10,7 @@ from vlcrender.scene.mesh import Mesh, join, probes_inward
 from vlcrender.scene.schema import Furniture
 
 Array = NDArray[np.float64]
-MOST_TRIANGLES = 2_000_000
+MAX_TRIANGLES = 2_000_000
 
 
 def furniture_meshes(scene: Scene, first_owner: int) -> list[Mesh]:
@@ -82,8 +82,8 @@ def _subdivide(corners: Array, albedo: Array, texel_m: float, where: str) -> tup
         edges = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
         long = edges.max(axis=1) > texel_m * (1 + 1e-9)
         done.append((corners[~long], albedo[~long]))
-        if sum(len(part) for part, _ in done) + 2 * long.sum() > MOST_TRIANGLES:
-            raise InputError(f"{where}: makes more than {MOST_TRIANGLES} triangles at bake.texel_m = {texel_m}")
+        if sum(len(part) for part, _ in done) + 2 * long.sum() > MAX_TRIANGLES:
+            raise InputError(f"{where}: makes more than {MAX_TRIANGLES} triangles at bake.texel_m = {texel_m}")
         corners, albedo, longest = corners[long], albedo[long], edges[long].argmax(axis=1)
         rows = np.arange(len(corners))
         a, b, c = (corners[rows, (longest + i) % 3] for i in range(3))

@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 from vlcrender.config.toml_model import check, read_toml
 from vlcrender.core.random_keys import stream
 from vlcrender.errors import InputError
-from vlcrender.scene.diffuser import NEAREST_RADII, Sheet
+from vlcrender.scene.diffuser import MIN_DISTANCE_RADII, Diffuser
 from vlcrender.scene.schema import PanelDiffuser, PanelGrid, PanelLeds, SceneSettings
 from vlcrender.scene.surfaces import (
     TOUCH_M,
-    Pane,
+    Glazing,
     Surface,
+    glazings_of,
     panel_centers_m,
     panel_opening_m,
     panel_surfaces,
-    panes_of,
     room_surfaces,
 )
 
@@ -41,7 +41,7 @@ class Leds:
     squares: NDArray[np.bool_]
     """Where True the LED is a square of half side `radii_m`, sides along x and y."""
 
-    sheets: tuple[Sheet | None, ...]
+    diffusers: tuple[Diffuser | None, ...]
     """What each lights of a diffuser, which is seen in place of its face."""
 
     def __len__(self) -> int:
@@ -57,10 +57,10 @@ class Leds:
     def reaches_m(self) -> NDArray[np.float64]:
         """From each centre to the farthest point seen to shine: a square's corner, a disc's rim, lit corner."""
         reaches = np.where(self.squares, np.sqrt(2.0), 1.0) * self.radii_m
-        for i, sheet in enumerate(self.sheets):
-            if sheet is not None:
-                x0, y0, x1, y1 = sheet.lit_m
-                x, y = sheet.foot_m
+        for i, diffuser in enumerate(self.diffusers):
+            if diffuser is not None:
+                x0, y0, x1, y1 = diffuser.lit_m
+                x, y = diffuser.foot_m
                 reaches[i] = np.hypot(max(x - x0, x1 - x), max(y - y0, y1 - y))
         return reaches
 
@@ -71,7 +71,7 @@ class Scene:
 
     settings: SceneSettings
     surfaces: tuple[Surface, ...]
-    panes: tuple[Pane, ...]
+    glazings: tuple[Glazing, ...]
     leds: Leds
     folder: Path
     """Where furniture and textures are looked up."""
@@ -99,8 +99,8 @@ def build_scene(settings: SceneSettings, source: str, folder: Path = Path()) -> 
     texture, cannot be used.
     """
     leds = _leds(settings, source)
-    panes = panes_of(settings, source)
-    surfaces = room_surfaces(settings.room, settings.panels, panes, folder, source)
+    glazings = glazings_of(settings, source)
+    surfaces = room_surfaces(settings.room, settings.panels, glazings, folder, source)
     for index, grid in enumerate(settings.panels):
         surfaces += panel_surfaces(grid, np.array(settings.room.size_m), f"{source}: panels[{index}]")
     for index, piece in enumerate(settings.furniture):
@@ -108,7 +108,7 @@ def build_scene(settings: SceneSettings, source: str, folder: Path = Path()) -> 
             raise InputError(
                 f"{source}: furniture[{index}].file = {piece.file!r}: no such file from the scene's folder"
             )
-    return Scene(settings, tuple(surfaces), panes, leds, folder)
+    return Scene(settings, tuple(surfaces), glazings, leds, folder)
 
 
 def _leds(settings: SceneSettings, source: str) -> Leds:
@@ -160,10 +160,10 @@ def _leds(settings: SceneSettings, source: str) -> Leds:
         np.array([shape == "square" for shape in shapes])[order],
         (None,) * len(ids),
     )
-    sheets = [
+    diffusers = [
         None
         if of_led is None
-        else Sheet(
+        else Diffuser(
             (float(leds.centers_m[i, 0]), float(leds.centers_m[i, 1])),
             of_led[0].distance_m,
             of_led[0].transmittance,
@@ -173,7 +173,7 @@ def _leds(settings: SceneSettings, source: str) -> Leds:
         )
         for i, of_led in enumerate(behind[number] for number in order)
     ]
-    leds = replace(leds, sheets=tuple(sheets))
+    leds = replace(leds, diffusers=tuple(diffusers))
     _check_leds(leds, [origins[i] for i in order], np.array(settings.room.size_m), source)
     return leds
 
@@ -189,11 +189,11 @@ def _check_led_array(array: PanelLeds, grid: PanelGrid, where: str) -> None:
                 f"{extent:.4g} m; the panel is {grid.size_m[axis]} m{within}"
             )
     if grid.diffuser is not None:
-        least, most = NEAREST_RADII * array.radius_m, grid.size_m[2]
+        least, most = MIN_DISTANCE_RADII * array.radius_m, grid.size_m[2]
         if not least - TOUCH_M <= grid.diffuser.distance_m <= most + TOUCH_M:
             raise InputError(
                 f"{where}.diffuser.distance_m = {grid.diffuser.distance_m}: has to be from {least:.4g} m, "
-                f"{NEAREST_RADII:g} radii of the LEDs, to {most:.4g} m, the panel's height"
+                f"{MIN_DISTANCE_RADII:g} radii of the LEDs, to {most:.4g} m, the panel's height"
             )
     if array.luminance_cd_m2[0] > array.luminance_cd_m2[1]:
         raise InputError(f"{where}.leds.luminance_cd_m2 = {list(array.luminance_cd_m2)}: the lower value comes first")

@@ -127,7 +127,7 @@ class PanelGrid(Settings):
     leds: PanelLeds
 
 
-class Window(Settings):
+class GlazingEntry(Settings):
     """A pane of glass in a wall. By Fresnel's law it mirrors and lets through what is outside."""
 
     wall: Literal["x=0", "x=max", "y=0", "y=max"]
@@ -174,6 +174,6 @@ class SceneSettings(Settings):
     ambient: Ambient
     led: tuple[LedEntry, ...] = ()
     panels: tuple[PanelGrid, ...] = ()
-    window: tuple[Window, ...] = ()
+    glazing: tuple[GlazingEntry, ...] = ()
     furniture: tuple[Furniture, ...] = ()
     bake: Bake = Bake()

@@ -33,12 +33,12 @@ def point_sources(leds: Leds) -> Sources:
     lights of a diffuser is Lambertian, and four points: the quadrants about its foot, each at its light's centroid.
     Their error is below 7 % at 10 times the LED's distance behind the sheet, and 0.6 % at 30 times (tested).
     """
-    bare = np.array([sheet is None for sheet in leds.sheets])
+    bare = np.array([diffuser is None for diffuser in leds.diffusers])
     centers, intensities = [leds.centers_m[bare]], [(leds.luminances_cd_m2 * leds.areas_m2)[bare]]
     for i in np.flatnonzero(~bare):
-        sheet = leds.sheets[i]
-        assert sheet is not None  # it is not bare
-        at, light = sheet.quadrants()
+        diffuser = leds.diffusers[i]
+        assert diffuser is not None  # it is not bare
+        at, light = diffuser.quadrants()
         centers.append(np.column_stack([at, np.full(len(at), leds.centers_m[i, 2])]))
         intensities.append(leds.luminances_cd_m2[i] * light)
     orders = np.append(leds.orders[bare], np.ones(sum(map(len, intensities[1:]))))

@@ -33,7 +33,7 @@ class Surface:
 
 
 @dataclass(frozen=True)
-class Pane:
+class Glazing:
     """A window pane: the rectangle corner + a * edge_u + b * edge_v, seen from edge_u x edge_v."""
 
     name: str
@@ -61,7 +61,7 @@ class Pane:
         images: NDArray[np.float64] = points_m - 2 * height * self.normal
         return images
 
-    def holds(self, points_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def contains(self, points_m: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Whether points (..., 3) of its plane are within the pane, (...,)."""
         from_corner = points_m - self.corner_m
         inside = np.ones(points_m.shape[:-1], dtype=bool)
@@ -87,7 +87,7 @@ def panel_opening_m(grid: PanelGrid, x: float, y: float) -> tuple[float, float, 
 
 
 def room_surfaces(
-    room: Room, panels: tuple[PanelGrid, ...], panes: tuple[Pane, ...], folder: Path, source: str
+    room: Room, panels: tuple[PanelGrid, ...], glazings: tuple[Glazing, ...], folder: Path, source: str
 ) -> list[Surface]:
     """Floor, ceiling and walls, cut where panels touch and panes are; images are read from below `folder`."""
     o = np.zeros(3)
@@ -99,7 +99,11 @@ def room_surfaces(
         Surface("ceiling", z, y, x, skins["ceiling"].reflectance, _panels_on_ceiling(room, panels), ceiling),
     ]
     for name, (corner, edge_u, edge_v) in _walls(room).items():
-        holes = tuple(_hole(pane, corner, edge_u, edge_v) for pane in panes if pane.name.startswith(f"window {name} "))
+        holes = tuple(
+            _hole(glazing, corner, edge_u, edge_v)
+            for glazing in glazings
+            if glazing.name.startswith(f"glazing {name} ")
+        )
         along = y if name.startswith("x") else x
         texture = _hung(skins["walls"], corner + z, along, -z)
         surfaces.append(Surface(f"wall {name}", corner, edge_u, edge_v, skins["walls"].reflectance, holes, texture))
@@ -161,49 +165,49 @@ def _panels_on_ceiling(room: Room, panels: tuple[PanelGrid, ...]) -> tuple[tuple
 
 
 def _hole(
-    pane: Pane, corner: NDArray[np.float64], edge_u: NDArray[np.float64], edge_v: NDArray[np.float64]
+    glazing: Glazing, corner: NDArray[np.float64], edge_u: NDArray[np.float64], edge_v: NDArray[np.float64]
 ) -> tuple[float, float, float, float]:
-    low = pane.corner_m - corner
-    high = low + pane.edge_u_m + pane.edge_v_m
+    low = glazing.corner_m - corner
+    high = low + glazing.edge_u_m + glazing.edge_v_m
     along = [(float(p @ edge_u / (edge_u @ edge_u)), float(p @ edge_v / (edge_v @ edge_v))) for p in (low, high)]
     (a0, b0), (a1, b1) = along
     return a0, b0, a1, b1
 
 
-def panes_of(settings: SceneSettings, source: str) -> tuple[Pane, ...]:
+def glazings_of(settings: SceneSettings, source: str) -> tuple[Glazing, ...]:
     """The scene's window panes. Raises InputError where one does not fit into its wall or overlaps another."""
-    panes: list[Pane] = []
+    glazings: list[Glazing] = []
     taken: list[tuple[str, tuple[NDArray[np.float64], NDArray[np.float64]]]] = []
-    for index, window in enumerate(settings.window):
-        where = f"{source}: window[{index}]"
-        corner, edge_u, edge_v = _walls(settings.room)[window.wall]
-        along = 1 if window.wall.startswith("x") else 0
+    for index, glazing in enumerate(settings.glazing):
+        where = f"{source}: glazing[{index}]"
+        corner, edge_u, edge_v = _walls(settings.room)[glazing.wall]
+        along = 1 if glazing.wall.startswith("x") else 0
         low = corner.copy()
-        low[along] = window.corner_m[0]
-        low[2] = window.corner_m[1]
+        low[along] = glazing.corner_m[0]
+        low[2] = glazing.corner_m[1]
         high = low.copy()
-        high[along] += window.size_m[0]
-        high[2] += window.size_m[1]
+        high[along] += glazing.size_m[0]
+        high[2] += glazing.size_m[1]
         if (high > np.array(settings.room.size_m) + TOUCH_M).any():
             raise InputError(
                 f"{where}: from {low.round(4).tolist()} to {high.round(4).tolist()} m does not fit "
                 f"into the room of {list(settings.room.size_m)} m"
             )
-        if any(wall == window.wall and _overlap(low, high, *extent, along) for wall, extent in taken):
-            raise InputError(f"{where}: overlaps another window in wall {window.wall}")
-        taken.append((window.wall, (low, high)))
+        if any(wall == glazing.wall and _overlap(low, high, *extent, along) for wall, extent in taken):
+            raise InputError(f"{where}: overlaps another glazing in wall {glazing.wall}")
+        taken.append((glazing.wall, (low, high)))
         span = high - low
-        panes.append(
-            Pane(
-                name=f"window {window.wall} {index}",
+        glazings.append(
+            Glazing(
+                name=f"glazing {glazing.wall} {index}",
                 corner_m=low,
                 edge_u_m=np.where(edge_u != 0, span, 0.0),
                 edge_v_m=np.where(edge_v != 0, span, 0.0),
-                luminance_cd_m2=window.luminance_cd_m2,
-                refractive_index=window.refractive_index,
+                luminance_cd_m2=glazing.luminance_cd_m2,
+                refractive_index=glazing.refractive_index,
             )
         )
-    return tuple(panes)
+    return tuple(glazings)
 
 
 def _overlap(

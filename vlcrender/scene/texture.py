@@ -15,7 +15,7 @@ from vlcrender.errors import InputError
 
 Array = NDArray[np.float64]
 
-MOST_PIXELS = 4_000_000
+MAX_PIXELS = 4_000_000
 """Of an image: the table of sums that a view looks up takes 32 bytes a pixel."""
 
 
@@ -88,9 +88,9 @@ def read_reflectances(path: Path, where: str) -> Array:
         raise InputError(f"{where}: no such file from the scene's folder")
     try:
         with Image.open(path, formats=["PNG"]) as image:
-            if image.width * image.height > MOST_PIXELS:
+            if image.width * image.height > MAX_PIXELS:
                 raise InputError(
-                    f"{where}: is {image.width} x {image.height} pixels; at most {MOST_PIXELS} in all are allowed"
+                    f"{where}: is {image.width} x {image.height} pixels; at most {MAX_PIXELS} in all are allowed"
                 )
             if image.mode not in LARGEST:
                 raise InputError(f"{where}: is no grey image of 8 or 16 bits without transparency")

@@ -18,7 +18,7 @@ ENOUGH_LEDS = 4
 
 
 @dataclass(frozen=True)
-class Coverage:
+class Visibility:
     """Share of `poses` poses that see ENOUGH_LEDS LEDs or more."""
 
     height_m: float
@@ -48,7 +48,7 @@ def leds_in_view(camera: Camera, pose: Pose, scene: Scene, margin_px: float = 0.
     return visible
 
 
-def level_coverage(camera: Camera, scene: Scene, height_m: float, yaw_deg: float) -> Coverage:
+def level_visibility(camera: Camera, scene: Scene, height_m: float, yaw_deg: float) -> Visibility:
     """Level poses on a LEVEL_GRID x LEVEL_GRID grid of cell centres over the floor, LED centres in view."""
     room = scene.room_m
     x = (np.arange(LEVEL_GRID) + 0.5) * room[0] / LEVEL_GRID
@@ -67,10 +67,10 @@ def level_coverage(camera: Camera, scene: Scene, height_m: float, yaw_deg: float
         near = np.array(tree.query_ball_point(center[:2], reach), dtype=np.int64)
         counts[near] += _on_sensor(camera, transform(pose.rotation, center - positions[near]))
     side = "x" if yaw_deg == 0 else "y"
-    return Coverage(height_m, f"level, long side along {side}", len(positions), int((counts >= ENOUGH_LEDS).sum()))
+    return Visibility(height_m, f"level, long side along {side}", len(positions), int((counts >= ENOUGH_LEDS).sum()))
 
 
-def tilted_coverage(camera: Camera, scene: Scene, height_m: float) -> Coverage:
+def tilted_visibility(camera: Camera, scene: Scene, height_m: float) -> Visibility:
     """Random poses: anywhere, 0 to 60 deg on both axes, any yaw; not aimed."""
     generator = stream(0, 0, "tilted-coverage")
     room = scene.room_m
@@ -88,7 +88,7 @@ def tilted_coverage(camera: Camera, scene: Scene, height_m: float) -> Coverage:
     for center in scene.leds.centers_m:
         counts += _on_sensor(camera, ((center - positions)[:, None, :] @ rotations.transpose(0, 2, 1))[:, 0])
     attitude = f"tilted 0 to {TILT_LIMIT_DEG:.0f} deg on both axes, not aimed"
-    return Coverage(height_m, attitude, TILTED_POSES, int((counts >= ENOUGH_LEDS).sum()))
+    return Visibility(height_m, attitude, TILTED_POSES, int((counts >= ENOUGH_LEDS).sum()))
 
 
 def _on_sensor(camera: Camera, p_cam: NDArray[np.float64]) -> NDArray[np.bool_]:

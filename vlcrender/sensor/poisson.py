@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from vlcrender.core.backend import dr, exact_math, mi
 from vlcrender.core.philox import PHILOX, places, seed_of
 
-MOST_TURNS = 1000
+MAX_TURNS = 1000
 """A turn takes a draw with a chance of 0.7 or more, so that none ever gets here; no kernel may run for ever."""
-LARGEST_MEAN = 2.0**22
+MAX_MEAN = 2.0**22
 """Beyond it the float32 arithmetic of the kernel would show."""
 
 
@@ -26,8 +26,8 @@ def poisson(means: NDArray[np.float32], key: str, row: int = 0, column: int = 0)
     of the frame that `key` names. Raises ValueError for other means.
     """
     low, high = float(means.min()), float(means.max())
-    if not 0 <= low <= high <= LARGEST_MEAN:
-        raise ValueError(f"means from {low} to {high} electrons; 0 to {LARGEST_MEAN:.0f} are allowed")
+    if not 0 <= low <= high <= MAX_MEAN:
+        raise ValueError(f"means from {low} to {high} electrons; 0 to {MAX_MEAN:.0f} are allowed")
     with exact_math():
         flat = np.ascontiguousarray(means, dtype=np.float32).ravel()
         count: Any = mi.UInt32(draw(mi.Float(flat), seed_of(key), *places(means.shape, row, column)))
@@ -68,7 +68,7 @@ def draw(mean: Any, seed: Any, column: Any, row: Any) -> Any:
             low |= product <= limit
             steps += dr.select(low, 0.0, 1.0)
         count = dr.select(active, dr.select(large, dr.select(accepted, tried, count), count + steps), count)
-        active &= ~dr.select(large, accepted, low) & (turn < MOST_TURNS)
+        active &= ~dr.select(large, accepted, low) & (turn < MAX_TURNS)
         turn += 1
     return count
 

@@ -17,7 +17,7 @@ def full_well_e(sensor: Sensor, dark_e: float) -> float:
     acting, gain = sensor.acting(), sensor.gain_at_iso_e_per_dn
     parts = [acting["read_noise_e"], acting["adc_noise_dn"] * gain, acting["row_offset_e"], acting["column_offset_e"]]
     noise = max(float(np.linalg.norm(parts)), 1e-6)
-    mean, _ = clipped(np.array(sensor.full_well_e), np.array(noise), _converter_e(sensor))
+    mean, _ = clipped(np.array(sensor.full_well_e), np.array(noise), _adc_e(sensor))
     return float(mean) - dark_e
 
 
@@ -46,15 +46,15 @@ def _temporal_variance_e2(sensor: Sensor, dark_e: float, signal_e: Array) -> Arr
     nodes, weights = np.polynomial.hermite_e.hermegauss(31)
     spread = np.hypot(acting["prnu"] * signal_e, acting["dsnu_e"])
     means = np.maximum((signal_e + dark_e)[:, None] + spread[:, None] * nodes, 1e-9)
-    if sensor.full_well_e <= _converter_e(sensor):
+    if sensor.full_well_e <= _adc_e(sensor):
         variances = clipped(means, np.sqrt(means), sensor.full_well_e)[1] + after_e2
     else:
-        variances = clipped(means, np.sqrt(means + after_e2), _converter_e(sensor))[1]
+        variances = clipped(means, np.sqrt(means + after_e2), _adc_e(sensor))[1]
     average: Array = variances @ weights / weights.sum()
     return average
 
 
-def _converter_e(sensor: Sensor) -> float:
+def _adc_e(sensor: Sensor) -> float:
     """Electrons of the converter's largest number."""
     return (sensor.largest_dn - sensor.black_level_dn) * sensor.gain_at_iso_e_per_dn
 

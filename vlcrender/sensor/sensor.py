@@ -36,7 +36,7 @@ Celsius = Annotated[float, Field(ge=-100, le=150)]
 Iso = Annotated[float, Field(ge=1, le=1e7)]
 
 
-LARGEST_WELL_E = 2.0**22
+MAX_WELL_E = 2.0**22
 """What `poisson` draws at most: beyond it the float32 arithmetic of the kernels would show."""
 SPREADS = ("prnu", "dsnu_e", "read_noise_e", "adc_noise_dn", "row_offset_e", "column_offset_e")
 """Keys of standard deviations."""
@@ -51,7 +51,7 @@ class Sensor(Settings):
     iso: Iso = 100.0
     base_iso: Iso = 100.0
     """What gain and converter noise are given for: at twice this ISO a digital number is half as many electrons."""
-    full_well_e: Annotated[float, Field(gt=0, le=LARGEST_WELL_E)] = 6000.0
+    full_well_e: Annotated[float, Field(gt=0, le=MAX_WELL_E)] = 6000.0
     black_level_dn: Annotated[int, Field(ge=0, le=16382)] = 0
     noise: Literal["shot", "none", "full"] = "shot"
     prnu: Annotated[float, Field(ge=0, le=0.5)] = 0.0

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from vlcrender.core.backend import dr, exact_math, mi
 from vlcrender.core.philox import normals, places, seed_of
-from vlcrender.sensor.poisson import LARGEST_MEAN, draw, poisson
+from vlcrender.sensor.poisson import MAX_MEAN, draw, poisson
 from vlcrender.sensor.sensor import Electrons, Sensor, clip_full_well
 
 
@@ -46,7 +46,7 @@ def expose(
     and its noise is that of the whole frame's pixels there. With `noise = "full"` the dark current gathers electrons
     for `exposure_s`, and the fixed patterns are those of the sensor's `serial` in the camera of this name.
     """
-    expected_e = np.minimum(expected_e, np.float32(LARGEST_MEAN))
+    expected_e = np.minimum(expected_e, np.float32(MAX_MEAN))
     if sensor.noise == "full":
         return _full_chain(sensor, expected_e, key, f"{sensor.serial}/{camera}", (row, column), exposure_s)
     electrons: Electrons = poisson(expected_e, key, row, column) if sensor.noise == "shot" else expected_e
@@ -74,7 +74,7 @@ def _full_chain(
         response, offset = normals(seed_of(f"{individual}/pixels"), column, row)
         mean = mi.Float(np.ascontiguousarray(expected_e).ravel())
         mean = mean * dr.maximum(1.0 + number(sensor.prnu) * response, 0.0)  # 2
-        mean = dr.minimum(mean + number(sensor.dark_electrons(exposure_s)), LARGEST_MEAN)  # 3
+        mean = dr.minimum(mean + number(sensor.dark_electrons(exposure_s)), MAX_MEAN)  # 3
         electrons = draw(mean, seed_of(key), column, row)  # 4
         electrons = electrons + number(sensor.dsnu_e) * offset  # 5
         electrons = dr.minimum(electrons, number(sensor.full_well_e))  # 6

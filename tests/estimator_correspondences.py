@@ -8,7 +8,7 @@ from estimator_synthetic import Array, View, description
 
 from estimator.io.dataset import Accelerometer, Camera, DeviceFrame, Led, Sensor
 from estimator.spots.detect import Spot
-from estimator.spots.identify import Sighting
+from estimator.spots.identify import Correspondence
 
 POINT_M = 1e-6
 """A radius whose eccentricity is nothing: at 3 m it lifts an LED by 3e-13 m."""
@@ -32,13 +32,15 @@ def device(view: View, error_deg: float, rng: np.random.Generator | None = None)
     )
 
 
-def sighted(view: View, leds_m: Array, sigma_px: float = 0.0, rng: np.random.Generator | None = None) -> list[Sighting]:
+def sighted(
+    view: View, leds_m: Array, sigma_px: float = 0.0, rng: np.random.Generator | None = None
+) -> list[Correspondence]:
     """Points (n, 3) seen from a view, with normal errors of their pixels where `rng` is given."""
     pixels = view.project(leds_m)
     if rng is not None:
         pixels = pixels + rng.normal(0, sigma_px, pixels.shape)
     return [
-        Sighting(
+        Correspondence(
             Led(id=k, position_m=(x, y, z), radius_m=POINT_M, shape="disc"),
             Spot(u, v, sigma_px**2 * np.eye(2), u, v, 50, 1000.0, touches_border=False, saturated=False),
         )

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from conftest import ROOT, SMALL
 from PIL import Image
-from test_mosaic import QE
+from test_bayer import QE
 
 from vlcrender.dataset.generate import generate
 from vlcrender.dataset.recipe import load_plan
@@ -77,7 +77,7 @@ def test_a_recipe_gets_its_pictures(tmp_path: Path) -> None:
     assigned = ", ".join(f"{key} = {value}" for key, value in table.items())
     mosaic = ["sensor.mosaic=rggb", f"sensor.quantum_efficiency={{ {assigned} }}"]
     # Exposed until the brightest pixel has 3 900 of 4 095 numbers.
-    metered = ["exposure.kind=peak", "exposure.share_of_saturation=0.65", "exposure.longest_s=1.0"]
+    metered = ["exposure.kind=peak", "exposure.share_of_saturation=0.65", "exposure.max_s=1.0"]
     base = [*(a for a in SMALL if not a.startswith("exposure_s")), *metered, "poses.count=1", "processed={}"]
     for name, more, mode in (("grey", [], "L"), ("colour", mosaic, "RGB")):
         plan = load_plan(ROOT / "datasets/quickstart.toml", [*base, *more])

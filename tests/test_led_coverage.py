@@ -8,15 +8,15 @@ from hypothesis import strategies as st
 from vlcrender.camera.distortion import Distortion
 from vlcrender.camera.intrinsics import Camera, Pose, project, rays_world
 from vlcrender.core.planar_shapes import Disc, Rectangle, circle_polygon_area, rectangle_polygon_area
-from vlcrender.rendering.led_coverage import LedImage, image_of_led, leds_that_may_be_seen
+from vlcrender.rendering.led_coverage import LedCoverage, coverage_of_led, leds_that_may_be_seen
 
 SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 
 
 def image_of_disc(
     camera: Camera, pose: Pose, center_m: np.ndarray, radius_m: float, margin_px: int = 0
-) -> LedImage | None:
-    return image_of_led(camera, pose, center_m, Disc(radius_m), margin_px)
+) -> LedCoverage | None:
+    return coverage_of_led(camera, pose, center_m, Disc(radius_m), margin_px)
 
 
 def area(polygon: np.ndarray, radius: float) -> float:
@@ -214,7 +214,7 @@ def test_every_shape_through_every_lens_covers_the_share_of_each_pixel(
         shape = Disc(size * shape.radius_m)
     else:
         shape = Rectangle((size * shape.size_m[0], size * shape.size_m[1]), shape.yaw_deg)
-    image = image_of_led(camera, pose, center, shape)
+    image = coverage_of_led(camera, pose, center, shape)
     assert image is not None
     n = 64
     rows, columns = image.coverage.shape
@@ -258,7 +258,7 @@ def test_an_image_goes_on_beyond_the_sensor_where_asked(camera: Camera) -> None:
 
 def test_a_level_square_of_whole_pixels_covers_them_and_nothing_else() -> None:
     # 0.1 m at 3 m is 500 px; sides run along pixel borders
-    image = image_of_led(Camera(), Pose((3.0, 3.0, 0.5)), np.array([3.0, 3.0, 3.5]), Rectangle((0.1, 0.1)))
+    image = coverage_of_led(Camera(), Pose((3.0, 3.0, 0.5)), np.array([3.0, 3.0, 3.5]), Rectangle((0.1, 0.1)))
     assert image is not None
     assert image.coverage.sum() == pytest.approx(250_000, rel=1e-9)
     assert image.coverage[1:-1, 1:-1].min() > 1 - 1e-9
@@ -266,7 +266,7 @@ def test_a_level_square_of_whole_pixels_covers_them_and_nothing_else() -> None:
 
 def test_a_turned_square_turns_from_x_towards_y() -> None:
     # a long thin one turned by 45 deg runs from the upper left to the lower right: +x is +u, +y is +v
-    image = image_of_led(Camera(), Pose((3.0, 3.0, 0.5)), np.array([3.0, 3.0, 3.5]), Rectangle((0.02, 0.002), 45.0))
+    image = coverage_of_led(Camera(), Pose((3.0, 3.0, 0.5)), np.array([3.0, 3.0, 3.5]), Rectangle((0.02, 0.002), 45.0))
     assert image is not None
     rows, columns = np.indices(image.coverage.shape)
     u, v = columns - columns.mean(), rows - rows.mean()

@@ -44,11 +44,11 @@ def both_ways(scene: Scene, camera: Camera, pose: Pose, samples: int) -> tuple[n
     reference, variance = reference_cd_m2(scene, camera, pose, samples)
     rate = electron_rate_per_cd_m2(camera, "LED-B3", Silicon())
     u, v = np.meshgrid(np.arange(camera.width_px) + 0.5, np.arange(camera.height_px) + 0.5)
-    view = Renderer(scene).view(camera, pose)
+    view = Renderer(scene).expected_image(camera, pose)
     ours = view.expected_electrons(1.0) / rate / relative_illumination(camera, u, v)
     lit = np.zeros(ours.shape, dtype=bool)
     for patch in (*view.patches, *view.parts[0].reflections):
-        lit[view.parts[0].window.slices(patch.window)] |= patch.electrons_per_s > 0
+        lit[view.parts[0].roi.slices(patch.roi)] |= patch.electrons_per_s > 0
     return ours, reference, variance, lit
 
 
@@ -70,7 +70,11 @@ def test_furniture_hides_leds_and_is_lit_as_in_the_reference(tmp_path: Path) -> 
     ours, reference, variance, lit = both_ways(
         scene, Camera(**SMALL_VIEW), Pose((1.5, 1.5, 0.4), 4.0, -6.0, 30.0), samples
     )
-    alone = Renderer(scene_of(led=leds)).view(Camera(**SMALL_VIEW), Pose((1.5, 1.5, 0.4), 4.0, -6.0, 30.0)).patches
+    alone = (
+        Renderer(scene_of(led=leds))
+        .expected_image(Camera(**SMALL_VIEW), Pose((1.5, 1.5, 0.4), 4.0, -6.0, 30.0))
+        .patches
+    )
     # the box hides one LED at least in part: otherwise this would test nothing
     assert lit.sum() < sum((patch.electrons_per_s > 0).sum() for patch in alone) - 10
 
@@ -93,7 +97,7 @@ def test_furniture_hides_leds_and_is_lit_as_in_the_reference(tmp_path: Path) -> 
 def test_the_light_that_a_pane_mirrors_is_as_in_the_reference() -> None:
     """A pane of index 3 mirrors 40 % and more of an LED half a metre before it onto the floor, which is looked at."""
     led = {"id": 1, "position_m": [0.5, 1.5, 2.5], "radius_m": 0.15, "luminance_cd_m2": 8000.0}
-    pane = {
+    glazing = {
         "wall": "x=0",
         "corner_m": [0.6, 0.2],
         "size_m": [1.5, 2.2],
@@ -101,7 +105,7 @@ def test_the_light_that_a_pane_mirrors_is_as_in_the_reference() -> None:
         "refractive_index": 3.0,
     }
     dark = {"size_m": [3.0, 3.0, 2.5], "reflectance": {"floor": 0.3, "ceiling": 0.1, "walls": 0.1}}
-    scene = scene_of(led=[led], window=[pane], room=dark, ambient={"illuminance_lux": 0.0, "spectrum": "LED-B3"})
+    scene = scene_of(led=[led], glazing=[glazing], room=dark, ambient={"illuminance_lux": 0.0, "spectrum": "LED-B3"})
     ours, reference, variance, lit = both_ways(scene, Camera(**SMALL_VIEW), Pose((1.0, 1.5, 2.2), 180.0), 64)
     assert not lit.any()
     # The mean over all pixels: the reference's noise, the point source's (r / d)^2 = 0.4 %, and 0.5 % as above. Not

@@ -11,7 +11,7 @@ from vlcrender.camera.intrinsics import Camera, Pose, project
 from vlcrender.camera.lens import relative_illumination
 from vlcrender.config.toml_model import check, read_toml
 from vlcrender.errors import InputError
-from vlcrender.rendering.expected_image import View
+from vlcrender.rendering.expected_image import ExpectedImage
 from vlcrender.rendering.path_traced import reference_cd_m2
 from vlcrender.rendering.renderer import Renderer
 from vlcrender.scene.loader import Scene, build_scene
@@ -29,7 +29,7 @@ def office_renderer(office: Scene) -> Renderer:
     return Renderer(office)
 
 
-def centroid(view: View, led_id: int) -> np.ndarray:
+def centroid(view: ExpectedImage, led_id: int) -> np.ndarray:
     """(u, v) of the light of one LED in the image."""
     patch = next(p for p in view.patches if p.led_id == led_id)
     rows, columns = patch.electrons_per_s.shape
@@ -56,7 +56,7 @@ LED_2 = (0.3, 1.9)
 def test_the_bright_spot_moves_the_written_way(
     renderer: Renderer, small_camera: Camera, pose: Pose, direction: tuple[int, int]
 ) -> None:
-    image = renderer.view(small_camera, pose).expected_electrons(1e-4)
+    image = renderer.expected_image(small_camera, pose).expected_electrons(1e-4)
     row, column = np.unravel_index(np.argmax(image), image.shape)
     shift = np.array([column + 0.5 - 200, row + 0.5 - 150])
     assert shift @ direction > 10
@@ -91,7 +91,7 @@ def test_the_background_moves_with_the_spots(office_renderer: Renderer, small_ca
 
 def test_a_filled_pixel_holds_the_leds_luminance(renderer: Renderer) -> None:
     camera = Camera()
-    view = renderer.view(camera, Pose((*LED_2, 0.5)))
+    view = renderer.expected_image(camera, Pose((*LED_2, 0.5)))
     expected = view.expected_electrons(2.5e-4)
     per_cd = 2.5e-4 * electron_rate_per_cd_m2(camera, "LED-B3", Silicon())
     # 8000 cd/m2 of its own and 0.5 * 400 / pi reflected, on the axis; the LEDs' light adds less than 1 lux: 2e-5
@@ -110,7 +110,7 @@ def test_the_ceiling_dims_with_cos4_towards_the_corner(renderer: Renderer) -> No
 def test_centroid_of_a_level_led_is_its_projection(renderer: Renderer) -> None:
     camera = Camera()
     pose = Pose((0.35, 1.8, 0.5))
-    view = renderer.view(camera, pose)
+    view = renderer.expected_image(camera, pose)
     expected, _ = project(camera, pose, np.array([0.3, 1.9, 3.5]))
     # cos^4 tilts the disc's brightness: d(cos^4)/du * r^2/4 = 4 * 500/15000^2 * 60^2/4 = 0.008 px at 500 px off axis
     assert np.abs(centroid(view, 2) - expected).max() < 0.01
@@ -137,8 +137,8 @@ VIEWS = {
 def daylight() -> Renderer:
     """The office with a window in the wall x = 0, bright enough outside to matter."""
     tree = read_toml(ROOT / "scenes/office.toml")
-    window = {"wall": "x=0", "corner_m": [1.5, 0.9], "size_m": [4.0, 2.0], "luminance_cd_m2": 300.0}
-    return Renderer(build_scene(check({**tree, "window": [window]}, SceneSettings, "daylight"), "daylight"))
+    glazing = {"wall": "x=0", "corner_m": [1.5, 0.9], "size_m": [4.0, 2.0], "luminance_cd_m2": 300.0}
+    return Renderer(build_scene(check({**tree, "glazing": [glazing]}, SceneSettings, "daylight"), "daylight"))
 
 
 @pytest.mark.parametrize("name", VIEWS)
@@ -149,11 +149,11 @@ def test_agrees_with_mitsubas_own_integrator(name: str, office_renderer: Rendere
     reference, variance = reference_cd_m2(renderer.scene, camera, pose, samples)
     rate = electron_rate_per_cd_m2(camera, "LED-B3", Silicon())
     u, v = np.meshgrid(np.arange(camera.width_px) + 0.5, np.arange(camera.height_px) + 0.5)
-    view = renderer.view(camera, pose)
+    view = renderer.expected_image(camera, pose)
     ours = view.expected_electrons(1.0) / rate / relative_illumination(camera, u, v)
     lit = np.zeros(ours.shape, dtype=bool)
     for patch in (*view.patches, *view.parts[0].reflections):
-        lit[view.parts[0].window.slices(patch.window)] |= patch.electrons_per_s > 0
+        lit[view.parts[0].roi.slices(patch.roi)] |= patch.electrons_per_s > 0
     assert lit.any(), "an LED has to be in view"
     assert (reference[lit] > 300).any()
 
@@ -191,13 +191,13 @@ def test_narrow_discs_are_mitsubas_and_those_of_whole_pixels_are_not(
     rate = electron_rate_per_cd_m2(camera, "LED-B3", Silicon())
     u, v = np.meshgrid(np.arange(camera.width_px) + 0.5, np.arange(camera.height_px) + 0.5)
     per_cd = rate * relative_illumination(camera, u, v)
-    view = office_renderer.view(camera, STRAIGHT)
+    view = office_renderer.expected_image(camera, STRAIGHT)
     ours = view.expected_electrons(1.0) / per_cd
     monkeypatch.setattr(lens, "MOST_PARTS", 1)
-    whole_pixels = office_renderer.view(camera, STRAIGHT).expected_electrons(1.0) / per_cd
+    whole_pixels = office_renderer.expected_image(camera, STRAIGHT).expected_electrons(1.0) / per_cd
     lit = np.zeros(ours.shape, dtype=bool)
     for patch in view.patches:
-        lit[view.parts[0].window.slices(patch.window)] |= patch.electrons_per_s > 0
+        lit[view.parts[0].roi.slices(patch.roi)] |= patch.electrons_per_s > 0
     added = (whole_pixels - ours)[lit]
     assert np.abs(added).max() > 0.02 * 16000
     # the bounds of each pixel's variance are those of `test_agrees_with_mitsubas_own_integrator`
@@ -211,8 +211,8 @@ def test_narrow_discs_are_mitsubas_and_those_of_whole_pixels_are_not(
 
 def test_two_renderings_are_identical(office_renderer: Renderer, office: Scene, small_camera: Camera) -> None:
     pose = Pose((3.5, 3.2, 0.5), 25, 10, 30)
-    first = office_renderer.view(small_camera, pose).expected_electrons(1e-3)
-    second = Renderer(office).view(small_camera, pose).expected_electrons(1e-3)
+    first = office_renderer.expected_image(small_camera, pose).expected_electrons(1e-3)
+    second = Renderer(office).expected_image(small_camera, pose).expected_electrons(1e-3)
     assert first.tobytes() == second.tobytes()
 
 
@@ -226,7 +226,7 @@ def test_another_thread_renders_the_same_bytes(office_renderer: Renderer) -> Non
 
 def test_gains_switch_single_leds(renderer: Renderer) -> None:
     camera = Camera()
-    view = renderer.view(camera, Pose((*LED_2, 0.5)))
+    view = renderer.expected_image(camera, Pose((*LED_2, 0.5)))
     off = view.expected_electrons(1e-3, gains={2: 0.0})
     assert np.array_equal(off, view.parts[0].background_e_per_s * np.float32(1e-3))
     half = view.expected_electrons(1e-3, gains={2: 0.5})
@@ -237,7 +237,7 @@ def test_gains_switch_single_leds(renderer: Renderer) -> None:
 @pytest.mark.parametrize("position", [(-0.1, 1.0, 1.0), (1.0, 7.0, 1.0), (1.0, 1.0, 3.6), (1.0, 1.0, 0.0)])
 def test_a_camera_outside_the_room_is_refused(renderer: Renderer, position: tuple[float, float, float]) -> None:
     with pytest.raises(InputError, match="not inside the room"):
-        renderer.view(Camera(), Pose(position))
+        renderer.expected_image(Camera(), Pose(position))
 
 
 def test_a_fish_eye_is_sharp_at_its_focus_distance_whatever_the_depth(table1: Scene) -> None:
@@ -247,7 +247,7 @@ def test_a_fish_eye_is_sharp_at_its_focus_distance_whatever_the_depth(table1: Sc
     fish_eye = Camera(**lens, projection="equidistant")
     renderer = Renderer(table1)
     sharp, at_2_m, at_1_m = (
-        next(p for p in renderer.view(camera, pose).patches if p.led_id == 2).electrons_per_s
+        next(p for p in renderer.expected_image(camera, pose).patches if p.led_id == 2).electrons_per_s
         for camera in (fish_eye, *(fish_eye.model_copy(update={"focus_distance_m": m}) for m in (2.0, 1.0)))
     )
     # Focused at 2 m the sensor is 0.15 % farther from the lens: the image is that much larger, 0.02 px, which may bring

@@ -10,7 +10,7 @@ from conftest import ROOT
 from vlcrender.config.toml_model import check, read_toml
 from vlcrender.light.lightmap import bake, led_illuminance_lux, path_traced_lux, room_mesh
 from vlcrender.light.mitsuba_room import mitsuba_scene
-from vlcrender.scene.fresnel import pane_reflectance
+from vlcrender.scene.fresnel import glazing_reflectance
 from vlcrender.scene.loader import Leds, Scene, build_scene, load_scene
 from vlcrender.scene.mesh import Mesh, join, mesh_of_surfaces
 from vlcrender.scene.schema import SceneSettings
@@ -159,9 +159,9 @@ def test_furniture_casts_a_shadow_and_reflects(tmp_path: Path) -> None:
 def test_a_window_lights_the_room_as_its_form_factor_says(tmp_path: Path) -> None:
     """E at a point opposite the middle of a rectangle, 4 corner form factors; the room is black."""
     black = {"floor": 0.0, "ceiling": 0.0, "walls": 0.0}
-    window = {"wall": "x=0", "corner_m": [2.5, 1.0], "size_m": [2.0, 1.5], "luminance_cd_m2": 2000.0}
+    glazing = {"wall": "x=0", "corner_m": [2.5, 1.0], "size_m": [2.0, 1.5], "luminance_cd_m2": 2000.0}
     scene = scene_of(
-        led=[lamp()], window=[window], room={"size_m": [7.0, 7.0, 3.5], "reflectance": black}, bake={"texel_m": 0.35}
+        led=[lamp()], glazing=[glazing], room={"size_m": [7.0, 7.0, 3.5], "reflectance": black}, bake={"texel_m": 0.35}
     )
     light = bake(scene, tmp_path)
     point = np.argmin(np.linalg.norm(light.mesh.vertices_m - [7.0, 3.5, 1.75], axis=1))
@@ -187,13 +187,13 @@ MIRROR = {"wall": "x=0", "corner_m": [3.0, 0.5], "size_m": [1.0, 2.5], "luminanc
 @pytest.mark.parametrize(("y", "mirrored"), [(3.5, True), (3.1, True), (1.9, False), (5.1, False)])
 def test_a_pane_mirrors_an_led_onto_what_its_mirror_image_sees_through_it(y: float, mirrored: bool) -> None:
     """LED at x = 2, its image at x = -2; the point at x = 2 sees it half way, at (y + 3.5) / 2, in the pane or not."""
-    scene = scene_of(led=[lamp(position_m=[2.0, 3.5, 3.5])], window=[MIRROR])
+    scene = scene_of(led=[lamp(position_m=[2.0, 3.5, 3.5])], glazing=[MIRROR])
     blockers, sources = empty_room(room_mesh(scene)), point_sources(scene.leds)
     point, up = np.array([[2.0, y, 0.0]]), np.array([[0.0, 0.0, 1.0]])
     straight = led_illuminance_lux(blockers, point, up, sources)[0]
-    by_pane = led_illuminance_lux(blockers, point, up, sources, scene.panes)[0] - straight
+    by_pane = led_illuminance_lux(blockers, point, up, sources, scene.glazings)[0] - straight
     d2 = 4.0**2 + (y - 3.5) ** 2 + 3.5**2
-    lux = 10000 * np.pi * 0.01**2 * (3.5**2 / d2) / d2 * pane_reflectance(4.0 / np.sqrt(d2), 1.52, np.sqrt)
+    lux = 10000 * np.pi * 0.01**2 * (3.5**2 / d2) / d2 * glazing_reflectance(4.0 / np.sqrt(d2), 1.52, np.sqrt)
     # shadow rays start 0.1 mm off: no matter where the ray is not within that of the pane's border
     assert by_pane == pytest.approx(lux if mirrored else 0.0, rel=1e-9, abs=1e-12)
 
@@ -204,12 +204,11 @@ def test_a_board_takes_the_mirrored_light_before_and_behind_the_pane(tmp_path: P
     for z, covers in ((3.5 * (2 - x) / 4, True), (3.5 * (2 + x) / 4, True), (0.1, False)):
         corners = [(x - 0.1, 3.4), (x + 0.1, 3.4), (x + 0.1, 3.6), (x - 0.1, 3.6)]
         (tmp_path / "b.obj").write_text("".join(f"v {a} {b} {z}\n" for a, b in corners) + "f 1 2 3\nf 1 3 4\n")
-        scene = scene_of(
-            tmp_path, led=[lamp(position_m=[2.0, 3.5, 3.5])], window=[MIRROR], furniture=[{"file": "b.obj"}]
-        )
+        led, furniture = lamp(position_m=[2.0, 3.5, 3.5]), {"file": "b.obj"}
+        scene = scene_of(tmp_path, led=[led], glazing=[MIRROR], furniture=[furniture])
         blockers, sources = empty_room(room_mesh(scene)), point_sources(scene.leds)
         arguments = blockers, np.array([[2.0, 3.5, 0.0]]), np.array([[0.0, 0.0, 1.0]]), sources
-        by_pane = led_illuminance_lux(*arguments, scene.panes)[0] - led_illuminance_lux(*arguments)[0]
+        by_pane = led_illuminance_lux(*arguments, scene.glazings)[0] - led_illuminance_lux(*arguments)[0]
         assert (by_pane == 0) == covers
 
 

@@ -4,18 +4,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from estimator.pixels.polygon_raster import LONGEST_EDGE_PX, Canvas, Outlines, cover
+from estimator.pixels.polygon_raster import MAX_EDGE_PX, Canvas, Outlines, cover
 
 Floats = NDArray[np.float64]
 
 
-def window(row: int, column: int, height: int, width: int) -> Canvas:
+def roi(row: int, column: int, height: int, width: int) -> Canvas:
     return Canvas(np.array([row]), np.array([column]), np.array([height]), np.array([width]))
 
 
 def circle(u: float, v: float, radius: float) -> Floats:
     """A polygon of the circle's area."""
-    points = int(np.ceil(2 * np.pi * radius / LONGEST_EDGE_PX))
+    points = int(np.ceil(2 * np.pi * radius / MAX_EDGE_PX))
     step = 2 * np.pi / points
     angles = step * np.arange(points)
     return np.array([u, v]) + radius * np.sqrt(step / np.sin(step)) * np.column_stack([np.cos(angles), np.sin(angles)])
@@ -28,7 +28,7 @@ def outlines(points: Floats, slopes: Floats | None = None) -> Outlines:
 
 
 def covered(canvas: Canvas, points: Floats) -> Floats:
-    return canvas.window(cover(canvas, outlines(points))[0], 0)
+    return canvas.roi(cover(canvas, outlines(points))[0], 0)
 
 
 def circle_in_pixels(u: float, v: float, radius: float, size: int) -> Floats:
@@ -49,16 +49,16 @@ def test_a_circle_covers_what_its_chords_say(radius: float) -> None:
     some 1e-5, where a chord begins.
     """
     u, v, size = radius + 3.37, radius + 2.81, int(2 * radius) + 7
-    found = covered(window(0, 0, size, size), circle(u, v, radius))
+    found = covered(roi(0, 0, size, size), circle(u, v, radius))
     assert abs(found.sum() - np.pi * radius**2) < 1e-9
-    assert np.abs(found - circle_in_pixels(u, v, radius, size)).max() < LONGEST_EDGE_PX**2 / (12 * radius) + 2e-5
+    assert np.abs(found - circle_in_pixels(u, v, radius, size)).max() < MAX_EDGE_PX**2 / (12 * radius) + 2e-5
 
 
 def test_a_window_shows_its_part_of_the_whole() -> None:
     points = circle(20.4, 18.8, 12.5)
-    whole = covered(window(0, 0, 40, 40), points)
+    whole = covered(roi(0, 0, 40, 40), points)
     for row, column, height, width in ((12, 15, 9, 30), (0, 0, 12, 12), (25, 25, 3, 3), (15, 30, 4, 8)):
-        part = covered(window(row, column, height, width), points)
+        part = covered(roi(row, column, height, width), points)
         expected = np.zeros((height, width))
         seen = whole[row : row + height, column : column + width]
         expected[: seen.shape[0], : seen.shape[1]] = seen
@@ -73,8 +73,8 @@ def test_windows_do_not_reach_into_each_other() -> None:
     following = np.concatenate([np.roll(np.arange(len(p)), -1) + s for p, s in ((first, 0), (second, len(first)))])
     belongs = np.repeat([0, 1], [len(first), len(second)])
     both, _ = cover(canvas, Outlines(points, following, belongs, np.zeros((len(points), 2, 0))))
-    np.testing.assert_allclose(canvas.window(both, 0), covered(window(0, 2, 20, 15), first), atol=1e-12)
-    np.testing.assert_allclose(canvas.window(both, 1), covered(window(2, 30, 15, 12), second), atol=1e-12)
+    np.testing.assert_allclose(canvas.roi(both, 0), covered(roi(0, 2, 20, 15), first), atol=1e-12)
+    np.testing.assert_allclose(canvas.roi(both, 1), covered(roi(2, 30, 15, 12), second), atol=1e-12)
 
 
 def test_corners_on_the_lines_between_pixels_lose_nothing() -> None:
@@ -89,17 +89,17 @@ def test_corners_on_the_lines_between_pixels_lose_nothing() -> None:
     )
     expected = np.zeros((10, 10))
     expected[3:7, 2:6] = 1
-    np.testing.assert_allclose(covered(window(0, 0, 10, 10), square), expected, atol=1e-12)
+    np.testing.assert_allclose(covered(roi(0, 0, 10, 10), square), expected, atol=1e-12)
 
 
 def test_slopes_are_what_moving_the_outline_gives() -> None:
     """Central differences over 1e-4 px of a quadratic: exact but for rounding, save where a point crosses a line."""
     points = circle(13.37, 12.81, 8.0)
-    grown = points - np.array([13.37, 12.81])
-    moves = np.stack([np.tile([1.0, 0.0], (len(points), 1)), np.tile([0.0, 1.0], (len(points), 1)), grown], axis=2)
-    canvas = window(0, 0, 26, 26)
+    padded = points - np.array([13.37, 12.81])
+    moves = np.stack([np.tile([1.0, 0.0], (len(points), 1)), np.tile([0.0, 1.0], (len(points), 1)), padded], axis=2)
+    canvas = roi(0, 0, 26, 26)
     _, pieces = cover(canvas, outlines(points, moves))
-    cells = canvas.cell(pieces.window, pieces.row, pieces.column)
+    cells = canvas.cell(pieces.roi, pieces.row, pieces.column)
     for parameter in range(3):
         found = np.bincount(cells, pieces.slopes[:, parameter], canvas.cells())
         step = 1e-5 * moves[:, :, parameter]

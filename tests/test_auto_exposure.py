@@ -9,27 +9,27 @@ import pytest
 from conftest import ROOT, SMALL
 from pydantic import TypeAdapter
 
-from vlcrender.camera.roi import Window
+from vlcrender.camera.roi import Roi
 from vlcrender.dataset.auto_exposure import Metering, NoiseLevelMetering, PeakMetering
 from vlcrender.dataset.generate import generate
 from vlcrender.dataset.recipe import load_plan
 from vlcrender.dataset.verify import problems_of
-from vlcrender.rendering.expected_image import LedPatch, View, ViewPart
+from vlcrender.rendering.expected_image import ExpectedImage, ExpectedRegion, LedPatch
 
 
-def view_of(background: float, led: float) -> View:
+def view_of(background: float, led: float) -> ExpectedImage:
     """A part with an LED of 2 x 2 pixels, one of them dark, and one without; the brightest pixel is beside the LED."""
     image = np.full((6, 8), background, dtype=np.float32)
     image[5, 7] = 50 * background
     light = np.full((2, 2), led, dtype=np.float32)
     light[1, 1] = 0
     patch = LedPatch(3, (3.0, 3.0), 2, 2, light, 1.0, 1.0)
-    beside = ViewPart(Window(10, 0, 1, 1), np.full((1, 1), background, dtype=np.float32), ())
-    return View((ViewPart(Window(0, 0, 6, 8), image, (patch,)), beside))
+    beside = ExpectedRegion(Roi(10, 0, 1, 1), np.full((1, 1), background, dtype=np.float32), ())
+    return ExpectedImage((ExpectedRegion(Roi(0, 0, 6, 8), image, (patch,)), beside))
 
 
 def test_the_peak_holds_the_share() -> None:
-    metering = PeakMetering(kind="peak", share_of_saturation=0.7, longest_s=10.0)
+    metering = PeakMetering(kind="peak", share_of_saturation=0.7, max_s=10.0)
     view = view_of(100.0, 900.0)  # 5000 e/s in the corner
     assert metering.time_s(view, 6000.0) == pytest.approx(4200 / 5000)
     assert metering.time_s(view_of(1.0, 0.0), 6000.0) == 10.0, "84 s would be too long"
@@ -45,7 +45,7 @@ def test_the_noise_level_is_that_of_the_brightest_led_pixel() -> None:
 
 
 METERED = {
-    "peak": ["exposure.kind=peak", "exposure.share_of_saturation=0.6", "exposure.longest_s=1.0"],
+    "peak": ["exposure.kind=peak", "exposure.share_of_saturation=0.6", "exposure.max_s=1.0"],
     "noise-level": ["exposure.kind=noise-level", "exposure.level_db=-9"],
 }
 

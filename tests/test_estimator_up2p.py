@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-from estimator_sighted import device, sighted
+from estimator_correspondences import device, sighted
 from estimator_synthetic import Array, View, grid, view_of
 
 import estimator.variants.up2p
@@ -13,7 +13,7 @@ from estimator.solvers.ranging import law_of_sines, led_ranges
 from estimator.solvers.reprojection import observations
 from estimator.solvers.trilateration import position_from_ranges
 from estimator.variants.pnp import position_from_pixels
-from estimator.variants.up2p import fit_sightings, upright_pose
+from estimator.variants.up2p import fit_correspondences, upright_pose
 
 poselib = pytest.importorskip("poselib")
 
@@ -33,10 +33,10 @@ def test_up2p_sqpnp_and_the_range_fit_agree_on_exact_points() -> None:
         leds[:, :2] += rng.uniform(-0.03, 0.03, (12, 2))
         view = random_view(rng, leds)
         frame, pixels = device(view, 0.0), view.project(leds)
-        upright_m = fit_sightings(frame, sighted(view, leds)).position_m
+        upright_m = fit_correspondences(frame, sighted(view, leds)).position_m
         sqpnp_m = position_from_pixels(leds, pixels, view.K, (cv2.SOLVEPNP_SQPNP,))
-        levelled = level(pixels, view.K, rotation(*tilt_from_gravity(frame.accelerometer_m_s2)))
-        ranges_m = position_from_ranges(leds, led_ranges(levelled, view.K, leds, law_of_sines))
+        leveled = level(pixels, view.K, rotation(*tilt_from_gravity(frame.accelerometer_m_s2)))
+        ranges_m = position_from_ranges(leds, led_ranges(leveled, view.K, leds, law_of_sines))
         for found_m in (upright_m, sqpnp_m, ranges_m):
             assert np.abs(found_m - view.position_m).max() < 1e-6
 
@@ -74,7 +74,7 @@ def test_the_refinement_frees_the_tilt() -> None:
     leds = grid(5, 4, 0.14, (3, 2, 2.7))
     view = view_of((3, 2, 2.7), 2.6, 20, -10, 40)
     wrong = device(view_of((3, 2, 2.7), 2.6, 22, -10, 40), 1.0)
-    found_m = fit_sightings(wrong, sighted(view, leds)).position_m
+    found_m = fit_correspondences(wrong, sighted(view, leds)).position_m
     np.testing.assert_allclose(found_m, view.position_m, atol=1e-6)
 
 

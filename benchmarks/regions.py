@@ -1,6 +1,6 @@
 """Speed of LED windows alone: poses a second, and a full frame's time over that of its windows.
 
-    python benchmarks/windows.py [POSES]
+    python benchmarks/regions.py [POSES]
 
 Table 1's four LEDs on a 4000 x 3000 sensor, windows reaching beyond it so that every pose has all four, noise
 included, files not. Machines differ and are shared: compare rates within one run only.
@@ -14,7 +14,7 @@ from multiprocessing import get_context
 from pathlib import Path
 
 from vlcrender.camera.intrinsics import Camera, Pose
-from vlcrender.camera.roi import LedWindows
+from vlcrender.camera.roi import LedRegions
 from vlcrender.core.backend import dr
 from vlcrender.rendering.renderer import Renderer
 from vlcrender.scene.loader import load_scene
@@ -31,21 +31,21 @@ def renderer() -> Renderer:
     return Renderer(load_scene(Path(__file__).parent.parent / "scenes/table1.toml"))
 
 
-def shoot(number: int, windows: LedWindows | None) -> int:
+def shoot(number: int, regions: LedRegions | None) -> int:
     """Render and expose the pose of this number, along a diagonal of the floor; returns the pixels made."""
     share = number * 0.618034 % 1.0
     pose = Pose((0.2 + 6.6 * share, 0.2 + 6.6 * (1 - share), 0.05))
-    view = renderer().view(Camera(), pose, windows)
+    view = renderer().expected_image(Camera(), pose, regions)
     sensor, key = Sensor(), f"bench {number}"
     return sum(
-        expose(sensor, part.expected_electrons(EXPOSURE_S), key, part.window.row, part.window.column).size
+        expose(sensor, part.expected_electrons(EXPOSURE_S), key, part.roi.row, part.roi.column).size
         for part in view.parts
     )
 
 
 def leds_alone(numbers: range) -> int:
     """Make the windows of these poses; returns the pixels made."""
-    return sum(shoot(number, LedWindows(kind="leds", overscan=True)) for number in numbers)
+    return sum(shoot(number, LedRegions(kind="leds", overscan=True)) for number in numbers)
 
 
 def one_thread() -> None:

@@ -170,12 +170,10 @@ def test_the_variance_told_is_the_variance_had() -> None:
     """Over individuals, whose patterns nobody knows; of one row and column each, since those share offsets."""
     mean = 800.0
     sensors = [EVERYTHING.model_copy(update={"serial": serial}) for serial in range(200)]
-    window = np.full((40, 40), mean, dtype=np.float32)
-    diagonal = [
-        np.diag(expose(sensor, window, f"frame {sensor.serial}", 0, 0, 0.2)).astype(float) for sensor in sensors
-    ]
+    roi = np.full((40, 40), mean, dtype=np.float32)
+    diagonal = [np.diag(expose(sensor, roi, f"frame {sensor.serial}", 0, 0, 0.2)).astype(float) for sensor in sensors]
     electrons = (np.concatenate(diagonal) - 64) * EVERYTHING.gain_at_iso_e_per_dn
-    expected = float(variance_e2(EVERYTHING, window, 0.2)[0, 0])
+    expected = float(variance_e2(EVERYTHING, roi, 0.2)[0, 0])
     n = len(electrons)
     assert abs(electrons.mean() - (mean + 100)) < 5 * np.sqrt(expected / n)
     assert abs(electrons.var(ddof=1) - expected) < 5 * np.sqrt(2 / n) * expected  # nearly normal: excess 1 / 800
@@ -260,7 +258,7 @@ def test_a_window_gets_the_noise_of_the_whole_frame(rng: np.random.Generator) ->
 def test_threads_make_no_difference(tmp_path: Path) -> None:
     """One thread, two, and all, each in a process of its own."""
     code = (
-        "import sys, numpy as np; from test_full_chain import EVERYTHING; from vlcrender.core.backend import dr; "
+        "import sys, numpy as np; from test_signal_chain import EVERYTHING; from vlcrender.core.backend import dr; "
         "from vlcrender.sensor.signal_chain import expose; dr.set_thread_count(int(sys.argv[1])); "
         "means = np.linspace(0, 4000, 120000, dtype=np.float32).reshape(300, 400); "
         "np.save(sys.argv[2], expose(EVERYTHING, means, 'key', 0, 0, 0.1))"

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vlcrender.camera.intrinsics import Camera, Pose
-from vlcrender.camera.roi import LedWindows, Window, led_windows
+from vlcrender.camera.roi import LedRegions, Roi, led_regions
 from vlcrender.core.backend import dr
 from vlcrender.dataset.generate import generate
 from vlcrender.dataset.recipe import load_plan
@@ -20,8 +20,8 @@ from vlcrender.rendering.background import _edges
 from vlcrender.rendering.renderer import Renderer
 from vlcrender.scene.loader import Scene
 
-LEDS = LedWindows(kind="leds")
-OVERSCAN = LedWindows(kind="leds", overscan=True)
+LEDS = LedRegions(kind="leds")
+OVERSCAN = LedRegions(kind="leds", overscan=True)
 OFFICE_POSES = [Pose((3.15, 3.1, 0.6), 6, -8, 20), Pose((1.5, 2.0, 1.2), 40.0, 35.0, 110.0)]
 
 
@@ -30,99 +30,101 @@ def office_renderer(office: Scene) -> Renderer:
     return Renderer(office)
 
 
-def pixels_of(whole: np.ndarray, window: Window) -> np.ndarray:
+def pixels_of(whole: np.ndarray, roi: Roi) -> np.ndarray:
     """What a full frame has in a window on the sensor."""
-    return whole[window.row : window.end_row, window.column : window.end_column]
+    return whole[roi.row : roi.end_row, roi.column : roi.end_column]
 
 
 @pytest.mark.parametrize(
-    ("pose", "windows"),
+    ("pose", "regions"),
     [
         *((pose, LEDS) for pose in OFFICE_POSES),
-        *((OFFICE_POSES[0], w) for w in (OVERSCAN, LedWindows(kind="leds", margin_px=0))),
+        *((OFFICE_POSES[0], w) for w in (OVERSCAN, LedRegions(kind="leds", margin_px=0))),
     ],
     ids=["level", "tilted", "overscan", "no margin"],
 )
 def test_a_windowed_pixel_holds_what_it_holds_in_the_full_frame(
-    office_renderer: Renderer, pose: Pose, windows: LedWindows
+    office_renderer: Renderer, pose: Pose, regions: LedRegions
 ) -> None:
     """Exactly, at the windows' own borders and at the edges of panels too."""
     camera = Camera(width_px=800, height_px=600, pixel_pitch_um=6.0)
-    full = office_renderer.view(camera, pose).expected_electrons(1e-5)
-    view = office_renderer.view(camera, pose, windows)
-    sensor = Window.of_sensor(camera)
-    seen = [part for part in view.parts if part.window.overlaps(sensor)]
+    full = office_renderer.expected_image(camera, pose).expected_electrons(1e-5)
+    view = office_renderer.expected_image(camera, pose, regions)
+    sensor = Roi.of_sensor(camera)
+    seen = [part for part in view.parts if part.roi.overlaps(sensor)]
     assert seen
     for part in seen:
-        shared = part.window.common(sensor)
-        ours = part.expected_electrons(1e-5)[part.window.slices(shared)]
+        shared = part.roi.intersection(sensor)
+        ours = part.expected_electrons(1e-5)[part.roi.slices(shared)]
         assert np.array_equal(ours, pixels_of(full, shared))
-    assert sum(part.window.pixels for part in seen) < sensor.pixels
+    assert sum(part.roi.pixels for part in seen) < sensor.pixels
 
 
 def test_on_the_sensor_no_edge_comes_from_beyond_it() -> None:
     """A full frame does not look there. Here surfaces meet exactly along the sensor's left border."""
     surfaces = np.zeros((5, 8), np.uint32)
     surfaces[:, :3] = 1
-    edges = _edges(surfaces, Window(10, -3, 5, 8), Window(0, 0, 300, 400))
+    edges = _edges(surfaces, Roi(10, -3, 5, 8), Roi(0, 0, 300, 400))
     assert edges.any(axis=0).tolist() == [False, False, True, False, False, False, False, False]
 
 
 def test_each_led_has_its_margin_unless_the_sensor_ends(office_renderer: Renderer) -> None:
     camera, pose = Camera(), OFFICE_POSES[0]
-    view = office_renderer.view(camera, pose, LEDS)
-    sensor = Window.of_sensor(camera)
-    assert len(view.patches) == len(office_renderer.view(camera, pose).patches)
+    view = office_renderer.expected_image(camera, pose, LEDS)
+    sensor = Roi.of_sensor(camera)
+    assert len(view.patches) == len(office_renderer.expected_image(camera, pose).patches)
     for part in view.parts:
         assert part.patches
-        assert sensor.holds(part.window)
+        assert sensor.contains(part.roi)
         for patch in part.patches:
-            assert part.window.holds(patch.window.grown(20).common(sensor))
+            assert part.roi.contains(patch.roi.padded(20).intersection(sensor))
 
 
 def test_beyond_the_sensor_is_what_a_larger_sensor_would_see(table1: Scene) -> None:
     renderer, pose = Renderer(table1), Pose((0.35, 1.75, 0.05), 3.0, 1.0, 10.0)
     camera = Camera(width_px=400, height_px=300, pixel_pitch_um=12.0)
     larger = Camera(width_px=1600, height_px=1500, pixel_pitch_um=12.0, principal_point_px=(800.0, 750.0))
-    full = renderer.view(larger, pose).expected_electrons(1e-5)
-    view = renderer.view(camera, pose, OVERSCAN)
+    full = renderer.expected_image(larger, pose).expected_electrons(1e-5)
+    view = renderer.expected_image(camera, pose, OVERSCAN)
     assert len(view.patches) == 4
     assert {patch.imaged_fraction for patch in view.patches} == {1.0}
     assert min(patch.visible_fraction for patch in view.patches) == 0.0
     for part in view.parts:
-        there = Window(part.window.row + 600, part.window.column + 600, part.window.rows, part.window.columns)
+        there = Roi(part.roi.row + 600, part.roi.column + 600, part.roi.rows, part.roi.columns)
         # two cameras: float32 rounds their rays differently, 1e-7 of the cos^4 and at the LEDs' edges 1e-6 of a pixel
         assert np.allclose(part.expected_electrons(1e-5), pixels_of(full, there), rtol=1e-5)
 
 
 def test_a_frame_that_sees_no_led_has_one_dark_pixel(table1: Scene) -> None:
-    view = Renderer(table1).view(Camera(), Pose((5.0, 5.0, 0.5)), LEDS)
-    assert [part.window for part in view.parts] == [Window(0, 0, 1, 1)]
+    view = Renderer(table1).expected_image(Camera(), Pose((5.0, 5.0, 0.5)), LEDS)
+    assert [part.roi for part in view.parts] == [Roi(0, 0, 1, 1)]
     assert view.patches == ()
 
 
 def test_windows_larger_than_the_sensor_allows_are_refused(table1: Scene) -> None:
     with pytest.raises(InputError, match=r"margin_px"):
-        Renderer(table1).view(Camera(), Pose((5.0, 5.0, 0.5)), LedWindows(kind="leds", margin_px=9000, overscan=True))
+        Renderer(table1).expected_image(
+            Camera(), Pose((5.0, 5.0, 0.5)), LedRegions(kind="leds", margin_px=9000, overscan=True)
+        )
 
 
 @given(st.lists(st.tuples(*[st.integers(0, 60)] * 2, *[st.integers(1, 12)] * 2), max_size=12), st.integers(0, 5))
 def test_windows_share_no_pixel_and_hold_all_that_is_lit(boxes: list[tuple[int, ...]], margin: int) -> None:
     camera = Camera(width_px=72, height_px=72)
-    lit = [Window(*box) for box in boxes]
-    windows = led_windows(lit, camera, LedWindows(kind="leds", margin_px=margin))
-    assert not any(a.overlaps(b) for i, a in enumerate(windows) for b in windows[:i])
-    for window in lit:
-        assert any(w.holds(window.grown(margin).common(Window.of_sensor(camera))) for w in windows)
+    lit = [Roi(*box) for box in boxes]
+    regions = led_regions(lit, camera, LedRegions(kind="leds", margin_px=margin))
+    assert not any(a.overlaps(b) for i, a in enumerate(regions) for b in regions[:i])
+    for roi in lit:
+        assert any(w.contains(roi.padded(margin).intersection(Roi.of_sensor(camera))) for w in regions)
 
 
-@pytest.mark.parametrize("windows", [None, LEDS], ids=["full frame", "windows"])
-def test_a_new_pose_compiles_no_kernel(office_renderer: Renderer, windows: LedWindows | None) -> None:
+@pytest.mark.parametrize("regions", [None, LEDS], ids=["full frame", "regions"])
+def test_a_new_pose_compiles_no_kernel(office_renderer: Renderer, regions: LedRegions | None) -> None:
     camera = Camera(width_px=400, height_px=300, pixel_pitch_um=12.0)
-    office_renderer.view(camera, OFFICE_POSES[0], windows)
+    office_renderer.expected_image(camera, OFFICE_POSES[0], regions)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history()
-        office_renderer.view(camera, Pose((3.3, 3.0, 0.7), 3, 2, -50), windows)
+        office_renderer.expected_image(camera, Pose((3.3, 3.0, 0.7), 3, 2, -50), regions)
         kernels = [entry for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT]
     assert kernels
     assert all(entry["cache_hit"] for entry in kernels)
@@ -130,7 +132,7 @@ def test_a_new_pose_compiles_no_kernel(office_renderer: Renderer, windows: LedWi
 
 @pytest.fixture(scope="module")
 def table1_set(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    directory = tmp_path_factory.mktemp("windows") / "set"
+    directory = tmp_path_factory.mktemp("regions") / "set"
     assignments = ["poses.columns=4", "poses.rows=4", *SMALL[:4], "expected=true"]
     generate(load_plan(ROOT / "datasets/table1.toml", assignments), directory)
     return directory

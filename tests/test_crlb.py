@@ -7,7 +7,7 @@ import pytest
 from conftest import ROOT
 
 from vlcrender.camera.intrinsics import Camera, Pose, project
-from vlcrender.camera.roi import Window
+from vlcrender.camera.roi import Roi
 from vlcrender.config.toml_model import check, read_toml
 from vlcrender.dataset.recipe import load_plan
 from vlcrender.errors import InputError
@@ -49,8 +49,8 @@ def light_of(
 def bound_m2(
     renderer: Renderer, camera: Camera, led_ids: Sequence[int], sigma_deg: float, exposure_s: float = EXPOSURE_S
 ) -> np.ndarray | None:
-    expected = renderer.view(camera, POSE).expected_electrons(exposure_s)
-    variance = [(Window.of_sensor(camera), variance_e2(Sensor(full_well_e=1e6), expected))]
+    expected = renderer.expected_image(camera, POSE).expected_electrons(exposure_s)
+    variance = [(Roi.of_sensor(camera), variance_e2(Sensor(full_well_e=1e6), expected))]
     return position_bound_m2(
         camera, POSE, light_of(renderer, camera, led_ids), exposure_s, variance, 2.6, (sigma_deg, sigma_deg)
     )
@@ -62,7 +62,7 @@ def moved(unknown: int, by: float) -> Pose:
     return Pose((numbers[0], numbers[1], numbers[2]), *numbers[3:])
 
 
-def edge_slopes(camera: Camera, center_m: np.ndarray, box: Window) -> np.ndarray:
+def edge_slopes(camera: Camera, center_m: np.ndarray, box: Roi) -> np.ndarray:
     """d coverage / d (x, y, z, tilt_x, tilt_y, yaw) in a box of pixels, (6, rows, columns).
 
     As the pose changes, a pixel gains what the disc's edge sweeps in it: the integral of velocity times outward normal
@@ -91,15 +91,15 @@ def test_it_is_the_information_that_moving_edges_carry(renderer: Renderer, small
     takes up to a part in 1000, and the edge's brightness is not exactly the brightest pixel's: cos^4 changes by 4
     tan(16 deg) / 1500 = 1e-3 a pixel, over 5 pixels by 0.5 %. Held to 1 %.
     """
-    view = renderer.view(small_camera, POSE)
+    view = renderer.expected_image(small_camera, POSE)
     expected = view.expected_electrons(EXPOSURE_S).astype(float)
     count = len(view.patches)
     information = np.zeros((6 + 2 * count, 6 + 2 * count))
     for number, patch in enumerate(view.patches):
-        box = patch.window.grown(int(MARGIN_PX))
-        here = Window.of_sensor(small_camera).slices(box)
+        box = patch.roi.padded(int(MARGIN_PX))
+        here = Roi.of_sensor(small_camera).slices(box)
         light = np.zeros((box.rows, box.columns))
-        light[box.slices(patch.window)] = patch.electrons_per_s * EXPOSURE_S
+        light[box.slices(patch.roi)] = patch.electrons_per_s * EXPOSURE_S
         slopes = np.zeros((len(information), box.rows, box.columns))
         slopes[:6] = light.max() * edge_slopes(small_camera, renderer.scene.leds.centers_m[number], box)
         slopes[6 + 2 * number], slopes[7 + 2 * number] = light, 1.0
@@ -137,8 +137,8 @@ def test_gravity_and_more_leds_lower_it(renderer: Renderer, small_camera: Camera
 
 def test_each_tilt_has_its_own_error(renderer: Renderer, small_camera: Camera) -> None:
     """Little known of one tilt costs more than as little known of none, and less than as little known of both."""
-    expected = renderer.view(small_camera, POSE).expected_electrons(EXPOSURE_S)
-    variance = [(Window.of_sensor(small_camera), variance_e2(Sensor(full_well_e=1e6), expected))]
+    expected = renderer.expected_image(small_camera, POSE).expected_electrons(EXPOSURE_S)
+    variance = [(Roi.of_sensor(small_camera), variance_e2(Sensor(full_well_e=1e6), expected))]
     sizes = [
         position_bound_m2(small_camera, POSE, light_of(renderer, small_camera, [0, 1]), EXPOSURE_S, variance, 2.6, s)
         for s in ((0.1, 0.1), (0.1, 5.0), (5.0, 0.1), (5.0, 5.0))
@@ -165,8 +165,10 @@ def test_on_a_rig_it_is_of_the_cameras_own_position(renderer: Renderer, small_ca
     main = Pose((x, y, z), POSE.tilt_x_deg, POSE.tilt_y_deg, POSE.yaw_deg)
     variance = [
         (
-            Window.of_sensor(small_camera),
-            variance_e2(Sensor(full_well_e=1e6), renderer.view(small_camera, POSE).expected_electrons(EXPOSURE_S)),
+            Roi.of_sensor(small_camera),
+            variance_e2(
+                Sensor(full_well_e=1e6), renderer.expected_image(small_camera, POSE).expected_electrons(EXPOSURE_S)
+            ),
         )
     ]
     bound = position_bound_m2(

@@ -5,7 +5,7 @@ import pytest
 from scipy import constants
 
 from vlcrender.camera.intrinsics import Camera, Pose
-from vlcrender.camera.roi import LedWindows, Window
+from vlcrender.camera.roi import LedRegions, Roi
 from vlcrender.rendering.bayer import MosaicRenderer, colour_of_pixels
 from vlcrender.rendering.renderer import Renderer
 from vlcrender.scene.loader import Scene
@@ -27,23 +27,23 @@ POSE = Pose((3.15, 3.1, 0.6), 6.0, -8.0, 20.0)
     [("rggb", [[0, 1], [1, 2]]), ("bggr", [[2, 1], [1, 0]]), ("grbg", [[1, 0], [2, 1]]), ("gbrg", [[1, 2], [0, 1]])],
 )
 def test_colours_of_pixels(mosaic: str, corner: list[list[int]]) -> None:
-    whole = colour_of_pixels(mosaic, Window(0, 0, 6, 8))
+    whole = colour_of_pixels(mosaic, Roi(0, 0, 6, 8))
     assert whole[:2, :2].tolist() == corner
     assert np.array_equal(whole[2:, 2:], whole[:-2, :-2])
-    assert np.array_equal(colour_of_pixels(mosaic, Window(3, 1, 2, 5)), whole[3:5, 1:6])
-    assert np.array_equal(colour_of_pixels(mosaic, Window(-3, -5, 9, 13))[3:, 5:], whole), "beyond the sensor too"
+    assert np.array_equal(colour_of_pixels(mosaic, Roi(3, 1, 2, 5)), whole[3:5, 1:6])
+    assert np.array_equal(colour_of_pixels(mosaic, Roi(-3, -5, 9, 13))[3:, 5:], whole), "beyond the sensor too"
 
 
-@pytest.mark.parametrize("windows", [None, LedWindows(kind="leds")], ids=["full", "windows"])
-def test_each_pixel_is_that_of_a_sensor_of_its_colour(office: Scene, windows: LedWindows | None) -> None:
+@pytest.mark.parametrize("regions", [None, LedRegions(kind="leds")], ids=["full", "regions"])
+def test_each_pixel_is_that_of_a_sensor_of_its_colour(office: Scene, regions: LedRegions | None) -> None:
     """Through a defocused lens, so that the blur is shown to come before the filters."""
     camera = Camera(width_px=160, height_px=120, pixel_pitch_um=30.0, focus_distance_m=0.6)
     of_colours = tuple(Renderer(office, None, Tabulated(QE, colour)) for colour in COLOURS)
-    seen = MosaicRenderer(of_colours, "grbg").view(camera, POSE, windows)
-    alone = [renderer.view(camera, POSE, windows) for renderer in of_colours]
+    seen = MosaicRenderer(of_colours, "grbg").expected_image(camera, POSE, regions)
+    alone = [renderer.expected_image(camera, POSE, regions) for renderer in of_colours]
     for number, part in enumerate(seen.parts):
         image = part.expected_electrons(1e-6)
-        colours = colour_of_pixels("grbg", part.window)
+        colours = colour_of_pixels("grbg", part.roi)
         for colour in range(3):
             expected = alone[colour].parts[number].expected_electrons(1e-6)
             assert np.array_equal(image[colours == colour], expected[colours == colour])
@@ -53,7 +53,7 @@ def test_each_pixel_is_that_of_a_sensor_of_its_colour(office: Scene, windows: Le
 def test_the_bounds_patches_are_the_views(office: Scene) -> None:
     camera = Camera(width_px=160, height_px=120, pixel_pitch_um=30.0)
     renderer = MosaicRenderer(tuple(Renderer(office, None, Tabulated(QE, colour)) for colour in COLOURS), "rggb")
-    seen, alone = renderer.view(camera, POSE).patches, renderer.led_patches(camera, POSE)
+    seen, alone = renderer.expected_image(camera, POSE).patches, renderer.led_patches(camera, POSE)
     assert len(seen) == len(alone) > 0
     for a, b in zip(seen, alone, strict=True):
         assert np.allclose(a.electrons_per_s, b.electrons_per_s, rtol=1e-6)

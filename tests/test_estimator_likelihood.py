@@ -9,7 +9,7 @@ from test_estimator_maximum_likelihood import frame_of
 from estimator.camera.projection import TiltedPose, pose_of_rotation, project
 from estimator.io.dataset import DeviceFrame
 from estimator.pixels.likelihood import LedLight, Noise, led_light, misfit, score
-from estimator.pixels.measurements import CERTAIN_PX, Evidence, gather
+from estimator.pixels.measurements import CERTAIN_PX, Measurements, gather
 
 Floats = NDArray[np.float64]
 TARGET = (3.5, 3.6, 3.5)
@@ -28,40 +28,40 @@ def drawn(led_e: float, seed: int, full_well_e: float = 60000.0) -> DeviceFrame:
     return DeviceFrame(**{**vars(frame), "sensor": frame.sensor.model_copy(update={"full_well_e": full_well_e})})
 
 
-def explained(frame: DeviceFrame) -> tuple[Evidence, LedLight]:
-    evidence = gather(frame, true_pose(frame), SURE)
-    used = np.ones(len(evidence.leds), dtype=bool)
+def explained(frame: DeviceFrame) -> tuple[Measurements, LedLight]:
+    measurements = gather(frame, true_pose(frame), SURE)
+    used = np.ones(len(measurements.leds), dtype=bool)
     light = None
     for _ in range(4):
-        light = led_light(evidence, evidence.drawing, used, Noise.of(frame), light)
+        light = led_light(measurements, measurements.drawing, used, Noise.of(frame), light)
     assert light is not None
-    return evidence, light
+    return measurements, light
 
 
 def test_information_about_the_pose_is_the_schur_complement_of_all_of_it() -> None:
-    evidence, light = explained(drawn(600.0, 1))
-    readings, edges, groups = len(evidence.electrons), len(evidence.cells), len(evidence.led)
+    measurements, light = explained(drawn(600.0, 1))
+    readings, edges, groups = len(measurements.electrons), len(measurements.cells), len(measurements.led)
     design = np.zeros((readings, 6 + 2 * groups))
-    brightness = evidence.weights * light.amplitude[evidence.group[:edges]]
-    design[:edges, :6] = evidence.drawing.slopes(evidence.cells) * brightness[:, None]
-    design[np.arange(readings), 6 + evidence.group] = evidence.pixels
-    design[np.arange(readings), 6 + groups + evidence.group] = light.light
+    brightness = measurements.weights * light.amplitude[measurements.group[:edges]]
+    design[:edges, :6] = measurements.drawing.slopes(measurements.cells) * brightness[:, None]
+    design[np.arange(readings), 6 + measurements.group] = measurements.pixels
+    design[np.arange(readings), 6 + groups + measurements.group] = light.light
     full = design.T @ (design * light.weight[:, None])
     scale = np.sqrt(np.diag(full))
     covariance = np.linalg.inv(full / np.outer(scale, scale)) / np.outer(scale, scale)
-    information, gradient = score(evidence, evidence.drawing, light)
+    information, gradient = score(measurements, measurements.drawing, light)
     found = np.linalg.inv(information)
     np.testing.assert_allclose(found, covariance[:6, :6], rtol=1e-6, atol=1e-6 * np.abs(found).max())
-    residual = design.T @ (light.weight * (evidence.electrons - light.expected))
+    residual = design.T @ (light.weight * (measurements.electrons - light.expected))
     np.testing.assert_allclose(gradient, residual[:6], rtol=1e-9)
 
 
 def test_every_led_in_view_has_its_readings() -> None:
-    evidence, _ = explained(drawn(4000.0, 2))
-    assert sorted(led.id for led in evidence.leds) == [10, 11, 12, 13, 14, 15]
-    assert not evidence.more
+    measurements, _ = explained(drawn(4000.0, 2))
+    assert sorted(led.id for led in measurements.leds) == [10, 11, 12, 13, 14, 15]
+    assert not measurements.more
     # An ellipse of 5 px semi-axes, its edge 2 px of margin either way, its ring 8 px more: some hundred and a thousand.
-    counts = np.bincount(evidence.group, evidence.pixels)
+    counts = np.bincount(measurements.group, measurements.pixels)
     assert (counts > 400).all()
     assert (counts < 1200).all()
 
@@ -73,18 +73,18 @@ def test_amplitudes_are_those_drawn_also_near_to_full(full_well_e: float) -> Non
     Where a face is as bright as a full pixel, half of its pixels are cut off: to leave out only those would take 0.8
     standard deviations of a pixel off, 43 e.
     """
-    evidence, light = explained(drawn(2950.0, 3, full_well_e))
+    measurements, light = explained(drawn(2950.0, 3, full_well_e))
     sigma = light.amplitude / light.signal_to_noise
     off = light.amplitude - 2910.0
     assert (np.abs(off) < 5 * sigma).all()
     assert abs((off / sigma**2).sum()) < 4 * np.sqrt((1 / sigma**2).sum())
-    assert len(evidence.leds) == 6
+    assert len(measurements.leds) == 6
 
 
 def test_a_true_led_looks_like_itself_and_a_shifted_one_does_not() -> None:
     frame = drawn(4000.0, 4)
-    evidence, light = explained(frame)
-    assert (misfit(evidence, evidence.drawing, light) < 0).all()
+    measurements, light = explained(frame)
+    assert (misfit(measurements, measurements.drawing, light) < 0).all()
     shifted = gather(frame, true_pose(frame).moved(np.array([0.0, 0.0, 0.0, 0.5 / 1500, 0.0, 0.0])), SURE)
     light = led_light(shifted, shifted.drawing, np.ones(6, dtype=bool), Noise.of(frame))
     assert (misfit(shifted, shifted.drawing, light) > 0).all()
@@ -95,6 +95,6 @@ def test_leds_whose_place_is_not_sure_wait() -> None:
     moves = project(SIX, true_pose(frame), frame.camera).slopes[:, :, 5]
     spread = SURE.copy()
     spread[5, 5] = (CERTAIN_PX / np.median(np.linalg.norm(moves, axis=1))) ** 2
-    evidence = gather(frame, true_pose(frame), spread)
-    assert len(evidence.leds) == 3
-    assert evidence.more
+    measurements = gather(frame, true_pose(frame), spread)
+    assert len(measurements.leds) == 3
+    assert measurements.more

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from estimator_synthetic import GRAVITY_M_S2, View, grid, view_of
 
-from estimator.camera.leveling import level, levelling_homography, printed_eq6, rotation, tilt_from_gravity, tilt_sigmas
+from estimator.camera.leveling import level, leveling_homography, printed_eq6, rotation, tilt_from_gravity, tilt_sigmas
 from estimator.errors import EstimationFailure
 from estimator.io.dataset import Accelerometer
 
@@ -58,13 +58,13 @@ def test_levelled_pixels_are_those_of_a_level_camera_at_the_same_place(
     tilted = view_of((3, 3, 3), 2.5, tilt_x_deg, tilt_y_deg, yaw_deg, (4000, 3000, 15000.0))
     same_place = View(4000, 3000, 15000.0, tilted.position_m, yaw_deg=yaw_deg)
     x, y, z = tilted.gravity_m_s2
-    levelled = level(tilted.project(leds), tilted.K, rotation(*tilt_from_gravity((x, y, z))))
+    leveled = level(tilted.project(leds), tilted.K, rotation(*tilt_from_gravity((x, y, z))))
     # Pixels up to 6e4, a few roundings of 1e-16 each, magnified by 1 / cos^2 of 75.5 deg = 16.
-    np.testing.assert_allclose(levelled, same_place.project(leds), atol=1e-8)
+    np.testing.assert_allclose(leveled, same_place.project(leds), atol=1e-8)
 
 
 def test_the_homography_of_a_level_camera_is_the_identity() -> None:
-    np.testing.assert_allclose(levelling_homography(K, rotation(0, 0)), np.eye(3), atol=1e-15)
+    np.testing.assert_allclose(leveling_homography(K, rotation(0, 0)), np.eye(3), atol=1e-15)
 
 
 @pytest.mark.parametrize("v_px", [150.0, 160.0])
