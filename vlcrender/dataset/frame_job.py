@@ -11,7 +11,7 @@ import numpy as np
 from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.rig import Mounted
 from vlcrender.camera.roi import Roi
-from vlcrender.core.random_keys import stream
+from vlcrender.core.random_keys import random_key, stream
 from vlcrender.dataset.downlink import decoded_spots
 from vlcrender.dataset.files import EXPECTED, FRAMES, PREVIEWS, PROCESSED, exr_attributes, write_exr, write_preview
 from vlcrender.dataset.motion import poses_during
@@ -51,7 +51,7 @@ def make_frame(job: Job, frame: int) -> Record:
     camera, sensor = mounted.camera, Roi.of_sensor(mounted.camera)
     seen = _seen(job, pose_number, which)
     main, pose, view, exposure_s, expected = seen.main, seen.pose, seen.view, seen.exposure_s, seen.expected
-    noise = f"{recipe.seed}/{frame}/shot-noise"
+    noise = random_key(recipe.seed, frame, "shot-noise")
     dn = [
         (roi, expose(recipe.sensor, image, noise, roi.row, roi.column, exposure_s, mounted.name))
         for roi, image in expected
