@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from vlcrender.camera.intrinsics import Camera, Pose
+from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.roi import Roi
 from vlcrender.core.backend import dr, mi
 from vlcrender.dataset.files import exr_attributes, write_exr, write_preview
@@ -50,17 +51,17 @@ def main() -> None:
     repeats = int(sys.argv[1]) if len(sys.argv) > 1 else 5
     scene = load_scene(Path(__file__).parent.parent / "scenes/office.toml")
     camera, sensor, renderer = Camera(), Sensor(), Renderer(scene)
-    view = renderer.expected_image(camera, POSE)
+    view = renderer.expected_image(PosedCamera(camera, POSE))
     expected = view.expected_electrons(EXPOSURE_S)
     whole = Roi.of_sensor(camera)
     dn = expose(sensor, expected, "bench")
-    loaded = mi.load_dict(scene_dict(scene, camera, POSE), optimize=False)
+    loaded = mi.load_dict(scene_dict(scene, PosedCamera(camera, POSE)), optimize=False)
     depth, path = mi.load_dict({"type": "depth"}), mi.load_dict({"type": "path", "max_depth": 8})
     with tempfile.TemporaryDirectory() as folder:
         exr, png = Path(folder) / "frame.exr", Path(folder) / "frame.png"
         attributes = exr_attributes(camera, "main", EXPOSURE_S, 0)
         stages: dict[str, Callable[[], object]] = {
-            "rays and LED patches": lambda: renderer.expected_image(camera, POSE),
+            "rays and LED patches": lambda: renderer.expected_image(PosedCamera(camera, POSE)),
             "expected electrons": lambda: view.expected_electrons(EXPOSURE_S),
             "Poisson noise and digital numbers": lambda: expose(sensor, expected, "bench"),
             "EXR (PIZ) and its SHA-256": lambda: write_exr(exr, [(whole, dn)], whole, attributes),

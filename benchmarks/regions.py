@@ -14,6 +14,7 @@ from multiprocessing import get_context
 from pathlib import Path
 
 from vlcrender.camera.intrinsics import Camera, Pose
+from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.roi import LedRegions
 from vlcrender.core.backend import dr
 from vlcrender.rendering.renderer import Renderer
@@ -35,7 +36,7 @@ def shoot(number: int, regions: LedRegions | None) -> int:
     """Render and expose the pose of this number, along a diagonal of the floor; returns the pixels made."""
     share = number * 0.618034 % 1.0
     pose = Pose((0.2 + 6.6 * share, 0.2 + 6.6 * (1 - share), 0.05))
-    view = renderer().expected_image(Camera(), pose, regions)
+    view = renderer().expected_image(PosedCamera(Camera(), pose), regions)
     sensor, key = Sensor(), f"bench {number}"
     return sum(
         expose(sensor, part.expected_electrons(EXPOSURE_S), key, part.roi.row, part.roi.column).size

@@ -13,6 +13,7 @@ from PIL import Image
 from scipy.stats import skellam
 
 from vlcrender.camera.intrinsics import Camera, Pose
+from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.rendering.renderer import Renderer
 from vlcrender.scene.loader import load_scene
 from vlcrender.sensor.isp import Processed
@@ -41,7 +42,7 @@ def processed(image_dn: NDArray[np.uint32], sensor: Sensor) -> NDArray[np.float6
 def main() -> None:
     """Render, expose twice, and draw the difference's distribution and its variance over the mean."""
     sensor = Sensor()
-    view = Renderer(load_scene(ROOT / "scenes/office.toml")).expected_image(BLURRED, POSE)
+    view = Renderer(load_scene(ROOT / "scenes/office.toml")).expected_image(PosedCamera(BLURRED, POSE))
     expected = view.expected_electrons(EXPOSURE_S)
     pair = [expose(sensor, expected, f"picture/{n}") for n in range(2)]
     raw = pair[0].astype(float) - pair[1]

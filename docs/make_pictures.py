@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from vlcrender.camera.intrinsics import Camera, Pose, rays_world
+from vlcrender.camera.intrinsics import Camera, Pose
+from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.rig import mounted_cameras
 from vlcrender.config.toml_model import check, read_toml
 from vlcrender.dataset.motion import Motion, poses_during
@@ -63,7 +64,7 @@ def main() -> None:
     OUT.mkdir(exist_ok=True)
     mesh = OUT / "board.obj"
     mesh.write_text(BOARD_OBJ)
-    ray = rays_world(Camera(**NARROW), TILTED, np.array([600.0, 330.0]))
+    ray = PosedCamera(Camera(**NARROW), TILTED).rays_world(np.array([600.0, 330.0]))
     place = np.array(TILTED.position_m) + ray * 1.6 / ray[2]
     board = {"file": "board.obj", "position_m": place.tolist(), "yaw_deg": 30.0, "scale": 0.2, "reflectance": 0.2}
     furnished = Renderer(office(OUT, furniture=[board]))
@@ -106,7 +107,7 @@ def main() -> None:
     for axes, (title, (renderer, camera, pose, during)) in zip(
         figure.subplots(3, 4).ravel(), shots.items(), strict=True
     ):
-        image = renderer.expected_image(camera, pose, during=during).expected_electrons(1.0)
+        image = renderer.expected_image(PosedCamera(camera, pose), during=during).expected_electrons(1.0)
         image = image / np.quantile(image, 0.5) / WHITES.get(title, 12.0)
         axes.imshow(np.clip(image, 0, 1) ** (1 / 2.2), cmap="gray", vmin=0, vmax=1)
         axes.set_title(title, fontsize=10)

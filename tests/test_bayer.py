@@ -5,6 +5,7 @@ import pytest
 from scipy import constants
 
 from vlcrender.camera.intrinsics import Camera, Pose
+from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.roi import LedRegions, Roi
 from vlcrender.rendering.bayer import MosaicRenderer, colour_of_pixels
 from vlcrender.rendering.renderer import Renderer
@@ -39,8 +40,8 @@ def test_each_pixel_is_that_of_a_sensor_of_its_colour(office: Scene, regions: Le
     """Through a defocused lens, so that the blur is shown to come before the filters."""
     camera = Camera(width_px=160, height_px=120, pixel_pitch_um=30.0, focus_distance_m=0.6)
     of_colours = tuple(Renderer(office, None, Tabulated(QE, colour)) for colour in COLOURS)
-    seen = MosaicRenderer(of_colours, "grbg").expected_image(camera, POSE, regions)
-    alone = [renderer.expected_image(camera, POSE, regions) for renderer in of_colours]
+    seen = MosaicRenderer(of_colours, "grbg").expected_image(PosedCamera(camera, POSE), regions)
+    alone = [renderer.expected_image(PosedCamera(camera, POSE), regions) for renderer in of_colours]
     for number, part in enumerate(seen.parts):
         image = part.expected_electrons(1e-6)
         colours = colour_of_pixels("grbg", part.roi)
@@ -53,7 +54,10 @@ def test_each_pixel_is_that_of_a_sensor_of_its_colour(office: Scene, regions: Le
 def test_the_bounds_patches_are_the_views(office: Scene) -> None:
     camera = Camera(width_px=160, height_px=120, pixel_pitch_um=30.0)
     renderer = MosaicRenderer(tuple(Renderer(office, None, Tabulated(QE, colour)) for colour in COLOURS), "rggb")
-    seen, alone = renderer.expected_image(camera, POSE).patches, renderer.led_patches(camera, POSE)
+    seen, alone = (
+        renderer.expected_image(PosedCamera(camera, POSE)).patches,
+        renderer.led_patches(PosedCamera(camera, POSE)),
+    )
     assert len(seen) == len(alone) > 0
     for a, b in zip(seen, alone, strict=True):
         assert np.allclose(a.electrons_per_s, b.electrons_per_s, rtol=1e-6)

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from conftest import ROOT
 
-from vlcrender.camera.intrinsics import Camera, Pose, project
-from vlcrender.camera.roi import Roi
+from vlcrender.camera.intrinsics import Camera, Pose
+from vlcrender.camera.posed_camera import PosedCamera
+from vlcrender.camera.rig import Mounted, mounted_cameras
+from vlcrender.camera.roi import RegionImage, Roi
 from vlcrender.config.toml_model import check, read_toml
 from vlcrender.dataset.recipe import load_plan
 from vlcrender.errors import InputError
@@ -37,22 +39,22 @@ def renderer() -> Renderer:
     return Renderer(build_scene(check({**tree, "led": leds}, SceneSettings, "bound"), "bound"))
 
 
-def light_of(
-    renderer: Renderer, camera: Camera, led_ids: Sequence[int], mounted: Callable[[Pose], Pose] = lambda pose: pose
-) -> Callable[[Pose], list[LedPatch]]:
-    def patches(pose: Pose) -> list[LedPatch]:
-        return [patch for patch in renderer.led_patches(camera, mounted(pose)) if patch.led_id in led_ids]
+def light_of(renderer: Renderer, led_ids: Sequence[int]) -> Callable[[PosedCamera], list[LedPatch]]:
+    return lambda posed: [patch for patch in renderer.led_patches(posed) if patch.led_id in led_ids]
 
-    return patches
+
+def alone(camera: Camera) -> Mounted:
+    """A camera that is the whole rig."""
+    return mounted_cameras(camera, ())[0]
 
 
 def bound_m2(
     renderer: Renderer, camera: Camera, led_ids: Sequence[int], sigma_deg: float, exposure_s: float = EXPOSURE_S
 ) -> np.ndarray | None:
-    expected = renderer.expected_image(camera, POSE).expected_electrons(exposure_s)
-    variance = [(Roi.of_sensor(camera), variance_e2(Sensor(full_well_e=1e6), expected))]
+    expected = renderer.expected_image(PosedCamera(camera, POSE)).expected_electrons(exposure_s)
+    variance = [RegionImage(Roi.of_sensor(camera), variance_e2(Sensor(full_well_e=1e6), expected))]
     return position_bound_m2(
-        camera, POSE, light_of(renderer, camera, led_ids), exposure_s, variance, 2.6, (sigma_deg, sigma_deg)
+        alone(camera), POSE, light_of(renderer, led_ids), exposure_s, variance, 2.6, (sigma_deg, sigma_deg)
     )
 
 
@@ -70,14 +72,14 @@ def edge_slopes(camera: Camera, center_m: np.ndarray, box: Roi) -> np.ndarray:
     """
     around = np.linspace(0, 2 * np.pi, 40_001)
     rim = center_m + RADIUS_M * np.column_stack([np.cos(around), np.sin(around), 0 * around])
-    edge, _ = project(camera, POSE, rim)
+    edge = PosedCamera(camera, POSE).project(rim)
     piece, middle = np.diff(edge, axis=0), (edge[1:] + edge[:-1]) / 2
     normal = np.column_stack([piece[:, 1], -piece[:, 0]])  # as long as the piece
     normal *= np.sign((normal * (middle - edge.mean(axis=0))).sum())
     column, row = (np.floor(middle).astype(int) - [box.column, box.row]).T
     slopes = np.zeros((6, box.rows, box.columns))
     for unknown in range(6):
-        there, back = (project(camera, moved(unknown, sign * 1e-6), rim)[0] for sign in (1, -1))
+        there, back = (PosedCamera(camera, moved(unknown, sign * 1e-6)).project(rim) for sign in (1, -1))
         velocity = (there - back) / 2e-6
         swept = ((velocity[1:] + velocity[:-1]) / 2 * normal).sum(axis=1)
         np.add.at(slopes[unknown], (row, column), swept)
@@ -91,7 +93,7 @@ def test_it_is_the_information_that_moving_edges_carry(renderer: Renderer, small
     takes up to a part in 1000, and the edge's brightness is not exactly the brightest pixel's: cos^4 changes by 4
     tan(16 deg) / 1500 = 1e-3 a pixel, over 5 pixels by 0.5 %. Held to 1 %.
     """
-    view = renderer.expected_image(small_camera, POSE)
+    view = renderer.expected_image(PosedCamera(small_camera, POSE))
     expected = view.expected_electrons(EXPOSURE_S).astype(float)
     count = len(view.patches)
     information = np.zeros((6 + 2 * count, 6 + 2 * count))
@@ -137,10 +139,10 @@ def test_gravity_and_more_leds_lower_it(renderer: Renderer, small_camera: Camera
 
 def test_each_tilt_has_its_own_error(renderer: Renderer, small_camera: Camera) -> None:
     """Little known of one tilt costs more than as little known of none, and less than as little known of both."""
-    expected = renderer.expected_image(small_camera, POSE).expected_electrons(EXPOSURE_S)
-    variance = [(Roi.of_sensor(small_camera), variance_e2(Sensor(full_well_e=1e6), expected))]
+    expected = renderer.expected_image(PosedCamera(small_camera, POSE)).expected_electrons(EXPOSURE_S)
+    variance = [RegionImage(Roi.of_sensor(small_camera), variance_e2(Sensor(full_well_e=1e6), expected))]
     sizes = [
-        position_bound_m2(small_camera, POSE, light_of(renderer, small_camera, [0, 1]), EXPOSURE_S, variance, 2.6, s)
+        position_bound_m2(alone(small_camera), POSE, light_of(renderer, [0, 1]), EXPOSURE_S, variance, 2.6, s)
         for s in ((0.1, 0.1), (0.1, 5.0), (5.0, 0.1), (5.0, 5.0))
     ]
     none, y, x, both = (float(np.trace(bound)) for bound in sizes if bound is not None)
@@ -156,31 +158,12 @@ def test_on_a_rig_it_is_of_the_cameras_own_position(renderer: Renderer, small_ca
     exact to 1e-7; the lever's differences, of 1e-8 m, to 1e-8 of rounding.
     """
     offset_m = np.array([0.3, 0.0, 0.0])
-
-    def mounted(main: Pose) -> Pose:
-        x, y, z = np.array(main.position_m) + main.rotation.T @ offset_m
-        return Pose((x, y, z), main.tilt_x_deg, main.tilt_y_deg, main.yaw_deg)
-
     x, y, z = np.array(POSE.position_m) - POSE.rotation.T @ offset_m
     main = Pose((x, y, z), POSE.tilt_x_deg, POSE.tilt_y_deg, POSE.yaw_deg)
-    variance = [
-        (
-            Roi.of_sensor(small_camera),
-            variance_e2(
-                Sensor(full_well_e=1e6), renderer.expected_image(small_camera, POSE).expected_electrons(EXPOSURE_S)
-            ),
-        )
-    ]
-    bound = position_bound_m2(
-        small_camera,
-        main,
-        light_of(renderer, small_camera, [0, 1], mounted),
-        EXPOSURE_S,
-        variance,
-        2.6,
-        (0.5, 0.5),
-        mounted=mounted,
-    )
+    expected = renderer.expected_image(PosedCamera(small_camera, POSE)).expected_electrons(EXPOSURE_S)
+    variance = [RegionImage(Roi.of_sensor(small_camera), variance_e2(Sensor(full_well_e=1e6), expected))]
+    mounted = Mounted("beside", small_camera, np.eye(3), offset_m)
+    bound = position_bound_m2(mounted, main, light_of(renderer, [0, 1]), EXPOSURE_S, variance, 2.6, (0.5, 0.5))
     assert bound == pytest.approx(bound_m2(renderer, small_camera, [0, 1], 0.5), rel=1e-4, abs=1e-12)
 
 

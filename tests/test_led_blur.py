@@ -8,10 +8,11 @@ from scipy.special import j1
 
 from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.lens import AIRY_TAIL, defocus_diameter_px, split_for, split_kernel
+from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.roi import Roi
 from vlcrender.core.planar_shapes import Disc
-from vlcrender.rendering.led_blur import LedBlur, led_blur
-from vlcrender.rendering.led_coverage import coverage_of_led
+from vlcrender.rendering.led_blur import LedKernel, led_blur
+from vlcrender.rendering.led_coverage import LedFace, coverage_of_led
 from vlcrender.rendering.led_edges import LedEdges, edges_of_led
 from vlcrender.rendering.renderer import Renderer
 from vlcrender.scene.loader import Scene
@@ -52,19 +53,19 @@ def sharp_image(camera: Camera) -> tuple[Array, Roi, LedEdges]:
     """Coverage of an LED overhead imaged at CENTER_PX, its window and edges."""
     pose = Pose((1.0, 1.0, 1.0))
     center_m = np.array([*(1.0 + (CENTER_PX - 32) * OVERHEAD_M / camera.focal_px), 1.0 + OVERHEAD_M])
-    image = coverage_of_led(camera, pose, center_m, Disc(RADIUS_M), 40)
+    posed, face = PosedCamera(camera, pose), LedFace(center_m, Disc(RADIUS_M))
+    image = coverage_of_led(posed, face, 40)
     assert image is not None
-    edges = edges_of_led(camera, pose, center_m, Disc(RADIUS_M), image, split_for(camera, OVERHEAD_M))
-    return image.coverage, Roi(image.row, image.column, *image.coverage.shape), edges
+    return image.coverage, image.roi, edges_of_led(posed, face, image, split_for(camera, OVERHEAD_M))
 
 
 def blurred_image(camera: Camera) -> tuple[Array, Roi]:
     """The same after the lens."""
     coverage, roi, edges = sharp_image(camera)
-    kernel = split_kernel(camera, OVERHEAD_M)
-    assert kernel is not None
-    blur = LedBlur((kernel.whole,), (kernel,), None)
-    return blur.blurred(0, coverage, roi, [edges], 1.0), roi.padded(blur.spread_px)
+    parts = split_kernel(camera, OVERHEAD_M)
+    assert parts is not None
+    kernel = LedKernel(parts.whole, parts)
+    return kernel.blurred(coverage, roi, [edges], 1.0), roi.padded(kernel.radius_px)
 
 
 def shared_by_discs(distance: Array, first: float, second: float) -> Array:
@@ -146,7 +147,7 @@ def test_each_led_near_the_focus_has_its_own_kernel(table1: Scene) -> None:
     leds, camera = table1.leds, Camera(focus_distance_m=2.5)
     pose = Pose((float(leds.centers_m[0, 0]), float(leds.centers_m[0, 1]), 0.98))
     lower = Pose((pose.position_m[0], pose.position_m[1], 0.982))
-    one, other = (led_blur(leds, camera, at).splits[0] for at in (pose, lower))
+    one, other = (led_blur(leds, PosedCamera(camera, at)).kernels[0].parts for at in (pose, lower))
     assert one is not None
     assert other is not None
     expected = split_kernel(camera, float(leds.centers_m[0, 2]) - 0.98)
@@ -166,7 +167,7 @@ def test_slopes_of_blurred_edges_do_not_depend_on_the_step(table1: Scene, lens: 
         images = []
         for sign in (1, -1):
             moved = Pose((0.31 + sign * step_px * 3.0 / camera.focal_px, *at.position_m[1:]), 2.0, -1.0, 10.0)
-            (patch,) = (p for p in renderer.led_patches(camera, moved, None, at) if p.led_id == 2)
+            (patch,) = (p for p in renderer.led_patches(PosedCamera(camera, moved), None, at) if p.led_id == 2)
             images.append(patch.electrons_per_s)
         return (images[0] - images[1]) / (2 * step_px)
 

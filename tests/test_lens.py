@@ -5,7 +5,7 @@ import pytest
 from scipy.special import j0, j1
 
 from vlcrender.camera.distortion import Distortion
-from vlcrender.camera.intrinsics import Camera, ray_of_pixel
+from vlcrender.camera.intrinsics import Camera
 from vlcrender.camera.lens import blur, blur_kernel, defocus_diameter_px, relative_illumination
 from vlcrender.core.backend import dr, mi
 from vlcrender.core.planar_shapes import rectangle_polygon_area
@@ -24,12 +24,12 @@ def test_falloff_is_the_cosine_times_a_pixels_solid_angle(camera: Camera, rng: n
     u, v = rng.uniform([[0], [0]], [[400], [300]], (2, 200))
     h = 1e-3
     corners = [
-        np.stack(ray_of_pixel(camera, u + i * h, v + j * h), axis=-1) for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1))
+        np.stack(camera.unproject(u + i * h, v + j * h), axis=-1) for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1))
     ]
     corners = [c / np.linalg.norm(c, axis=-1, keepdims=True) for c in corners]
     spread = np.cross(corners[2] - corners[0], corners[3] - corners[1])
     solid_angle = np.linalg.norm(spread, axis=-1) / 2 / (2 * h) ** 2
-    ray = np.stack(ray_of_pixel(camera, u, v), axis=-1)
+    ray = np.stack(camera.unproject(u, v), axis=-1)
     cosine = ray[:, 2] / np.linalg.norm(ray, axis=-1)
     # differences over 2 h = 2e-3 px: 2^-52 / (2e-3 / 167 px) = 2e-11, twice; curvature (2e-3 / 167)^2 is less
     expected = cosine * solid_angle * camera.focal_px**2

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from vlcrender.camera.intrinsics import Camera, Pose, project
+from vlcrender.camera.intrinsics import Camera, Pose
+from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.rig import mounted_cameras
 from vlcrender.dataset.motion import Motion, poses_during
 from vlcrender.errors import InputError
@@ -19,7 +20,9 @@ LED_2 = np.array([0.3, 1.9, 3.5])
 def patch(scene: Scene, camera: Camera, motion: Motion | None) -> LedPatch:
     (mounted,) = mounted_cameras(camera, ())
     during = poses_during(motion, mounted, POSE, EXPOSURE_S, scene)
-    return next(p for p in Renderer(scene).expected_image(camera, POSE, None, during).patches if p.led_id == 2)
+    return next(
+        p for p in Renderer(scene).expected_image(PosedCamera(camera, POSE), None, during).patches if p.led_id == 2
+    )
 
 
 def moments(light: LedPatch) -> tuple[np.ndarray, np.ndarray]:
@@ -62,8 +65,8 @@ def test_a_streak_is_as_long_as_the_way_and_keeps_its_light(table1: Scene, small
 def test_later_is_further_along(small_camera: Camera, name: str) -> None:
     """The way has a sign, which a streak does not show."""
     motion, way_px = STREAKS[name]
-    later, _ = project(small_camera, motion.pose_at(POSE, EXPOSURE_S), LED_2)
-    now, _ = project(small_camera, POSE, LED_2)
+    later = PosedCamera(small_camera, motion.pose_at(POSE, EXPOSURE_S)).project(LED_2)
+    now = PosedCamera(small_camera, POSE).project(LED_2)
     assert later - now == pytest.approx(way_px, abs=0.02)  # tan(w t) is longer than w t by (0.0087)^2 / 3
 
 
@@ -72,24 +75,25 @@ def test_turning_about_the_axis_turns_the_image_back(small_camera: Camera) -> No
     lamp = LED_2 + [0.2, 0.0, 0.0]  # 100 px right of the centre; x (right) turns to y (down), what is seen turns up
     angle = np.radians(10)
     expected = [200 + 100 * np.cos(angle), 150 - 100 * np.sin(angle)]
-    assert project(small_camera, later, lamp)[0] == pytest.approx(expected, abs=1e-9)
+    assert PosedCamera(small_camera, later).project(lamp) == pytest.approx(expected, abs=1e-9)
 
 
 def test_steps_are_half_a_pixel_at_most(table1: Scene, small_camera: Camera) -> None:
     (mounted,) = mounted_cameras(small_camera, ())
     during = poses_during(STREAKS["to +x"][0], mounted, POSE, EXPOSURE_S, table1)
-    pixels = np.array([project(small_camera, pose, LED_2)[0] for pose in during])
+    pixels = np.array([PosedCamera(small_camera, pose).project(LED_2) for pose in during])
     assert np.abs(np.diff(pixels[:, 0])).max() <= 0.5 + 1e-9
     assert len(during) < 60
-    assert pixels.mean(axis=0) == pytest.approx(project(small_camera, POSE, LED_2)[0])
+    assert pixels.mean(axis=0) == pytest.approx(PosedCamera(small_camera, POSE).project(LED_2))
 
 
 def test_standing_still_is_the_same_to_the_bit(table1: Scene, small_camera: Camera) -> None:
     assert poses_during(Motion(), mounted_cameras(small_camera, ())[0], POSE, EXPOSURE_S, table1) == (POSE,)
     renderer = Renderer(table1)
-    one = renderer.expected_image(small_camera, POSE).expected_electrons(1e-4)
+    one = renderer.expected_image(PosedCamera(small_camera, POSE)).expected_electrons(1e-4)
     assert (
-        renderer.expected_image(small_camera, POSE, None, (POSE,)).expected_electrons(1e-4).tobytes() == one.tobytes()
+        renderer.expected_image(PosedCamera(small_camera, POSE), None, (POSE,)).expected_electrons(1e-4).tobytes()
+        == one.tobytes()
     )
 
 

@@ -7,6 +7,7 @@ import pytest
 
 from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.lens import relative_illumination
+from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.config.toml_model import check
 from vlcrender.errors import InputError
 from vlcrender.rendering.path_traced import reference_cd_m2
@@ -41,10 +42,10 @@ def scene_of(folder: Path = Path(), **changes: object) -> Scene:
 
 def both_ways(scene: Scene, camera: Camera, pose: Pose, samples: int) -> tuple[np.ndarray, ...]:
     """In cd/m2, (rows, columns) each: the fast way, the reference, its variance; and which pixels LEDs light."""
-    reference, variance = reference_cd_m2(scene, camera, pose, samples)
+    reference, variance = reference_cd_m2(scene, PosedCamera(camera, pose), samples)
     rate = electron_rate_per_cd_m2(camera, "LED-B3", Silicon())
     u, v = np.meshgrid(np.arange(camera.width_px) + 0.5, np.arange(camera.height_px) + 0.5)
-    view = Renderer(scene).expected_image(camera, pose)
+    view = Renderer(scene).expected_image(PosedCamera(camera, pose))
     ours = view.expected_electrons(1.0) / rate / relative_illumination(camera, u, v)
     lit = np.zeros(ours.shape, dtype=bool)
     for patch in (*view.patches, *view.parts[0].reflections):
@@ -72,7 +73,7 @@ def test_furniture_hides_leds_and_is_lit_as_in_the_reference(tmp_path: Path) -> 
     )
     alone = (
         Renderer(scene_of(led=leds))
-        .expected_image(Camera(**SMALL_VIEW), Pose((1.5, 1.5, 0.4), 4.0, -6.0, 30.0))
+        .expected_image(PosedCamera(Camera(**SMALL_VIEW), Pose((1.5, 1.5, 0.4), 4.0, -6.0, 30.0)))
         .patches
     )
     # the box hides one LED at least in part: otherwise this would test nothing
@@ -114,11 +115,11 @@ def test_the_light_that_a_pane_mirrors_is_as_in_the_reference() -> None:
     assert abs((ours - reference).mean()) < allowed
     # what is tested is there, and the tolerance does not hide it
     without = Renderer(scene_of(led=[led], room=dark, ambient=scene.settings.ambient.model_dump()))
-    plain = without.background_cd_m2(Camera(**SMALL_VIEW), Pose((1.0, 1.5, 2.2), 180.0))
+    plain = without.background_cd_m2(PosedCamera(Camera(**SMALL_VIEW), Pose((1.0, 1.5, 2.2), 180.0)))
     assert ours.mean() - plain.mean() > 3 * allowed
 
 
 def test_leds_that_are_not_lambertian_are_refused() -> None:
     led = {"id": 1, "position_m": [0.5, 1.5, 2.5], "radius_m": 0.1, "luminance_cd_m2": 8000.0, "half_power_deg": 40.0}
     with pytest.raises(InputError, match="half_power_deg"):
-        reference_cd_m2(scene_of(led=[led]), Camera(**SMALL_VIEW), Pose((1.0, 1.0, 1.0)), 8)
+        reference_cd_m2(scene_of(led=[led]), PosedCamera(Camera(**SMALL_VIEW), Pose((1.0, 1.0, 1.0))), 8)

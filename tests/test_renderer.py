@@ -7,8 +7,9 @@ import pytest
 from conftest import ROOT
 
 from vlcrender.camera import lens
-from vlcrender.camera.intrinsics import Camera, Pose, project
+from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.lens import relative_illumination
+from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.config.toml_model import check, read_toml
 from vlcrender.errors import InputError
 from vlcrender.rendering.expected_image import ExpectedImage
@@ -56,7 +57,7 @@ LED_2 = (0.3, 1.9)
 def test_the_bright_spot_moves_the_written_way(
     renderer: Renderer, small_camera: Camera, pose: Pose, direction: tuple[int, int]
 ) -> None:
-    image = renderer.expected_image(small_camera, pose).expected_electrons(1e-4)
+    image = renderer.expected_image(PosedCamera(small_camera, pose)).expected_electrons(1e-4)
     row, column = np.unravel_index(np.argmax(image), image.shape)
     shift = np.array([column + 0.5 - 200, row + 0.5 - 150])
     assert shift @ direction > 10
@@ -66,13 +67,11 @@ def test_the_bright_spot_moves_the_written_way(
 def test_the_background_moves_with_the_spots(office_renderer: Renderer, small_camera: Camera) -> None:
     """The rays cast for the surfaces and the projection of the LEDs agree: a panel's corner is where it projects."""
     pose = Pose((3.15, 3.1, 1.0), tilt_x_deg=-4.0, tilt_y_deg=3.0, yaw_deg=20.0)
-    image = office_renderer.background_cd_m2(small_camera, pose)
+    image = office_renderer.background_cd_m2(PosedCamera(small_camera, pose))
     inverse = np.linalg.inv(small_camera.matrix)
     panel = next(s for s in office_renderer.scene.surfaces if s.name == "panel 24 underside")
-    corners, _ = project(
-        small_camera,
-        pose,
-        np.stack([panel.corner_m + a * panel.edge_u_m + b * panel.edge_v_m for a in (0, 1) for b in (0, 1)]),
+    corners = PosedCamera(small_camera, pose).project(
+        np.stack([panel.corner_m + a * panel.edge_u_m + b * panel.edge_v_m for a in (0, 1) for b in (0, 1)])
     )
     inside = [c for c in corners if 5 < c[0] < 395 and 5 < c[1] < 295]
     assert inside, "choose another pose: no corner in view"
@@ -91,7 +90,7 @@ def test_the_background_moves_with_the_spots(office_renderer: Renderer, small_ca
 
 def test_a_filled_pixel_holds_the_leds_luminance(renderer: Renderer) -> None:
     camera = Camera()
-    view = renderer.expected_image(camera, Pose((*LED_2, 0.5)))
+    view = renderer.expected_image(PosedCamera(camera, Pose((*LED_2, 0.5))))
     expected = view.expected_electrons(2.5e-4)
     per_cd = 2.5e-4 * electron_rate_per_cd_m2(camera, "LED-B3", Silicon())
     # 8000 cd/m2 of its own and 0.5 * 400 / pi reflected, on the axis; the LEDs' light adds less than 1 lux: 2e-5
@@ -100,7 +99,7 @@ def test_a_filled_pixel_holds_the_leds_luminance(renderer: Renderer) -> None:
 
 def test_the_ceiling_dims_with_cos4_towards_the_corner(renderer: Renderer) -> None:
     camera = Camera()
-    image = renderer.background_cd_m2(camera, Pose((3.5, 3.5, 0.5)))
+    image = renderer.background_cd_m2(PosedCamera(camera, Pose((3.5, 3.5, 0.5))))
     tan2 = ((1999.5) ** 2 + (1499.5) ** 2) / 15000**2
     # 400 lux everywhere, and the four LEDs' reflected light, which is below 0.3 lux: 8e-4
     assert image[0, 0] == pytest.approx(0.8 * 400 / np.pi / (1 + tan2) ** 2, rel=1e-3)
@@ -110,8 +109,8 @@ def test_the_ceiling_dims_with_cos4_towards_the_corner(renderer: Renderer) -> No
 def test_centroid_of_a_level_led_is_its_projection(renderer: Renderer) -> None:
     camera = Camera()
     pose = Pose((0.35, 1.8, 0.5))
-    view = renderer.expected_image(camera, pose)
-    expected, _ = project(camera, pose, np.array([0.3, 1.9, 3.5]))
+    view = renderer.expected_image(PosedCamera(camera, pose))
+    expected = PosedCamera(camera, pose).project(np.array([0.3, 1.9, 3.5]))
     # cos^4 tilts the disc's brightness: d(cos^4)/du * r^2/4 = 4 * 500/15000^2 * 60^2/4 = 0.008 px at 500 px off axis
     assert np.abs(centroid(view, 2) - expected).max() < 0.01
 
@@ -146,10 +145,10 @@ def test_agrees_with_mitsubas_own_integrator(name: str, office_renderer: Rendere
     camera, pose = VIEWS[name]
     renderer = daylight if name == "window pane" else office_renderer
     samples = 64
-    reference, variance = reference_cd_m2(renderer.scene, camera, pose, samples)
+    reference, variance = reference_cd_m2(renderer.scene, PosedCamera(camera, pose), samples)
     rate = electron_rate_per_cd_m2(camera, "LED-B3", Silicon())
     u, v = np.meshgrid(np.arange(camera.width_px) + 0.5, np.arange(camera.height_px) + 0.5)
-    view = renderer.expected_image(camera, pose)
+    view = renderer.expected_image(PosedCamera(camera, pose))
     ours = view.expected_electrons(1.0) / rate / relative_illumination(camera, u, v)
     lit = np.zeros(ours.shape, dtype=bool)
     for patch in (*view.patches, *view.parts[0].reflections):
@@ -187,14 +186,14 @@ def test_narrow_discs_are_mitsubas_and_those_of_whole_pixels_are_not(
     """How much of what blurring whole pixels would add is in ours, by least squares: none of it."""
     # D f_i / (z pitch) = 8.2 mm * 18 mm / (2.95 m * 40 um) = 1.25 px
     camera, samples = Camera(**SMALL_VIEW, focus_distance_m="infinity"), 64
-    reference, variance = reference_cd_m2(office_renderer.scene, camera, STRAIGHT, samples)
+    reference, variance = reference_cd_m2(office_renderer.scene, PosedCamera(camera, STRAIGHT), samples)
     rate = electron_rate_per_cd_m2(camera, "LED-B3", Silicon())
     u, v = np.meshgrid(np.arange(camera.width_px) + 0.5, np.arange(camera.height_px) + 0.5)
     per_cd = rate * relative_illumination(camera, u, v)
-    view = office_renderer.expected_image(camera, STRAIGHT)
+    view = office_renderer.expected_image(PosedCamera(camera, STRAIGHT))
     ours = view.expected_electrons(1.0) / per_cd
-    monkeypatch.setattr(lens, "MOST_PARTS", 1)
-    whole_pixels = office_renderer.expected_image(camera, STRAIGHT).expected_electrons(1.0) / per_cd
+    monkeypatch.setattr(lens, "MAX_PARTS", 1)
+    whole_pixels = office_renderer.expected_image(PosedCamera(camera, STRAIGHT)).expected_electrons(1.0) / per_cd
     lit = np.zeros(ours.shape, dtype=bool)
     for patch in view.patches:
         lit[view.parts[0].roi.slices(patch.roi)] |= patch.electrons_per_s > 0
@@ -211,22 +210,22 @@ def test_narrow_discs_are_mitsubas_and_those_of_whole_pixels_are_not(
 
 def test_two_renderings_are_identical(office_renderer: Renderer, office: Scene, small_camera: Camera) -> None:
     pose = Pose((3.5, 3.2, 0.5), 25, 10, 30)
-    first = office_renderer.expected_image(small_camera, pose).expected_electrons(1e-3)
-    second = Renderer(office).expected_image(small_camera, pose).expected_electrons(1e-3)
+    first = office_renderer.expected_image(PosedCamera(small_camera, pose)).expected_electrons(1e-3)
+    second = Renderer(office).expected_image(PosedCamera(small_camera, pose)).expected_electrons(1e-3)
     assert first.tobytes() == second.tobytes()
 
 
 def test_another_thread_renders_the_same_bytes(office_renderer: Renderer) -> None:
     """Dr.Jit's flags hold for one thread, and workers of a cluster render in threads of their own."""
-    arguments = Camera(), Pose((1.5, 2.0, 1.2), 40.0, 35.0, 110.0)
+    posed = PosedCamera(Camera(), Pose((1.5, 2.0, 1.2), 40.0, 35.0, 110.0))
     with ThreadPoolExecutor(1) as pool:
-        there = pool.submit(office_renderer.background_cd_m2, *arguments).result()
-    assert there.tobytes() == office_renderer.background_cd_m2(*arguments).tobytes()
+        there = pool.submit(office_renderer.background_cd_m2, posed).result()
+    assert there.tobytes() == office_renderer.background_cd_m2(posed).tobytes()
 
 
 def test_gains_switch_single_leds(renderer: Renderer) -> None:
     camera = Camera()
-    view = renderer.expected_image(camera, Pose((*LED_2, 0.5)))
+    view = renderer.expected_image(PosedCamera(camera, Pose((*LED_2, 0.5))))
     off = view.expected_electrons(1e-3, gains={2: 0.0})
     assert np.array_equal(off, view.parts[0].background_e_per_s * np.float32(1e-3))
     half = view.expected_electrons(1e-3, gains={2: 0.5})
@@ -237,7 +236,7 @@ def test_gains_switch_single_leds(renderer: Renderer) -> None:
 @pytest.mark.parametrize("position", [(-0.1, 1.0, 1.0), (1.0, 7.0, 1.0), (1.0, 1.0, 3.6), (1.0, 1.0, 0.0)])
 def test_a_camera_outside_the_room_is_refused(renderer: Renderer, position: tuple[float, float, float]) -> None:
     with pytest.raises(InputError, match="not inside the room"):
-        renderer.expected_image(Camera(), Pose(position))
+        renderer.expected_image(PosedCamera(Camera(), Pose(position)))
 
 
 def test_a_fish_eye_is_sharp_at_its_focus_distance_whatever_the_depth(table1: Scene) -> None:
@@ -247,7 +246,7 @@ def test_a_fish_eye_is_sharp_at_its_focus_distance_whatever_the_depth(table1: Sc
     fish_eye = Camera(**lens, projection="equidistant")
     renderer = Renderer(table1)
     sharp, at_2_m, at_1_m = (
-        next(p for p in renderer.expected_image(camera, pose).patches if p.led_id == 2).electrons_per_s
+        next(p for p in renderer.expected_image(PosedCamera(camera, pose)).patches if p.led_id == 2).electrons_per_s
         for camera in (fish_eye, *(fish_eye.model_copy(update={"focus_distance_m": m}) for m in (2.0, 1.0)))
     )
     # Focused at 2 m the sensor is 0.15 % farther from the lens: the image is that much larger, 0.02 px, which may bring
@@ -259,4 +258,4 @@ def test_a_fish_eye_is_sharp_at_its_focus_distance_whatever_the_depth(table1: Sc
 
 def test_the_reference_has_no_diffraction(table1: Scene) -> None:
     with pytest.raises(InputError, match="psf"):
-        reference_cd_m2(table1, Camera(psf="diffraction"), Pose((1, 1, 1)), 8)
+        reference_cd_m2(table1, PosedCamera(Camera(psf="diffraction"), Pose((1, 1, 1))), 8)

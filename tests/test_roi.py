@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vlcrender.camera.intrinsics import Camera, Pose
+from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.roi import LedRegions, Roi, led_regions
 from vlcrender.core.backend import dr
 from vlcrender.dataset.generate import generate
@@ -48,8 +49,8 @@ def test_a_windowed_pixel_holds_what_it_holds_in_the_full_frame(
 ) -> None:
     """Exactly, at the windows' own borders and at the edges of panels too."""
     camera = Camera(width_px=800, height_px=600, pixel_pitch_um=6.0)
-    full = office_renderer.expected_image(camera, pose).expected_electrons(1e-5)
-    view = office_renderer.expected_image(camera, pose, regions)
+    full = office_renderer.expected_image(PosedCamera(camera, pose)).expected_electrons(1e-5)
+    view = office_renderer.expected_image(PosedCamera(camera, pose), regions)
     sensor = Roi.of_sensor(camera)
     seen = [part for part in view.parts if part.roi.overlaps(sensor)]
     assert seen
@@ -70,9 +71,9 @@ def test_on_the_sensor_no_edge_comes_from_beyond_it() -> None:
 
 def test_each_led_has_its_margin_unless_the_sensor_ends(office_renderer: Renderer) -> None:
     camera, pose = Camera(), OFFICE_POSES[0]
-    view = office_renderer.expected_image(camera, pose, LEDS)
+    view = office_renderer.expected_image(PosedCamera(camera, pose), LEDS)
     sensor = Roi.of_sensor(camera)
-    assert len(view.patches) == len(office_renderer.expected_image(camera, pose).patches)
+    assert len(view.patches) == len(office_renderer.expected_image(PosedCamera(camera, pose)).patches)
     for part in view.parts:
         assert part.patches
         assert sensor.contains(part.roi)
@@ -84,8 +85,8 @@ def test_beyond_the_sensor_is_what_a_larger_sensor_would_see(table1: Scene) -> N
     renderer, pose = Renderer(table1), Pose((0.35, 1.75, 0.05), 3.0, 1.0, 10.0)
     camera = Camera(width_px=400, height_px=300, pixel_pitch_um=12.0)
     larger = Camera(width_px=1600, height_px=1500, pixel_pitch_um=12.0, principal_point_px=(800.0, 750.0))
-    full = renderer.expected_image(larger, pose).expected_electrons(1e-5)
-    view = renderer.expected_image(camera, pose, OVERSCAN)
+    full = renderer.expected_image(PosedCamera(larger, pose)).expected_electrons(1e-5)
+    view = renderer.expected_image(PosedCamera(camera, pose), OVERSCAN)
     assert len(view.patches) == 4
     assert {patch.imaged_fraction for patch in view.patches} == {1.0}
     assert min(patch.visible_fraction for patch in view.patches) == 0.0
@@ -96,7 +97,7 @@ def test_beyond_the_sensor_is_what_a_larger_sensor_would_see(table1: Scene) -> N
 
 
 def test_a_frame_that_sees_no_led_has_one_dark_pixel(table1: Scene) -> None:
-    view = Renderer(table1).expected_image(Camera(), Pose((5.0, 5.0, 0.5)), LEDS)
+    view = Renderer(table1).expected_image(PosedCamera(Camera(), Pose((5.0, 5.0, 0.5))), LEDS)
     assert [part.roi for part in view.parts] == [Roi(0, 0, 1, 1)]
     assert view.patches == ()
 
@@ -104,7 +105,7 @@ def test_a_frame_that_sees_no_led_has_one_dark_pixel(table1: Scene) -> None:
 def test_windows_larger_than_the_sensor_allows_are_refused(table1: Scene) -> None:
     with pytest.raises(InputError, match=r"margin_px"):
         Renderer(table1).expected_image(
-            Camera(), Pose((5.0, 5.0, 0.5)), LedRegions(kind="leds", margin_px=9000, overscan=True)
+            PosedCamera(Camera(), Pose((5.0, 5.0, 0.5))), LedRegions(kind="leds", margin_px=9000, overscan=True)
         )
 
 
@@ -121,10 +122,10 @@ def test_windows_share_no_pixel_and_hold_all_that_is_lit(boxes: list[tuple[int, 
 @pytest.mark.parametrize("regions", [None, LEDS], ids=["full frame", "regions"])
 def test_a_new_pose_compiles_no_kernel(office_renderer: Renderer, regions: LedRegions | None) -> None:
     camera = Camera(width_px=400, height_px=300, pixel_pitch_um=12.0)
-    office_renderer.expected_image(camera, OFFICE_POSES[0], regions)
+    office_renderer.expected_image(PosedCamera(camera, OFFICE_POSES[0]), regions)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history()
-        office_renderer.expected_image(camera, Pose((3.3, 3.0, 0.7), 3, 2, -50), regions)
+        office_renderer.expected_image(PosedCamera(camera, Pose((3.3, 3.0, 0.7), 3, 2, -50)), regions)
         kernels = [entry for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT]
     assert kernels
     assert all(entry["cache_hit"] for entry in kernels)

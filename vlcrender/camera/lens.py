@@ -1,4 +1,4 @@
-"""What the lens does to light: dims it off the axis, spreads it where out of focus, and diffracts it.
+"""Radiometry and blur of the lens: relative illumination, defocus, diffraction, and measured kernels.
 
 Sources: thin lens and similar triangles; G. B. Airy, On the diffraction of an object-glass with circular aperture,
 Trans. Camb. Phil. Soc. 5 (1835) 283; Born & Wolf, Principles of Optics, 7th ed., 8.5.2.
@@ -13,64 +13,51 @@ from numpy.typing import NDArray
 from scipy import signal
 from scipy.special import j1
 
-from vlcrender.camera.distortion import distort_with_slope
-from vlcrender.camera.intrinsics import ON_AXIS, Camera, pixel_on_sensor, ray_of_sensor
+from vlcrender.camera.intrinsics import Camera
 from vlcrender.core.planar_shapes import circle_polygon_area
 
 Array = NDArray[np.float64]
 
 AIRY_TAIL = 0.01
-"""Share of the light in the Airy pattern's rings that is left out, and made up for by the rest."""
+"""Share of the Airy pattern's light in rings that are left out; the rest is scaled up by it."""
 MAX_AIRY_PX = 150
-"""How far the Airy pattern is followed at the most; at 1.2 um and f/16 it would leave out AIRY_TAIL there."""
-PARTS_OF_DISC = 12.0
-PARTS_OF_AIRY = 8.0
-"""Parts across a pixel that a disc of 1 px and an Airy pattern of lambda N = 1 px take."""
+"""Maximum radius of the Airy kernel; at 1.2 um and f/16 AIRY_TAIL lies beyond it."""
+PARTS_FOR_DISC = 12.0
+PARTS_FOR_AIRY = 8.0
+"""Parts across a pixel that a disc of 1 px and an Airy pattern of lambda N = 1 px need."""
 MAX_PARTS = 64
-"""A disc narrower than a part then is none: it takes up to 0.2 % of the light from a pixel at an edge."""
+"""Most parts across a pixel. A narrower disc is ignored: it moves up to 0.2 % of an edge pixel's light."""
 
 
 def relative_illumination(camera: Camera, u: Any, v: Any, xp: Any = np, luminance: Any = 1.0) -> Any:
-    """Illumination at pixel positions (u, v) by a luminance, relative to the same on the axis; elementwise.
+    """Illuminance at pixel positions (u, v) over the illuminance on the axis, for one luminance; elementwise.
 
-    cos(theta) (the pupil seen at an angle) times a pixel's solid angle over that on the axis, times what the second
-    stop leaves: cos^4 for a perspective lens, over the distortion's Jacobian; cos(theta) sin(theta) / theta for an
-    equidistant one, 0 beyond 90 deg. Arrays as in `ray_of_pixel`. `luminance`, of the same shape or a number, is
-    multiplied by one factor after the other: rounding in float32 depends on the order.
+    cos(theta) (the pupil seen at an angle) times the pixel's solid angle over a pixel's on the axis, times the share of
+    the pupil that the second stop leaves: cos^4 for a perspective lens, over the distortion's Jacobian determinant;
+    cos(theta) sin(theta) / theta for an equidistant one, 0 beyond 90 deg. Arrays as in `Camera.unproject`. `luminance`,
+    of the same shape or a number, is multiplied by one factor after the other, since rounding depends on the order.
     """
-    x_d, y_d = pixel_on_sensor(camera, u, v)
-    x, y, z = ray_of_sensor(camera, x_d, y_d, xp)
-    if camera.projection == "equidistant":
-        facing = xp.maximum(z, 0.0)
-        sine = xp.sqrt(x * x + y * y + ON_AXIS)
-        tangent = sine / (facing + ON_AXIS)
-        light = luminance * facing * (sine / xp.sqrt(x_d * x_d + y_d * y_d + ON_AXIS))
-    else:
-        tangent = xp.sqrt(x * x + y * y)
-        cos2 = 1.0 / (1.0 + x * x + y * y)
-        light = luminance * cos2 * cos2
-        if camera.distortion is not None:
-            _, _, xx, xy, yy = distort_with_slope(camera.distortion, x, y)
-            light = light / (xx * yy - xy * xy)
+    x, y = camera.sensor_position(u, v)
+    light, tangent = camera.lens_projection.illumination(x, y, xp, luminance)
     if camera.vignetting_deg is not None:
-        light = light * _pupil_left(tangent / float(np.tan(np.radians(camera.vignetting_deg))), xp)
+        light = light * _pupil_share(tangent / float(np.tan(np.radians(camera.vignetting_deg))), xp)
     return light
 
 
-def _pupil_left(shift: Any, xp: Any) -> Any:
-    """Area that two equal circles share, as a part of one's, whose centres are `shift` diameters apart."""
+def _pupil_share(shift: Any, xp: Any) -> Any:
+    """Area that two equal circles with centres `shift` diameters apart share, over the area of one."""
     s = xp.minimum(shift, 1.0)
-    left = (xp.acos(s) - s * xp.sqrt(1.0 - s * s)) * (2 / np.pi)
-    return xp.maximum(left, 0.0)  # rounding: light is never negative
+    share = (xp.acos(s) - s * xp.sqrt(1.0 - s * s)) * (2 / np.pi)
+    return xp.maximum(share, 0.0)  # rounding: light is never negative
 
 
 def defocus_diameter_px(camera: Camera, depth_m: Any) -> Any:
-    """Diameter in pixels of the disc that a point at this depth (a number or an array, along the axis) becomes.
+    """Diameter in pixels of the defocus disc of a point at this depth (a number or an array, along the axis).
 
     D f_i |1/s - 1/z|. The point's image lies at v with 1/v = 1/f - 1/z, the sensor at f_i with 1/f_i = 1/f - 1/s; the
     cone from the pupil D to v has width D |f_i - v| / v = D f_i |1/v - 1/f_i| on the sensor, the same at any field
-    angle, since pupil and sensor are parallel. Of a fish-eye lens take the distance for the depth: it has no one plane
-    of focus. 0 where the camera has no focus.
+    angle, since pupil and sensor are parallel. For a fish-eye lens, which has no plane of focus, the depth is the
+    distance. 0 where the camera has no focus distance.
     """
     depth = np.abs(1.0 / depth_m)
     if camera.focus_distance_m is None:
@@ -80,15 +67,15 @@ def defocus_diameter_px(camera: Camera, depth_m: Any) -> Any:
 
 
 def blur_kernel(camera: Camera, depth_m: float) -> Array | None:
-    """What a point of light at this depth becomes, (m, m) with m odd, adding up to 1; None where it stays one pixel.
+    """Blur kernel of a point of light at this depth, (m, m) with m odd, sum 1; None where the kernel is one pixel.
 
     The disc of `defocus_diameter_px` averaged over each pixel, exactly, convolved with the `psf`.
 
-    It is for images whose pixels hold averages over their areas already. Blurring those by a sampled kernel puts the
-    light of each of its pixels at that pixel's centre: the image is widened by about 1/12 px^2 more than it should be,
-    as if a pixel's square were counted twice. The step at a sharp straight edge is off by 11 % at the worst for a disc
-    of 1 px, 6 % of 2 px, 2 % of 4 px, 0.8 % of 8 px, 0.1 % of 35 px: less than 0.2 / diameter^1.5 (tested). That does
-    for the room behind; LEDs, whose edges are high, have `split_kernel` where the blur is narrow.
+    The kernel is for images whose pixels hold averages over their areas already. It puts the light of each such pixel
+    at the pixel's centre, which widens the image by about 1/12 px^2 too much, as if the pixel's square were counted
+    twice. The error of the step at a sharp straight edge is at most 11 % for a disc of 1 px, 6 % for 2 px, 2 % for
+    4 px, 0.8 % for 8 px, 0.1 % for 35 px: less than 0.2 / diameter^1.5 (tested). This is enough for the room behind
+    the LEDs; LEDs, whose edges are high, have `split_kernel` where the blur is narrow.
     """
     kernel = _kernel(camera, float(defocus_diameter_px(camera, depth_m)), 1)
     if camera.psf_kernel is not None:
@@ -99,59 +86,60 @@ def blur_kernel(camera: Camera, depth_m: float) -> Array | None:
 
 @dataclass(frozen=True)
 class SplitKernel:
-    """What light becomes that is known in n x n parts of each pixel, in whole pixels.
+    """Blur kernels from n x n parts of a pixel to whole pixels.
 
-    `parts`: of light at each part's centre, (n, n, m, m) with m odd, each adding up to 1, in rows and columns.
+    `parts`: the kernel of light at each part's centre, (n, n, m, m) with m odd, sum 1 each; rows before columns.
     """
 
     parts: Array
 
     @property
     def split(self) -> int:
-        """n."""
+        """Number n of parts across a pixel."""
         return len(self.parts)
 
     @property
     def whole(self) -> Array:
-        """Of a pixel whose parts are alike, (m, m)."""
+        """Kernel of a pixel whose parts are equally bright, (m, m)."""
         mean: Array = self.parts.mean(axis=(0, 1))
         return mean
 
 
 def split_for(camera: Camera, depth_m: float) -> int:
-    """Into how many parts across pixels at an edge have to be split, a power of 2; 1 where they need not be.
+    """Number of parts across an edge pixel that the blur at this depth needs, a power of 2; 1 means no split.
 
-    With the light of parts of 1 / n px at their centres, a pixel at a straight edge of step 1 is off by up to
-    D / (12 n^2), D being the most by which the blurred image of a line changes from one pixel to the next: 4 / (pi d)
-    for discs of a diameter d below 1 px, about d^-1.5 for wide ones. What is allowed falls with the light there is:
-    with parts as here the error's square is below 5 % of the shot noise's variance in every pixel along an edge of
-    4000 e beside a background of 24 e, the ceiling's beside a quickstart's LED (tested).
+    With the light of parts of 1 / n px at their centres, the error of a pixel at a straight edge of step 1 is at most
+    D / (12 n^2), where D is the greatest change of the blurred image of a line from one pixel to the next: 4 / (pi d)
+    for discs of a diameter d below 1 px, about d^-1.5 for wide ones. With these numbers of parts the square of the
+    error is below 5 % of the shot noise's variance in every pixel along an edge of 4000 e beside a background of 24 e,
+    which is the ceiling beside an LED of the quickstart (tested).
     """
     disc_px = float(defocus_diameter_px(camera, depth_m))
-    needed = PARTS_OF_DISC / disc_px**0.5 if disc_px > 1 / MAX_PARTS else 1.0
+    needed = PARTS_FOR_DISC / disc_px**0.5 if disc_px > 1 / MAX_PARTS else 1.0
     if camera.psf == "diffraction":
-        airy = PARTS_OF_AIRY / _airy_scale_px(camera) ** 0.9
-        # light blurred twice is as smooth as the smoother of the two makes it
+        airy = PARTS_FOR_AIRY / _airy_scale_px(camera) ** 0.9
+        # light blurred twice is as smooth as the smoother of the two blurs makes it
         needed = min(needed, airy) if disc_px > 1 / MAX_PARTS else airy
     return min(1 << max(0, int(np.ceil(np.log2(needed)))), MAX_PARTS)
 
 
 def split_kernel(camera: Camera, depth_m: float) -> SplitKernel | None:
-    """`blur_kernel` on pixels split as `split_for` says, its results averaged over whole ones; None where that is 1.
+    """`blur_kernel` of the parts of pixels split by `split_for`, averaged over whole pixels; None without a split.
 
-    A measured `psf_kernel` is what it is on whole pixels, and comes last.
+    A measured `psf_kernel` is known on whole pixels and is applied last.
     """
     n = split_for(camera, depth_m)
     if n == 1:
         return None
     fine = _kernel(camera, float(defocus_diameter_px(camera, depth_m)), n)
-    # What a point gives to each pixel, in steps of a part: n x n of the fine kernel's numbers.
+    # Light of a point in each pixel, for points in steps of a part: sums of n x n elements of the fine kernel.
     radius = -(-(fine.shape[0] // 2) // n)
     padded = np.pad(fine / fine.sum(), (radius + 1) * n - 1 - fine.shape[0] // 2)
     sums = np.pad(padded, ((1, 0), (1, 0))).cumsum(axis=0).cumsum(axis=1)
-    gives = sums[n:, n:] - sums[:-n, n:] - sums[n:, :-n] + sums[:-n, :-n]
-    # gives[k] is the pixel whose first part lies k - (radius + 1) n + 1 parts from the point.
-    parts = np.maximum(np.stack([[gives[n - 1 - i :: n, n - 1 - j :: n] for j in range(n)] for i in range(n)]), 0.0)
+    in_pixel = sums[n:, n:] - sums[:-n, n:] - sums[n:, :-n] + sums[:-n, :-n]
+    # in_pixel[k] is the pixel whose first part lies k - (radius + 1) n + 1 parts from the point.
+    parts = np.stack([[in_pixel[n - 1 - i :: n, n - 1 - j :: n] for j in range(n)] for i in range(n)])
+    parts = np.maximum(parts, 0.0)
     if camera.psf_kernel is not None:
         parts = signal.oaconvolve(parts, np.array(camera.psf_kernel)[None, None], mode="full", axes=(2, 3))
     return SplitKernel(parts / parts.sum(axis=(2, 3), keepdims=True))
@@ -170,14 +158,14 @@ def _airy_scale_px(camera: Camera) -> float:
 
 
 def _disc(diameter: float) -> Array:
-    """Share of a disc's area in each pixel, the disc centred on the middle one."""
-    reach = max(0, int(np.ceil(diameter / 2 - 0.5)))
-    if reach == 0:
+    """Share of a disc's area in each pixel; the disc is centred on the middle pixel."""
+    radius = max(0, int(np.ceil(diameter / 2 - 0.5)))
+    if radius == 0:
         return np.ones((1, 1))
-    left = np.arange(reach + 1) - 0.5
+    left = np.arange(radius + 1) - 0.5
     u, v = (axis[..., None] for axis in np.meshgrid(left, left))
     quads = np.concatenate([u, v], axis=2)[:, :, None] + np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
-    quarter = circle_polygon_area(quads.reshape(-1, 4, 2), diameter / 2).reshape(reach + 1, reach + 1)
+    quarter = circle_polygon_area(quads.reshape(-1, 4, 2), diameter / 2).reshape(radius + 1, radius + 1)
     return _four_quarters(quarter / (np.pi * diameter**2 / 4))
 
 
@@ -185,27 +173,27 @@ def _blurred_airy(scale_px: float, disc_px: float, n: int) -> Array:
     """The Airy pattern of `scale_px` = lambda N / pitch, convolved with a disc, averaged over pixels split n x n."""
     if _disc(disc_px * n).size == 1:
         return _airy(scale_px, n)
-    # Both on finer pixels where the pattern is not wide: else each would be averaged over a pixel.
+    # Where the pattern is narrow, convolve on finer pixels: otherwise the average over a pixel would enter twice.
     finer = 5 if scale_px * n < 3 else 1
     fine = signal.fftconvolve(_disc(disc_px * n * finer), _airy(scale_px, n * finer))
-    reach = int(np.ceil((fine.shape[0] // 2 - finer // 2) / finer))
-    padded = np.pad(fine, reach * finer + finer // 2 - fine.shape[0] // 2)
-    pixels = 2 * reach + 1
+    radius = int(np.ceil((fine.shape[0] // 2 - finer // 2) / finer))
+    padded = np.pad(fine, radius * finer + finer // 2 - fine.shape[0] // 2)
+    pixels = 2 * radius + 1
     kernel: Array = np.maximum(padded.reshape(pixels, finer, pixels, finer).sum(axis=(1, 3)), 0.0)
     return kernel
 
 
 @cache
 def _airy(scale_px: float, finer: int) -> Array:
-    """The Airy pattern in pixels split `finer` x `finer`, integrated over each by Gauss-Legendre quadrature.
+    """The Airy pattern on pixels split `finer` x `finer`, integrated over each part by Gauss-Legendre quadrature.
 
     Encircled energy is 1 - 2 / (pi x) far out, on average, with x = pi r / (lambda N).
     """
-    reach_px = min(int(np.ceil(2 / (np.pi**2 * AIRY_TAIL) * scale_px)), MAX_AIRY_PX)
-    reach = reach_px * finer + finer // 2
-    # a ring is lambda N wide: four nodes for each that a pixel holds, and four to start with
+    radius_px = min(int(np.ceil(2 / (np.pi**2 * AIRY_TAIL) * scale_px)), MAX_AIRY_PX)
+    radius = radius_px * finer + finer // 2
+    # a ring is lambda N wide: four nodes, and four more for each ring in a pixel
     nodes, weights = np.polynomial.legendre.leggauss(4 + int(np.ceil(4 / (scale_px * finer))))
-    at = (np.arange(reach + 1)[:, None] + nodes / 2) / finer
+    at = (np.arange(radius + 1)[:, None] + nodes / 2) / finer
     lines = []
     for row in at:
         r = np.hypot(row[:, None, None], at)
@@ -217,17 +205,17 @@ def _airy(scale_px: float, finer: int) -> Array:
 
 
 def _four_quarters(quarter: Array) -> Array:
-    """A kernel from its part right of and below the middle, the middle's row and column included."""
+    """A symmetric kernel from its lower right quarter, which includes the middle row and column."""
     half = np.concatenate([quarter[:0:-1], quarter])
     return np.concatenate([half[:, :0:-1], half], axis=1)
 
 
 def blur(image: NDArray[Any], kernel: Array | None, border: str = "zero") -> NDArray[Any]:
-    """Convolve an image (rows, columns) of light with a kernel, in double precision; of the image's dtype.
+    """Convolve an image of light (rows, columns) with a kernel in double precision; the result has the image's dtype.
 
-    border "zero": nothing lies beyond it, the result grows by the kernel's radius on each side and holds all the light
-    (LED patches). border "edge": it goes on as its border pixels do, the result has its shape (backgrounds; sum is kept
-    but for what crosses the border). Rounding never leaves a pixel below 0. No kernel, no change.
+    border "zero": the image is dark beyond its border; the result is padded by the kernel's radius on each side and
+    holds all the light (LED patches). border "edge": border pixels are repeated; the result has the image's shape
+    (backgrounds). Negative pixels from rounding become 0. Without a kernel the image is returned.
     """
     if kernel is None:
         return image
@@ -237,3 +225,8 @@ def blur(image: NDArray[Any], kernel: Array | None, border: str = "zero") -> NDA
     else:
         blurred = signal.oaconvolve(image.astype(np.float64), kernel, mode="full")
     return np.maximum(blurred, 0.0).astype(image.dtype)
+
+
+def kernel_radius_px(kernel: Array | None) -> int:
+    """Radius of a kernel: pixels from its middle to its border; 0 for None."""
+    return 0 if kernel is None else kernel.shape[0] // 2
