@@ -1,4 +1,4 @@
-"""The Cramér-Rao bound against the information that moving edges carry, and what light, LEDs and gravity do to it."""
+"""The Cramér-Rao bound against the information of moving edges, and its dependence on light, LEDs and gravity."""
 
 from collections.abc import Callable, Sequence
 
@@ -67,8 +67,8 @@ def moved(unknown: int, by: float) -> Pose:
 def edge_slopes(camera: Camera, center_m: np.ndarray, box: Roi) -> np.ndarray:
     """d coverage / d (x, y, z, tilt_x, tilt_y, yaw) in a box of pixels, (6, rows, columns).
 
-    As the pose changes, a pixel gains what the disc's edge sweeps in it: the integral of velocity times outward normal
-    along the edge (the transport theorem), here a sum over 40 000 pieces of the projected rim.
+    As the pose changes, the coverage of a pixel grows by the area that the disc's edge sweeps in it: the integral of
+    velocity times outward normal along the edge (the transport theorem), here a sum over 40 000 pieces of the rim.
     """
     around = np.linspace(0, 2 * np.pi, 40_001)
     rim = center_m + RADIUS_M * np.column_stack([np.cos(around), np.sin(around), 0 * around])
@@ -86,18 +86,18 @@ def edge_slopes(camera: Camera, center_m: np.ndarray, box: Roi) -> np.ndarray:
     return slopes
 
 
-def test_it_is_the_information_that_moving_edges_carry(renderer: Renderer, small_camera: Camera) -> None:
-    """By the transport theorem, with all nuisances in one matrix; the renderer is asked for amplitudes alone.
+def test_bound_agrees_with_the_information_of_moving_edges(renderer: Renderer, small_camera: Camera) -> None:
+    """By the transport theorem, with all nuisances in one matrix; the renderer gives the amplitudes only.
 
-    What the theorem leaves out here: an LED's brightness changes with the pose by cos^4, which its unknown amplitude
+    The theorem leaves out: an LED's brightness changes with the pose by cos^4, which its unknown amplitude
     takes up to a part in 1000, and the edge's brightness is not exactly the brightest pixel's: cos^4 changes by 4
     tan(16 deg) / 1500 = 1e-3 a pixel, over 5 pixels by 0.5 %. Held to 1 %.
     """
-    view = renderer.expected_image(PosedCamera(small_camera, POSE))
-    expected = view.expected_electrons(EXPOSURE_S).astype(float)
-    count = len(view.patches)
+    mean = renderer.expected_image(PosedCamera(small_camera, POSE))
+    expected = mean.expected_electrons(EXPOSURE_S).astype(float)
+    count = len(mean.patches)
     information = np.zeros((6 + 2 * count, 6 + 2 * count))
-    for number, patch in enumerate(view.patches):
+    for number, patch in enumerate(mean.patches):
         box = patch.roi.padded(int(MARGIN_PX))
         here = Roi.of_sensor(small_camera).slices(box)
         light = np.zeros((box.rows, box.columns))
@@ -117,8 +117,8 @@ def test_it_is_the_information_that_moving_edges_carry(renderer: Renderer, small
     assert np.abs(correlation - expected_correlation).max() < 0.02
 
 
-def test_four_times_the_light_halves_it(renderer: Renderer, small_camera: Camera) -> None:
-    """Shot noise: information goes as the light, all of it; the accelerometer's share is nothing at 45 deg."""
+def test_four_times_the_light_quarters_the_bound(renderer: Renderer, small_camera: Camera) -> None:
+    """Shot noise: information is proportional to the light; an accelerometer of 45 deg adds almost none."""
     once, more = (bound_m2(renderer, small_camera, range(4), 45.0, t * EXPOSURE_S) for t in (0.25, 1))
     assert once is not None
     assert more is not None
@@ -126,7 +126,7 @@ def test_four_times_the_light_halves_it(renderer: Renderer, small_camera: Camera
     assert more * 4 == pytest.approx(once, rel=1e-4, abs=1e-4 * float(np.diag(once).max()))
 
 
-def test_gravity_and_more_leds_lower_it(renderer: Renderer, small_camera: Camera) -> None:
+def test_gravity_and_more_leds_lower_the_bound(renderer: Renderer, small_camera: Camera) -> None:
     sizes = []
     for ids, sigma in ((range(4), 0.0), (range(4), 0.05), (range(4), 45.0), (range(3), 45.0)):
         bound = bound_m2(renderer, small_camera, ids, sigma)
@@ -138,7 +138,7 @@ def test_gravity_and_more_leds_lower_it(renderer: Renderer, small_camera: Camera
 
 
 def test_each_tilt_has_its_own_error(renderer: Renderer, small_camera: Camera) -> None:
-    """Little known of one tilt costs more than as little known of none, and less than as little known of both."""
+    """A large error on one tilt raises the bound, and by less than a large error on both."""
     expected = renderer.expected_image(PosedCamera(small_camera, POSE)).expected_electrons(EXPOSURE_S)
     variance = [RegionImage(Roi.of_sensor(small_camera), variance_e2(Sensor(full_well_e=1e6), expected))]
     sizes = [
@@ -151,11 +151,11 @@ def test_each_tilt_has_its_own_error(renderer: Renderer, small_camera: Camera) -
     assert x != pytest.approx(y, rel=0.01)
 
 
-def test_on_a_rig_it_is_of_the_cameras_own_position(renderer: Renderer, small_camera: Camera) -> None:
-    """A camera mounted 0.3 m beside another, with its axes: the bound of a lone camera where it is.
+def test_bound_on_a_rig_is_of_the_cameras_own_position(renderer: Renderer, small_camera: Camera) -> None:
+    """A camera mounted 0.3 m beside another, with its axes: the bound of a lone camera at that position.
 
-    Of two LEDs alone, with 0.5 deg of tilt, the two places differ by what the lever makes of the tilts. Slopes are
-    exact to 1e-7; the lever's differences, of 1e-8 m, to 1e-8 of rounding.
+    With two LEDs and tilts known to 0.5 deg, the bounds at the two positions differ by the tilts times the lever.
+    Slopes are exact to 1e-7; the lever's differences, of 1e-8 m, to 1e-8 of rounding.
     """
     offset_m = np.array([0.3, 0.0, 0.0])
     x, y, z = np.array(POSE.position_m) - POSE.rotation.T @ offset_m
@@ -167,14 +167,14 @@ def test_on_a_rig_it_is_of_the_cameras_own_position(renderer: Renderer, small_ca
     assert bound == pytest.approx(bound_m2(renderer, small_camera, [0, 1], 0.5), rel=1e-4, abs=1e-12)
 
 
-def test_a_frame_that_determines_nothing_has_none(renderer: Renderer, small_camera: Camera) -> None:
-    """A disc alone looks the same for any yaw, and nothing at all tells nothing."""
+def test_a_frame_that_determines_no_position_has_no_bound(renderer: Renderer, small_camera: Camera) -> None:
+    """One disc has the same image for any yaw, and a frame without LEDs has no information."""
     assert bound_m2(renderer, small_camera, [0], 0.5) is None
     assert bound_m2(renderer, small_camera, [], 0.5) is None
     assert bound_m2(renderer, small_camera, [0, 1], 0.5) is not None
 
 
-def test_what_is_saturated_tells_nothing() -> None:
+def test_saturated_pixels_have_no_information() -> None:
     mean = np.array([[100.0, 5999.0, 6000.0, 9000.0]], dtype=np.float32)
     assert variance_e2(Sensor(full_well_e=6000, bits=12, gain_e_per_dn=2.0), mean).tolist() == [
         [100.0 + 1 / 3, 5999.0 + 1 / 3, np.inf, np.inf]
@@ -183,6 +183,6 @@ def test_what_is_saturated_tells_nothing() -> None:
 
 
 @pytest.mark.parametrize("key", ["motion={angular_velocity_deg_s=[1.0,0.0,0.0]}", "sensor.noise=none"])
-def test_no_bound_without_noise_or_at_rest(key: str) -> None:
+def test_bound_with_motion_or_without_noise_is_refused(key: str) -> None:
     with pytest.raises(InputError, match="bound = true"):
         load_plan(ROOT / "datasets/quickstart.toml", ["bound=true", key])

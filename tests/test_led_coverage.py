@@ -1,4 +1,4 @@
-"""The exact image of a disc: coverage of pixels against closed forms and against brute force."""
+"""Pixel coverage of discs and rectangles against closed forms and brute force."""
 
 import numpy as np
 import pytest
@@ -33,7 +33,7 @@ def area(polygon: np.ndarray, radius: float) -> float:
         (SQUARE + [1, 0], 0.5, np.pi / 8),  # half a disc
         (SQUARE + [5, 0], 1.0, 0.0),  # apart
         (SQUARE[::-1] + [1, 1], 1.0, np.pi / 4),  # clockwise
-        # half of each side sticks out: 4 minus 4 corners; area = 4 sqrt(r2-1) + r2 (pi - 4 acos(1/r)), r2 = 1.25
+        # the disc cuts off the vertices: 4 minus 4 of them; area = 4 sqrt(r2-1) + r2 (pi - 4 acos(1/r)), r2 = 1.25
         (SQUARE, np.sqrt(1.25), 4 * 0.5 + 1.25 * (np.pi - 4 * np.arccos(1 / np.sqrt(1.25)))),
     ],
 )
@@ -48,9 +48,9 @@ def test_area_shared_by_disc_and_polygon(polygon: np.ndarray, radius: float, exp
     st.floats(0, np.pi),
     st.floats(0.2, 3),
 )
-@example(x=0.0, y=1.0, radius=1.0, angle=3.8e-16, stretch=1.0)  # a corner within rounding of the centre
+@example(x=0.0, y=1.0, radius=1.0, angle=3.8e-16, stretch=1.0)  # a vertex within rounding of the centre
 @example(x=2.9e-9, y=2.9e-9, radius=1.0, angle=0.0, stretch=1.0)  # and near it
-def test_the_areas_of_the_parts_add_up(x: float, y: float, radius: float, angle: float, stretch: float) -> None:
+def test_areas_shared_with_parts_add_up(x: float, y: float, radius: float, angle: float, stretch: float) -> None:
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     quad = (SQUARE * [stretch, 1]) @ turn.T + [x, y]
     middle = quad.mean(axis=0)
@@ -84,9 +84,9 @@ def test_coverage_adds_up_to_the_solid_angle_of_the_disc(pose: Pose, pitch_um: f
     image = image_of_disc(camera, pose, center, radius)
     assert image is not None
     axis_pixel_sr = 1 / camera.focal_px**2
-    to_lamp = center - np.array(pose.position_m)
-    distance = np.linalg.norm(to_lamp)
-    disc_sr = np.pi * radius**2 * (to_lamp[2] / distance) / distance**2
+    to_led = center - np.array(pose.position_m)
+    distance = np.linalg.norm(to_led)
+    disc_sr = np.pi * radius**2 * (to_led[2] / distance) / distance**2
     # On the axis, cos^3 = 1 to (r f / h)^2; the small-disc formula is off by about (r / d)^2 too: 2e-5 together.
     assert image.coverage.sum() * axis_pixel_sr == pytest.approx(disc_sr, rel=1e-4)
     assert image.visible_fraction == 1.0
@@ -134,7 +134,7 @@ def test_the_centroid_is_not_the_image_of_the_centre_when_tilted() -> None:
     assert 0.3 < offsets[1] < 2.0
 
 
-def test_a_disc_cut_by_the_border_says_what_share_is_seen() -> None:
+def test_visible_fraction_of_a_disc_cut_by_the_border() -> None:
     camera = Camera()
     # centre exactly on the left border: half is seen
     center = np.array([3.0 - 2000 * 3.0 / 15000, 3.0, 3.5])
@@ -146,9 +146,13 @@ def test_a_disc_cut_by_the_border_says_what_share_is_seen() -> None:
 
 @pytest.mark.parametrize(
     ("center", "why"),
-    [([3.0, 3.0, 0.4], "behind"), ([5.0, 3.0, 3.5], "outside the view"), ([3.0, 3.0, 0.5], "level with the lens")],
+    [
+        ([3.0, 3.0, 0.4], "behind"),
+        ([5.0, 3.0, 3.5], "out of view"),
+        ([3.0, 3.0, 0.5], "level with the lens"),
+    ],
 )
-def test_a_disc_that_cannot_be_seen_has_no_image(center: list[float], why: str) -> None:
+def test_a_disc_out_of_sight_has_no_image(center: list[float], why: str) -> None:
     assert image_of_disc(Camera(), Pose((3.0, 3.0, 0.5)), np.array(center), 0.01) is None, why
 
 
@@ -165,12 +169,12 @@ DIAMOND = np.array([[0.0, -1.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
         (SQUARE, (0.5, 0.25), 0.5),  # the rectangle is inside
         (SQUARE, (2.0, 3.0), 4.0),  # the square is inside
         (SQUARE, (1.0, 1.0), 4.0),  # the same
-        (SQUARE + [1.5, 1.5], (1.0, 1.0), 0.25),  # corners overlap
+        (SQUARE + [1.5, 1.5], (1.0, 1.0), 0.25),  # vertices overlap
         (SQUARE + [2.0, 0.0], (1.0, 1.0), 0.0),  # they touch
-        (SQUARE + [3.0, 3.0], (1.0, 1.0), 0.0),  # apart, beyond a corner
+        (SQUARE + [3.0, 3.0], (1.0, 1.0), 0.0),  # apart, beyond a vertex
         (SQUARE + [0.0, 1.0], (1.0, 1.0), 2.0),  # sides run along each other
-        (DIAMOND, (0.5, 0.5), 1.0),  # its sides pass through the corners
-        (DIAMOND, (0.75, 0.75), 2 - 4 * 0.25**2),  # four corners cut off
+        (DIAMOND, (0.5, 0.5), 1.0),  # its sides pass through the vertices
+        (DIAMOND, (0.75, 0.75), 2 - 4 * 0.25**2),  # four vertices cut off
         (DIAMOND[::-1] + [1.0, 0.0], (1.0, 1.0), 1.0),  # clockwise; half of it
     ],
 )
@@ -179,7 +183,7 @@ def test_area_shared_by_rectangle_and_polygon(polygon: np.ndarray, half: tuple[f
 
 
 @given(st.floats(-2, 2), st.floats(-2, 2), st.floats(0.1, 2), st.floats(0.1, 2), st.floats(0, np.pi))
-def test_the_areas_in_a_rectangles_parts_add_up(x: float, y: float, w: float, h: float, angle: float) -> None:
+def test_areas_shared_with_parts_of_a_rectangle_add_up(x: float, y: float, w: float, h: float, angle: float) -> None:
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     quad = SQUARE @ turn.T + [x, y]
     quarters = [quad - [i * w / 2, j * h / 2] for i in (-1, 1) for j in (-1, 1)]
@@ -236,12 +240,12 @@ def test_every_shape_through_every_lens_covers_the_share_of_each_pixel(
     # and half a line of it at worst, and the change of scale within a pixel: less than 1e-3 here.
     assert np.sqrt((error[mixed] ** 2).mean()) < 3 * 0.3 / n**1.5
     assert np.abs(error).max() < 0.5 / n + 1e-3
-    assert abs(error.mean()) < 1e-4  # the grid errs either way, the coverage may not
+    assert abs(error.mean()) < 1e-4  # the errors of the grid have mean 0, and those of the coverage should
     assert mixed.sum() > 10
 
 
 @pytest.mark.parametrize("camera", LENSES.values(), ids=LENSES)
-def test_an_image_goes_on_beyond_the_sensor_where_asked(camera: Camera) -> None:
+def test_an_image_extends_into_the_margin_beyond_the_sensor(camera: Camera) -> None:
     pose = Pose((3.0, 2.0, 0.5), yaw_deg=10.0)
     # half of it is off the left border
     ray = PosedCamera(camera, pose).rays_world(np.array([0.0, camera.height_px / 2]))
@@ -258,7 +262,7 @@ def test_an_image_goes_on_beyond_the_sensor_where_asked(camera: Camera) -> None:
     assert cut.coverage.sum() / whole.coverage.sum() == pytest.approx(cut.visible_fraction, abs=1e-4)
 
 
-def test_a_level_square_of_whole_pixels_covers_them_and_nothing_else() -> None:
+def test_a_level_square_of_whole_pixels_covers_exactly_them() -> None:
     # 0.1 m at 3 m is 500 px; sides run along pixel borders
     posed = PosedCamera(Camera(), Pose((3.0, 3.0, 0.5)))
     image = coverage_of_led(posed, LedFace(np.array([3.0, 3.0, 3.5]), Rectangle((0.1, 0.1))))
@@ -267,7 +271,7 @@ def test_a_level_square_of_whole_pixels_covers_them_and_nothing_else() -> None:
     assert image.coverage[1:-1, 1:-1].min() > 1 - 1e-9
 
 
-def test_a_turned_square_turns_from_x_towards_y() -> None:
+def test_yaw_rotates_a_rectangle_from_x_towards_y() -> None:
     # a long thin one turned by 45 deg runs from the upper left to the lower right: +x is +u, +y is +v
     posed = PosedCamera(Camera(), Pose((3.0, 3.0, 0.5)))
     image = coverage_of_led(posed, LedFace(np.array([3.0, 3.0, 3.5]), Rectangle((0.02, 0.002), 45.0)))
@@ -284,15 +288,15 @@ COARSE_LENSES = LENSES | {
 
 
 @pytest.mark.parametrize("camera", COARSE_LENSES.values(), ids=COARSE_LENSES)
-def test_no_led_that_lights_a_pixel_is_left_out(camera: Camera, rng: np.random.Generator) -> None:
+def test_candidates_include_every_led_that_lights_a_pixel(camera: Camera, rng: np.random.Generator) -> None:
     centers = np.column_stack([rng.uniform(0, 7, (250, 2)), rng.uniform(2.5, 3.5, 250)])
     radii = rng.uniform(0.05, 0.5, 250)
-    candidates_in_vain = 0
+    false_candidates = 0
     for _ in range(8):
         pose = Pose((3.0, 3.0, 1.0), *rng.uniform(-40, 40, 2), rng.uniform(-180, 180))
         candidates = candidate_leds(PosedCamera(camera, pose), centers, radii, margin_px=5.0)
         images = [image_of_disc(camera, pose, c, float(r), 5) for c, r in zip(centers, radii, strict=True)]
         seen = [i for i, image in enumerate(images) if image is not None]
         assert set(seen) <= set(candidates.tolist())
-        candidates_in_vain += len(candidates) - len(seen)
-    assert candidates_in_vain < 8 * 250 / 4
+        false_candidates += len(candidates) - len(seen)
+    assert false_candidates < 8 * 250 / 4

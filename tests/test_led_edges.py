@@ -1,4 +1,4 @@
-"""Parts of the pixels at an LED's edge, against pixels of a camera that has finer ones."""
+"""Parts of the pixels at an LED's edge, against the pixels of a camera with finer pixels."""
 
 import numpy as np
 import pytest
@@ -35,9 +35,9 @@ def test_parts_are_the_pixels_of_a_finer_camera(lens: dict, shape: Disc | Rectan
     top, left = finer.roi.row + 20 * SPLIT, finer.roi.column + 20 * SPLIT
     drawn[top : top + finer.coverage.shape[0], left : left + finer.coverage.shape[1]] = finer.coverage
     parts = drawn.reshape(48 + 40, SPLIT, 64 + 40, SPLIT).swapaxes(1, 2)[edges.rows + 20, edges.columns + 20]
-    # areas of parts of 1/8 px, rounded to 2^-52 of the disc's, of which they are some 1e-4; WHOLE is 1e-9
+    # areas of parts of 1/8 px, rounded to 2^-52 of the disc's, of which they are some 1e-4; COVERAGE_TOLERANCE is 1e-9
     assert np.abs(edges.excess - (parts - parts.mean(axis=(1, 2), keepdims=True))).max() < 5e-9
-    # every other pixel is of one piece
+    # in every other pixel all parts have the same coverage
     whole = drawn.reshape(48 + 40, SPLIT, 64 + 40, SPLIT).swapaxes(1, 2)
     spread = whole.max(axis=(2, 3)) - whole.min(axis=(2, 3))
     spread[edges.rows + 20, edges.columns + 20] = 0

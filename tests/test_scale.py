@@ -1,4 +1,4 @@
-"""Fewer, larger pixels of the same camera."""
+"""Recipes scaled to fewer, larger pixels of the same camera."""
 
 from pathlib import Path
 
@@ -22,7 +22,7 @@ def recipe(*assignments: str, scale: int = 1, mode: ScaleMode = "binned", path: 
     return load_plan(path, [*FULL, *assignments], scale, mode).recipe
 
 
-def test_every_point_lands_on_a_tenth_of_its_pixel() -> None:
+def test_pixel_positions_scale_with_the_pixels() -> None:
     """u' = u / 10 and v' = v / 10, with the principal point off centre and skew."""
     full, small = (recipe(*SKEWED, scale=scale).camera for scale in (1, 10))
     assert (small.width_px, small.height_px) == (80, 60)
@@ -34,7 +34,7 @@ def test_every_point_lands_on_a_tenth_of_its_pixel() -> None:
 
 
 def test_keys_in_pixels_are_scaled_and_the_light_is_as_the_mode_says() -> None:
-    regions = ('windows={ kind = "leds", margin_px = 30 }', "poses.border_px=20")
+    regions = ('regions={ kind = "leds", margin_px = 30 }', "poses.border_px=20")
     full = recipe(*regions)
     binned, same = (recipe(*regions, scale=10, mode=mode) for mode in ("binned", "same-photons"))
     for small in (binned, same):
@@ -49,7 +49,7 @@ def test_keys_in_pixels_are_scaled_and_the_light_is_as_the_mode_says() -> None:
 
 
 def test_a_metered_exposure_is_the_full_cameras(office: Scene) -> None:
-    """Binned pixels gather a hundred times the light in one time, by either metering; else a quick look is too dark.
+    """Binned pixels collect a hundred times the light in the same exposure, with either metering.
 
     In the middle of an image of an LED, 4 of the large pixels wide; across one light changes by the cos^4 of 10 of the
     small ones, below 4 tan(17 deg) 10 / 3000 = 0.4 %.
