@@ -20,9 +20,7 @@ LENSES = {
 
 
 @pytest.mark.parametrize("camera", LENSES.values(), ids=LENSES)
-def test_relative_illumination_is_the_cosine_times_a_pixels_solid_angle(
-    camera: Camera, rng: np.random.Generator
-) -> None:
+def test_relative_illumination_is_cosine_times_solid_angle(camera: Camera, rng: np.random.Generator) -> None:
     u, v = rng.uniform([[0], [0]], [[400], [300]], (2, 200))
     h = 1e-3
     corners = [

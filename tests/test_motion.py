@@ -46,14 +46,12 @@ STREAKS = {
 
 
 @pytest.mark.parametrize("name", STREAKS)
-def test_a_streak_has_the_length_of_the_displacement_and_keeps_the_light(
-    table1: Scene, small_camera: Camera, name: str
-) -> None:
+def test_a_streak_is_as_long_as_the_displacement(table1: Scene, small_camera: Camera, name: str) -> None:
     motion, displacement_px = STREAKS[name]
     still, moved = (patch(table1, small_camera, m) for m in (None, motion))
-    # A streak of length L is the image at rest convolved with a line: its covariance grows by d d^T / 12, with N midpoints by
-    # (1 - 1/N^2) of it, 4e-4 for steps of half a pixel on 20 px. The size of the image at rest changes with the square of the
-    # way over the distance, 1e-4 of its 5 px^2.
+    # A streak of length L is the image at rest convolved with a line: its covariance grows by d d^T / 12, with N
+    # midpoints by (1 - 1/N^2) of it, 4e-4 for steps of half a pixel on 20 px. The size of the image at rest changes
+    # with the square of the displacement over the distance, 1e-4 of its 5 px^2.
     (center, spread), (center_still, spread_still) = moments(moved), moments(still)
     expected = np.outer(displacement_px, displacement_px) / 12
     assert np.allclose(spread - spread_still, expected, atol=2e-3 * np.trace(expected))

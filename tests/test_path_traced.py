@@ -85,8 +85,8 @@ def test_furniture_occludes_leds_and_is_lit_as_in_the_reference(tmp_path: Path) 
     z = (ours - reference)[lit] / np.sqrt(bound[lit])
     assert np.abs(z).max() < 6
 
-    # The room and the box, in blocks: noise of the reference (Student's t, 7 degrees of freedom); the lightmap's noise and
-    # interpolation 0.5 %: vertices 0.1 m apart below LEDs 0.8 m away, second order (0.1 / 0.8)^2 / 8 = 0.2 %
+    # The room and the box, in blocks: noise of the reference (Student's t, 7 degrees of freedom); noise of the lightmap
+    # and interpolation 0.5 %: vertices 0.1 m apart below LEDs 0.8 m away, second order (0.1 / 0.8)^2 / 8 = 0.2 %
     kept = blocks(lit.astype(float))[0] == 0
     mine, theirs, spread = (b[kept] for b in blocks(ours, reference, variance))
     assert kept.sum() > 40

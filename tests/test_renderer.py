@@ -65,7 +65,7 @@ def test_the_led_image_moves_as_documented(
 
 
 def test_background_and_leds_share_one_projection(office_renderer: Renderer, small_camera: Camera) -> None:
-    """The rays cast for the surfaces and the projection of the LEDs agree: a panel's vertex is imaged where it projects."""
+    """Rays of the surfaces and projection of the LEDs agree: a panel's vertex is imaged where it projects."""
     pose = Pose((3.15, 3.1, 1.0), tilt_x_deg=-4.0, tilt_y_deg=3.0, yaw_deg=20.0)
     image = office_renderer.background_cd_m2(PosedCamera(small_camera, pose))
     inverse = np.linalg.inv(small_camera.matrix)
