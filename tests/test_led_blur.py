@@ -7,8 +7,8 @@ import pytest
 from scipy.special import j1
 
 from vlcrender.camera.intrinsics import Camera, Pose
-from vlcrender.camera.lens import AIRY_TAIL, defocus_diameter_px, split_for, split_kernel
 from vlcrender.camera.posed_camera import PosedCamera
+from vlcrender.camera.psf import AIRY_TAIL, defocus_diameter_px, split_for, split_kernel
 from vlcrender.camera.roi import Roi
 from vlcrender.core.planar_shapes import Disc
 from vlcrender.rendering.led_blur import LedKernel, led_blur

@@ -6,7 +6,8 @@ from scipy.special import j0, j1
 
 from vlcrender.camera.distortion import Distortion
 from vlcrender.camera.intrinsics import Camera
-from vlcrender.camera.lens import blur, blur_kernel, defocus_diameter_px, relative_illumination
+from vlcrender.camera.psf import blur, blur_kernel, defocus_diameter_px
+from vlcrender.camera.vignetting import relative_illumination
 from vlcrender.core.backend import dr, mi
 from vlcrender.core.planar_shapes import rectangle_polygon_area
 

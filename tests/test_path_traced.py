@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from vlcrender.camera.intrinsics import Camera, Pose
-from vlcrender.camera.lens import relative_illumination
 from vlcrender.camera.posed_camera import PosedCamera
+from vlcrender.camera.vignetting import relative_illumination
 from vlcrender.config.toml_model import check
 from vlcrender.errors import InputError
 from vlcrender.rendering.path_traced import reference_cd_m2

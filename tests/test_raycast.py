@@ -7,8 +7,8 @@ import pytest
 from conftest import ROOT
 
 from vlcrender.camera.intrinsics import Camera, Pose
-from vlcrender.camera.lens import relative_illumination
 from vlcrender.camera.posed_camera import PosedCamera
+from vlcrender.camera.vignetting import relative_illumination
 from vlcrender.config.toml_model import check, read_toml
 from vlcrender.rendering.expected_image import LedPatch
 from vlcrender.rendering.renderer import Renderer

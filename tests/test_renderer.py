@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from conftest import ROOT
 
-from vlcrender.camera import lens
+from vlcrender.camera import psf
 from vlcrender.camera.intrinsics import Camera, Pose
-from vlcrender.camera.lens import relative_illumination
 from vlcrender.camera.posed_camera import PosedCamera
+from vlcrender.camera.vignetting import relative_illumination
 from vlcrender.config.toml_model import check, read_toml
 from vlcrender.errors import InputError
 from vlcrender.rendering.expected_image import ExpectedImage
@@ -192,7 +192,7 @@ def test_narrow_defocus_agrees_with_mitsuba_and_needs_split_pixels(
     per_cd = rate * relative_illumination(camera, u, v)
     mean = office_renderer.expected_image(PosedCamera(camera, STRAIGHT))
     ours = mean.expected_electrons(1.0) / per_cd
-    monkeypatch.setattr(lens, "MAX_PARTS", 1)
+    monkeypatch.setattr(psf, "MAX_PARTS", 1)
     whole_pixels = office_renderer.expected_image(PosedCamera(camera, STRAIGHT)).expected_electrons(1.0) / per_cd
     lit = np.zeros(ours.shape, dtype=bool)
     for patch in mean.patches:

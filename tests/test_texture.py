@@ -8,9 +8,9 @@ from PIL import Image
 from test_path_traced import ROOM, SMALL_VIEW, blocks, both_ways, scene_of
 
 from vlcrender.camera.intrinsics import Camera, Pose
-from vlcrender.camera.lens import relative_illumination
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.roi import Roi
+from vlcrender.camera.vignetting import relative_illumination
 from vlcrender.errors import InputError
 from vlcrender.light.lightmap import Lightmap, bake, room_mesh
 from vlcrender.rendering.background import Background

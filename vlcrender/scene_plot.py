@@ -11,8 +11,8 @@ from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
 from vlcrender.camera.intrinsics import Camera, Pose
-from vlcrender.camera.lens import relative_illumination
 from vlcrender.camera.posed_camera import PosedCamera
+from vlcrender.camera.vignetting import relative_illumination
 from vlcrender.rendering.path_traced import reference_cd_m2
 from vlcrender.rendering.renderer import Renderer
 from vlcrender.scene.loader import Scene

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vlcrender.camera.lens import relative_illumination
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.roi import Roi
+from vlcrender.camera.vignetting import relative_illumination
 from vlcrender.core.backend import dr, exact_math, mi
 from vlcrender.light.lightmap import Lightmap
 from vlcrender.light.raycast import Hit, Room

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vlcrender.camera.lens import SplitKernel, blur, blur_kernel, kernel_radius_px, split_for, split_kernel
 from vlcrender.camera.posed_camera import PosedCamera
+from vlcrender.camera.psf import SplitKernel, blur, blur_kernel, kernel_radius_px, split_for, split_kernel
 from vlcrender.camera.roi import Roi
 from vlcrender.rendering.led_coverage import candidate_leds
 from vlcrender.rendering.led_edges import LedEdges

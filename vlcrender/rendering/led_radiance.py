@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlcrender.camera.intrinsics import Camera
-from vlcrender.camera.lens import relative_illumination
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.roi import LedRegions, Roi
+from vlcrender.camera.vignetting import relative_illumination
 from vlcrender.core.planar_shapes import Disc, Rectangle
 from vlcrender.rendering.led_blur import LedBlur
 from vlcrender.rendering.led_coverage import LedFace, candidate_leds, coverage_of_led, intersections_with_plane

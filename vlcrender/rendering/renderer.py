@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlcrender.camera.intrinsics import Camera, Pose
-from vlcrender.camera.lens import blur
 from vlcrender.camera.posed_camera import PosedCamera
+from vlcrender.camera.psf import blur
 from vlcrender.camera.roi import LedRegions, Roi, led_regions
 from vlcrender.core.backend import dr
 from vlcrender.errors import InputError

@@ -7,9 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlcrender.camera.intrinsics import Pose
-from vlcrender.camera.lens import blur, kernel_radius_px, relative_illumination
 from vlcrender.camera.posed_camera import PosedCamera
+from vlcrender.camera.psf import blur, kernel_radius_px
 from vlcrender.camera.roi import Roi
+from vlcrender.camera.vignetting import relative_illumination
 from vlcrender.rendering.expected_image import SpecularReflection
 from vlcrender.rendering.led_coverage import candidate_leds, coverage_of_led
 from vlcrender.rendering.led_radiance import face_of_led, luminance_pattern
