@@ -26,7 +26,7 @@ PARTS_FOR_DISC = 12.0
 PARTS_FOR_AIRY = 8.0
 """Parts across a pixel that a disc of 1 px and an Airy pattern of lambda N = 1 px need."""
 MAX_PARTS = 64
-"""Most parts across a pixel. A narrower disc is ignored: it moves up to 0.2 % of an edge pixel's light."""
+"""Most parts across a pixel. A disc narrower than a part is ignored: it moves 0.2 % of an edge pixel's light."""
 
 
 def defocus_diameter_px(camera: Camera, depth_m: Any) -> Any:
