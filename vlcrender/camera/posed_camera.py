@@ -1,6 +1,7 @@
 """A camera at a pose: world points to pixels and pixels to world rays, and the camera's axes in Mitsuba."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -25,12 +26,12 @@ class PosedCamera:
         """The same camera at another pose."""
         return replace(self, pose=pose)
 
-    @property
+    @cached_property
     def position_m(self) -> Array:
         """Projection centre, world, (3,)."""
         return np.array(self.pose.position_m)
 
-    @property
+    @cached_property
     def rotation(self) -> Array:
         """R_cam_world, (3, 3)."""
         return self.pose.rotation
