@@ -1,4 +1,4 @@
-"""Counter-based Poisson draws: the law at every mean, and draws of a pixel independent of the other pixels."""
+"""Counter-based Poisson draws: the law at every mean, and draws of a pixel independent of its neighbours."""
 
 import numpy as np
 import pytest
