@@ -223,12 +223,19 @@ def _field_of_view(camera: Camera, margin_px: float) -> FieldOfView:
 
 @dataclass(frozen=True)
 class Pose:
-    """Position of the projection centre in the world, m, and tilts as in Huynh & Yoo 2016, Eq. 5, deg."""
+    """Position and attitude of a camera: R_cam_world = Rx(tilt_x) Ry(tilt_y) Rz(yaw), Huynh & Yoo 2016, Eq. 5.
+
+    The level pose looks straight up, with +x of the room to the right in the image and +y down.
+    """
 
     position_m: tuple[float, float, float]
+    """Projection centre, world, m."""
     tilt_x_deg: float = 0.0
+    """Raising it moves the image of an LED overhead to +v, deg."""
     tilt_y_deg: float = 0.0
+    """Raising it moves the image of an LED overhead to -u, deg."""
     yaw_deg: float = 0.0
+    """Raising it turns the image from +u towards -v, deg."""
 
     @property
     def rotation(self) -> NDArray[np.float64]:
