@@ -1,15 +1,17 @@
-"""What the fast way errs by, as shares of the shot noise's variance, at a peak of 4 000 electrons."""
+"""Errors of the renderer as shares of the shot noise's variance, at a peak of 4 000 electrons."""
 
 from pathlib import Path
 
 import numpy as np
 
-from vlcrender import background as background_module
 from vlcrender.camera.intrinsics import Camera, Pose
+from vlcrender.camera.posed_camera import PosedCamera
+from vlcrender.camera.roi import Roi
 from vlcrender.core.backend import dr
 from vlcrender.core.planar_shapes import Disc
 from vlcrender.light.lightmap import bake
-from vlcrender.rendering.led_coverage import coverage_of_led, leds_that_may_be_seen
+from vlcrender.rendering import background as background_module
+from vlcrender.rendering.led_coverage import LedFace, candidate_leds, coverage_of_led
 from vlcrender.rendering.renderer import Renderer
 from vlcrender.scene.loader import load_scene
 
@@ -29,45 +31,45 @@ def main() -> None:
     renderer, camera = Renderer(scene, light), Camera()
     per_cd = PEAK_E / scene.leds.luminances_cd_m2.max()
 
-    # The bake: an error of the illuminance is one of the image, alike over a texel.
+    # Lightmap: an error of the illuminance is an error of the image, the same over a texel.
     cd_m2 = light.led_cd_m2() + light.ambient_cd_m2()
     error_e = per_cd * light.albedo * light.sigma_lux / np.pi
-    print(f"bake, share of the shot noise's variance, worst corner        {(error_e**2 / (per_cd * cd_m2)).max():8.4%}")
+    print(f"lightmap, share of the shot noise's variance, worst vertex    {(error_e**2 / (per_cd * cd_m2)).max():8.4%}")
 
     # Where surfaces meet: the 8 x 8 grid against 32 x 32.
     worst = 0.0
-    for pose in POSES:
-        coarse = per_cd * renderer.background_cd_m2(camera, pose).astype(float)
+    for posed in (PosedCamera(camera, pose) for pose in POSES):
+        coarse = per_cd * renderer.background_cd_m2(posed).astype(float)
         background_module.EDGE_GRID, kept = 32, background_module.EDGE_GRID
-        fine = per_cd * renderer.background_cd_m2(camera, pose).astype(float)
+        fine = per_cd * renderer.background_cd_m2(posed).astype(float)
         background_module.EDGE_GRID = kept
         worst = max(worst, float(((coarse - fine) ** 2 / fine).max()))
-    print(f"edges between surfaces, worst pixel of {len(POSES)} views                {worst:8.4%}")
+    print(f"edges between surfaces, worst pixel of {len(POSES)} images               {worst:8.4%}")
 
     # LED edges: coverage against the mean of 8 x 8 exact coverages of pixels an eighth as wide.
     fine_camera = Camera(
         width_px=camera.width_px, height_px=camera.height_px, pixel_pitch_um=camera.pixel_pitch_um / FINER
     )
     worst, pixels = 0.0, 0
-    for pose in POSES:
-        for i in leds_that_may_be_seen(camera, pose, scene.leds.centers_m, scene.leds.radii_m):
-            image = coverage_of_led(camera, pose, scene.leds.centers_m[i], Disc(float(scene.leds.radii_m[i])))
+    for posed in (PosedCamera(camera, pose) for pose in POSES):
+        for i in candidate_leds(posed, scene.leds.centers_m, scene.leds.radii_m):
+            face = LedFace(scene.leds.centers_m[i], Disc(float(scene.leds.radii_m[i])))
+            image = coverage_of_led(posed, face)
             if image is None or image.visible_fraction < 1:
                 continue
             rows, columns = image.coverage.shape
             u, v = camera.center_px
             shifted = fine_camera.model_copy(
                 update={
-                    "principal_point_px": (FINER * (u - image.column), FINER * (v - image.row)),
+                    "principal_point_px": (FINER * (u - image.roi.column), FINER * (v - image.roi.row)),
                     "width_px": FINER * columns,
                     "height_px": FINER * rows,
                 }
             )
-            fine_image = coverage_of_led(shifted, pose, scene.leds.centers_m[i], Disc(float(scene.leds.radii_m[i])))
+            fine_image = coverage_of_led(PosedCamera(shifted, posed.pose), face)
             assert fine_image is not None
             whole = np.zeros((FINER * rows, FINER * columns))
-            r, c = fine_image.row, fine_image.column
-            whole[r : r + fine_image.coverage.shape[0], c : c + fine_image.coverage.shape[1]] = fine_image.coverage
+            whole[Roi(0, 0, *whole.shape).slices(fine_image.roi)] = fine_image.coverage
             mean = whole.reshape(rows, FINER, columns, FINER).mean(axis=(1, 3))
             edge = (mean > 0) & (mean < 1)
             light_e = PEAK_E * mean[edge] + per_cd * cd_m2.min()

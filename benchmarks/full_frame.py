@@ -2,7 +2,7 @@
 
     python benchmarks/full_frame.py [REPEATS]
 
-Prints medians over the repeats. Machines differ and are shared: only the ratios mean something.
+Prints medians over the repeats. Compare ratios only: machines differ and are shared.
 """
 
 import statistics
@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from vlcrender.camera.intrinsics import Camera, Pose
+from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.roi import Roi
 from vlcrender.core.backend import dr, mi
 from vlcrender.dataset.files import exr_attributes, write_exr, write_preview
@@ -29,7 +30,7 @@ EXPOSURE_S = 160e-6
 
 
 def median_s(work: Callable[[], object], repeats: int) -> float:
-    """Median wall time of a call after one that does not count."""
+    """Median wall time of a call, after one call that is not measured."""
     work()
     times = []
     for _ in range(repeats):
@@ -40,7 +41,7 @@ def median_s(work: Callable[[], object], repeats: int) -> float:
 
 
 def render(loaded: "mi.Scene", integrator: "mi.Integrator", samples_per_pixel: int) -> None:
-    """Render and wait: kernels run on after the call that starts them returns."""
+    """Render and wait: a call returns before its kernels have finished."""
     dr.eval(mi.render(loaded, integrator=integrator, spp=samples_per_pixel))
     dr.sync_thread()
 
@@ -50,18 +51,19 @@ def main() -> None:
     repeats = int(sys.argv[1]) if len(sys.argv) > 1 else 5
     scene = load_scene(Path(__file__).parent.parent / "scenes/office.toml")
     camera, sensor, renderer = Camera(), Sensor(), Renderer(scene)
-    view = renderer.expected_image(camera, POSE)
-    expected = view.expected_electrons(EXPOSURE_S)
+    posed = PosedCamera(camera, POSE)
+    mean = renderer.expected_image(posed)
+    expected = mean.expected_electrons(EXPOSURE_S)
     whole = Roi.of_sensor(camera)
     dn = expose(sensor, expected, "bench")
-    loaded = mi.load_dict(scene_dict(scene, camera, POSE), optimize=False)
+    loaded = mi.load_dict(scene_dict(scene, posed), optimize=False)
     depth, path = mi.load_dict({"type": "depth"}), mi.load_dict({"type": "path", "max_depth": 8})
     with tempfile.TemporaryDirectory() as folder:
         exr, png = Path(folder) / "frame.exr", Path(folder) / "frame.png"
         attributes = exr_attributes(camera, "main", EXPOSURE_S, 0)
         stages: dict[str, Callable[[], object]] = {
-            "rays and LED patches": lambda: renderer.expected_image(camera, POSE),
-            "expected electrons": lambda: view.expected_electrons(EXPOSURE_S),
+            "rays and LED patches": lambda: renderer.expected_image(posed),
+            "expected electrons": lambda: mean.expected_electrons(EXPOSURE_S),
             "Poisson noise and digital numbers": lambda: expose(sensor, expected, "bench"),
             "EXR (PIZ) and its SHA-256": lambda: write_exr(exr, [(whole, dn)], whole, attributes),
             "preview": lambda: write_preview(png, [(whole, dn)], whole, sensor.largest_dn),
@@ -70,7 +72,7 @@ def main() -> None:
         frame = sum(seconds.values())
         bare = median_s(lambda: render(loaded, depth, 1), repeats) + seconds["EXR (PIZ) and its SHA-256"]
     path_16 = median_s(lambda: render(loaded, path, 16), 1)
-    print(f"office, 4000 x 3000, {len(view.patches)} LEDs in view, medians of {repeats}")
+    print(f"office, 4000 x 3000, {len(mean.patches)} LEDs in the image, medians of {repeats}")
     for name, value in seconds.items():
         print(f"  {100 * value / frame:5.1f} %  {name}")
     print(f"full frame / (Mitsuba depth at 1 sample a pixel + one PIZ write)   {frame / bare:6.2f}")

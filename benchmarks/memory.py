@@ -1,4 +1,4 @@
-"""Peak memory of making full office frames, after 20 and after more of them: it has to stay where it is.
+"""Peak memory of making full office frames, after 20 and after all of them: the two should agree.
 
 python benchmarks/memory.py [FRAMES]
 """

@@ -1,6 +1,6 @@
 """Make the picture of docs/sensor.md: python docs/make_noise_picture.py
 
-Two exposures of one full-size office frame, raw and as a phone's software would process them.
+Two exposures of one full-size office frame, raw and processed to JPEG as by a phone.
 """
 
 import tempfile
@@ -13,6 +13,7 @@ from PIL import Image
 from scipy.stats import skellam
 
 from vlcrender.camera.intrinsics import Camera, Pose
+from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.rendering.renderer import Renderer
 from vlcrender.scene.loader import load_scene
 from vlcrender.sensor.isp import Processed
@@ -21,14 +22,14 @@ from vlcrender.sensor.signal_chain import expose
 
 ROOT = Path(__file__).parent.parent
 POSE = Pose((3.5, 1.5, 0.3), tilt_x_deg=-50.0)
-BLURRED = Camera(focus_distance_m="infinity")  # the LEDs' rims then hold every level
+BLURRED = Camera(focus_distance_m="infinity")  # the rims of the LED images then contain every level
 EXPOSURE_S = 160e-6
 MEAN_E = 25.6
 LEVELS_E = np.geomspace(20, 3500, 30)
 
 
 def processed(image_dn: NDArray[np.uint32], sensor: Sensor) -> NDArray[np.float64]:
-    """The pixels of a JPEG of quality 90, brought back to electrons by undoing the sRGB curve."""
+    """Pixels of a JPEG of quality 90, converted to electrons by the inverse of the sRGB curve."""
     how = Processed()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"frame{how.suffix}"
@@ -39,10 +40,10 @@ def processed(image_dn: NDArray[np.uint32], sensor: Sensor) -> NDArray[np.float6
 
 
 def main() -> None:
-    """Render, expose twice, and draw the difference's distribution and its variance over the mean."""
+    """Render, expose twice, and draw the distribution of the difference, and its variance over the mean."""
     sensor = Sensor()
-    view = Renderer(load_scene(ROOT / "scenes/office.toml")).expected_image(BLURRED, POSE)
-    expected = view.expected_electrons(EXPOSURE_S)
+    mean = Renderer(load_scene(ROOT / "scenes/office.toml")).expected_image(PosedCamera(BLURRED, POSE))
+    expected = mean.expected_electrons(EXPOSURE_S)
     pair = [expose(sensor, expected, f"picture/{n}") for n in range(2)]
     raw = pair[0].astype(float) - pair[1]
     jpeg = np.subtract(*(processed(image, sensor) for image in pair))

@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from vlcrender.camera.intrinsics import Camera, Pose, rays_world
+from vlcrender.camera.intrinsics import Camera, Pose
+from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.rig import mounted_cameras
 from vlcrender.config.toml_model import check, read_toml
 from vlcrender.dataset.motion import Motion, poses_during
@@ -21,7 +22,7 @@ WIDE = {**NARROW, "focal_length_mm": 3.0}
 FISH_EYE = {**NARROW, "focal_length_mm": 1.6, "projection": "equidistant"}
 
 WHITES = {"diffusers": 50.0}
-"""Luminance shown white, over the median of the picture, where it is not 12."""
+"""White level of some pictures, over the picture's median; 12 for all others."""
 
 BOARD_OBJ = """\
 v -0.4 -0.25 0
@@ -48,22 +49,22 @@ f 4 5 8
 
 
 def office(folder: Path = ROOT / "scenes", **changes: object) -> Scene:
-    """The office with other tables."""
+    """The office with some of its tables replaced."""
     tree = {**read_toml(ROOT / "scenes/office.toml"), **changes}
     return build_scene(check(tree, SceneSettings, "picture"), "picture", folder)
 
 
 def main() -> None:
-    """Render and write all."""
+    """Render all pictures and write them as one file."""
     plain = Renderer(office())
     glazing = {"wall": "x=0", "corner_m": [1.0, 0.9], "size_m": [5.0, 2.2], "luminance_cd_m2": 40.0}
-    glass = Renderer(office(glazing=[glazing]))
-    lamps = read_toml(ROOT / "scenes/office.toml")["panels"]
-    squares = [{**lamps[0], "leds": {**lamps[0]["leds"], "shape": "square", "half_power_deg": 30.0}}]
+    glazed = Renderer(office(glazing=[glazing]))
+    panels = read_toml(ROOT / "scenes/office.toml")["panels"]
+    squares = [{**panels[0], "leds": {**panels[0]["leds"], "shape": "square", "half_power_deg": 30.0}}]
     OUT.mkdir(exist_ok=True)
     mesh = OUT / "board.obj"
     mesh.write_text(BOARD_OBJ)
-    ray = rays_world(Camera(**NARROW), TILTED, np.array([600.0, 330.0]))
+    ray = PosedCamera(Camera(**NARROW), TILTED).rays_world(np.array([600.0, 330.0]))
     place = np.array(TILTED.position_m) + ray * 1.6 / ray[2]
     board = {"file": "board.obj", "position_m": place.tolist(), "yaw_deg": 30.0, "scale": 0.2, "reflectance": 0.2}
     furnished = Renderer(office(OUT, furniture=[board]))
@@ -83,8 +84,8 @@ def main() -> None:
             poses_during(moving, mounted, TILTED, 4e-3, plain.scene),
         ),
         "square LEDs of 30 deg half power": (Renderer(office(panels=squares)), main_camera, TILTED, None),
-        "a board hides LEDs": (furnished, main_camera, TILTED, None),
-        "3 mm lens: walls, light that bounces": (plain, Camera(**WIDE), TILTED, None),
+        "a board occludes LEDs": (furnished, main_camera, TILTED, None),
+        "3 mm lens: walls, reflected light": (plain, Camera(**WIDE), TILTED, None),
         "barrel distortion, k1 = -0.12": (plain, Camera(**WIDE, distortion={"k1": -0.12}), TILTED, None),
         "equidistant fish-eye": (
             plain,
@@ -92,9 +93,9 @@ def main() -> None:
             TILTED,
             None,
         ),
-        "vignetting, closed at 50 deg": (plain, Camera(**WIDE, vignetting_deg=50.0), TILTED, None),
-        "false LEDs in a window": (glass, Camera(**WIDE), Pose((2.5, 3.5, 1.2), tilt_y_deg=-60.0), None),
-        "tiled ceiling, a frame hides LEDs": (
+        "vignetting, pupil hidden at 50 deg": (plain, Camera(**WIDE, vignetting_deg=50.0), TILTED, None),
+        "specular reflections in a glazing": (glazed, Camera(**WIDE), Pose((2.5, 3.5, 1.2), tilt_y_deg=-60.0), None),
+        "tiled ceiling, a frame occludes LEDs": (
             meeting,
             six_mm,
             Pose((1.6, 0.4, 2.2), tilt_x_deg=-70.0, yaw_deg=10.0),
@@ -106,7 +107,7 @@ def main() -> None:
     for axes, (title, (renderer, camera, pose, during)) in zip(
         figure.subplots(3, 4).ravel(), shots.items(), strict=True
     ):
-        image = renderer.expected_image(camera, pose, during=during).expected_electrons(1.0)
+        image = renderer.expected_image(PosedCamera(camera, pose), during=during).expected_electrons(1.0)
         image = image / np.quantile(image, 0.5) / WHITES.get(title, 12.0)
         axes.imshow(np.clip(image, 0, 1) ** (1 / 2.2), cmap="gray", vmin=0, vmax=1)
         axes.set_title(title, fontsize=10)

@@ -1,10 +1,11 @@
-"""A mosaic's pixels see what a sensor wholly under their filter would, and the spectra count separately."""
+"""Mosaics: pixels agree with a sensor under one filter, and the two spectra are weighted separately."""
 
 import numpy as np
 import pytest
 from scipy import constants
 
 from vlcrender.camera.intrinsics import Camera, Pose
+from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.roi import LedRegions, Roi
 from vlcrender.rendering.bayer import MosaicRenderer, colour_of_pixels
 from vlcrender.rendering.renderer import Renderer
@@ -23,44 +24,47 @@ POSE = Pose((3.15, 3.1, 0.6), 6.0, -8.0, 20.0)
 
 
 @pytest.mark.parametrize(
-    ("mosaic", "corner"),
+    ("mosaic", "tile"),
     [("rggb", [[0, 1], [1, 2]]), ("bggr", [[2, 1], [1, 0]]), ("grbg", [[1, 0], [2, 1]]), ("gbrg", [[1, 2], [0, 1]])],
 )
-def test_colours_of_pixels(mosaic: str, corner: list[list[int]]) -> None:
+def test_colours_of_pixels(mosaic: str, tile: list[list[int]]) -> None:
     whole = colour_of_pixels(mosaic, Roi(0, 0, 6, 8))
-    assert whole[:2, :2].tolist() == corner
+    assert whole[:2, :2].tolist() == tile
     assert np.array_equal(whole[2:, 2:], whole[:-2, :-2])
     assert np.array_equal(colour_of_pixels(mosaic, Roi(3, 1, 2, 5)), whole[3:5, 1:6])
     assert np.array_equal(colour_of_pixels(mosaic, Roi(-3, -5, 9, 13))[3:, 5:], whole), "beyond the sensor too"
 
 
 @pytest.mark.parametrize("regions", [None, LedRegions(kind="leds")], ids=["full", "regions"])
-def test_each_pixel_is_that_of_a_sensor_of_its_colour(office: Scene, regions: LedRegions | None) -> None:
-    """Through a defocused lens, so that the blur is shown to come before the filters."""
+def test_each_pixel_agrees_with_a_sensor_of_its_colour(office: Scene, regions: LedRegions | None) -> None:
+    """Through a defocused lens: blur comes before the filters."""
     camera = Camera(width_px=160, height_px=120, pixel_pitch_um=30.0, focus_distance_m=0.6)
     of_colours = tuple(Renderer(office, None, Tabulated(QE, colour)) for colour in COLOURS)
-    seen = MosaicRenderer(of_colours, "grbg").expected_image(camera, POSE, regions)
-    alone = [renderer.expected_image(camera, POSE, regions) for renderer in of_colours]
-    for number, part in enumerate(seen.parts):
+    through_mosaic = MosaicRenderer(of_colours, "grbg").expected_image(PosedCamera(camera, POSE), regions)
+    of_colour = [renderer.expected_image(PosedCamera(camera, POSE), regions) for renderer in of_colours]
+    for number, part in enumerate(through_mosaic.parts):
         image = part.expected_electrons(1e-6)
         colours = colour_of_pixels("grbg", part.roi)
         for colour in range(3):
-            expected = alone[colour].parts[number].expected_electrons(1e-6)
+            expected = of_colour[colour].parts[number].expected_electrons(1e-6)
             assert np.array_equal(image[colours == colour], expected[colours == colour])
-        assert [p.led_id for p in part.patches] == [p.led_id for p in alone[0].parts[number].patches]
+        assert [p.led_id for p in part.patches] == [p.led_id for p in of_colour[0].parts[number].patches]
 
 
-def test_the_bounds_patches_are_the_views(office: Scene) -> None:
+def test_led_patches_are_the_patches_of_the_expected_image(office: Scene) -> None:
     camera = Camera(width_px=160, height_px=120, pixel_pitch_um=30.0)
     renderer = MosaicRenderer(tuple(Renderer(office, None, Tabulated(QE, colour)) for colour in COLOURS), "rggb")
-    seen, alone = renderer.expected_image(camera, POSE).patches, renderer.led_patches(camera, POSE)
-    assert len(seen) == len(alone) > 0
-    for a, b in zip(seen, alone, strict=True):
+    through_mosaic, of_colour = (
+        renderer.expected_image(PosedCamera(camera, POSE)).patches,
+        renderer.led_patches(PosedCamera(camera, POSE)),
+    )
+    assert len(through_mosaic) == len(of_colour) > 0
+    for a, b in zip(through_mosaic, of_colour, strict=True):
         assert np.allclose(a.electrons_per_s, b.electrons_per_s, rtol=1e-6)
 
 
-def test_light_of_leds_and_of_surroundings_have_each_their_colour() -> None:
-    """A warm and a cold white at one luminance: red sees more of the first, blue more of the second."""
+def test_red_and_blue_rates_follow_the_spectrum() -> None:
+    """A warm and a cold white at one luminance: red has the greater rate of the first, blue of the second."""
     rates = {
         spectrum: [electron_rate_per_cd_m2(Camera(), spectrum, Tabulated(QE, colour)) for colour in COLOURS]
         for spectrum in ("LED-B1", "LED-B5")  # 2733 K and 6598 K
@@ -70,7 +74,7 @@ def test_light_of_leds_and_of_surroundings_have_each_their_colour() -> None:
     assert cold[2] > 2 * warm[2]
 
 
-def test_a_table_of_the_silicon_curve_is_the_silicon_curve() -> None:
+def test_a_table_of_the_silicon_curve_gives_the_rate_of_silicon() -> None:
     values = Silicon().quantum_efficiency(WAVELENGTHS_NM)
     table = QuantumEfficiency(wavelengths_nm=tuple(WAVELENGTHS_NM), values=tuple(values))
     (detector,) = detectors(Sensor(quantum_efficiency=table))
@@ -79,7 +83,7 @@ def test_a_table_of_the_silicon_curve_is_the_silicon_curve() -> None:
     )
 
 
-def test_a_narrow_filter_counts_its_photons_only() -> None:
+def test_rate_of_a_narrow_filter_by_hand() -> None:
     """QE 1 from 550 to 560 nm: rate = pi/4 / N^2 * A * tau * integral of L_lambda lambda / (h c), by hand as a sum."""
     line = QuantumEfficiency(wavelengths_nm=(549.999, 550.0, 560.0, 560.001), values=(0.0, 1.0, 1.0, 0.0))
     from vlcrender.sensor.radiometry import relative_spectrum, spectral_radiance

@@ -14,7 +14,8 @@ from estimator.io.dataset import Camera as DeviceCamera
 from estimator.io.dataset import DeviceFrame, read_dataset, read_frame
 from estimator.variants.catalogue import VARIANTS
 from vlcrender.camera.distortion import Distortion
-from vlcrender.camera.intrinsics import Camera, Pose, image_of_points, project
+from vlcrender.camera.intrinsics import Camera, Pose
+from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.rig import mounted_cameras
 from vlcrender.core.random_keys import stream
 from vlcrender.dataset.files import camera_entry
@@ -70,17 +71,18 @@ def test_a_gravity_reading_levels_the_pixels_that_the_pose_tilted(tilts: tuple[f
     axis = pose.rotation[2]
     aim = np.array(pose.position_m) + axis * 2.45 / axis[2]
     leds = aim + np.array([[0, 0, 0], [0.13, 0, 0], [0, 0.13, 0], [-0.13, 0.26, 0]])
-    seen, _ = project(camera, pose, leds)
+    seen = PosedCamera(camera, pose).project(leds)
     reading = TiltError(error_deg=0.0).reading_m_s2(pose, stream(0, 0, "none"))
     leveled = level(seen, camera.matrix, rotation(*tilt_from_gravity(tuple(reading))))
-    expected, _ = project(camera, Pose(pose.position_m, yaw_deg=25.0), leds)
+    expected = PosedCamera(camera, Pose(pose.position_m, yaw_deg=25.0)).project(leds)
     # double precision; the horizon is near at 75.5 deg from the zenith: pixels of 1e5, so 1e5 * 1e-15 * amplification
     assert np.abs(leveled - expected).max() < 1e-6
 
 
 def test_a_hand_computed_point() -> None:
     """Camera at (1, 2, 0.5), level, LED at (1.3, 1.8, 3.5): 0.3/3 * 15000 = 1500 right of and 1000 above the centre."""
-    pixels, depth = project(Camera(), Pose((1.0, 2.0, 0.5)), np.array([1.3, 1.8, 3.5]))
+    posed, point = PosedCamera(Camera(), Pose((1.0, 2.0, 0.5))), np.array([1.3, 1.8, 3.5])
+    pixels, depth = posed.project(point), posed.camera_coordinates(point)[2]
     assert depth == pytest.approx(3.0)
     assert pixels == pytest.approx([3500.0, 500.0])
 
@@ -141,8 +143,8 @@ def test_one_side_undoes_the_distortion_of_the_other(lens: Distortion) -> None:
     bent = Camera(distortion=lens, skew_px=30.0, principal_point_px=(1900.0, 1600.0), focus_distance_m=2.0)
     x, y = np.meshgrid(np.linspace(-0.12, 0.12, 25), np.linspace(-0.09, 0.09, 19))
     rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
-    straight = image_of_points(bent.model_copy(update={"distortion": None}), rays)
-    seen = image_of_points(bent, rays)
+    straight = bent.model_copy(update={"distortion": None}).image_of_points(rays)
+    seen = bent.image_of_points(rays)
     assert np.abs(seen - straight).max() > 1
     assert np.abs(pinhole_pixels(seen, as_told(bent)) - straight).max() < 1e-6
 
@@ -153,8 +155,8 @@ def test_one_side_undoes_the_fish_eye_of_the_other() -> None:
         np.radians(np.linspace(0, MAX_FIELD_ANGLE_DEG - 0.1, 30)), np.radians(np.arange(0, 360, 15))
     )
     rays = np.stack([np.sin(theta) * np.cos(around), np.sin(theta) * np.sin(around), np.cos(theta)], -1).reshape(-1, 3)
-    straight = image_of_points(fish_eye.model_copy(update={"projection": "perspective"}), rays)
-    found = pinhole_pixels(image_of_points(fish_eye, rays), as_told(fish_eye))
+    straight = fish_eye.model_copy(update={"projection": "perspective"}).image_of_points(rays)
+    found = pinhole_pixels(fish_eye.image_of_points(rays), as_told(fish_eye))
     assert np.abs(found - straight).max() < 1e-6
 
 

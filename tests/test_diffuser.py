@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 from test_path_traced import SMALL_VIEW, blocks, both_ways, scene_of
 
-from vlcrender.camera.intrinsics import Camera, Pose, project
+from vlcrender.camera.intrinsics import Camera, Pose
+from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.roi import Roi
 from vlcrender.errors import InputError
 from vlcrender.rendering.background import differs_from_neighbour
+from vlcrender.rendering.electron_rates import ElectronRates
 from vlcrender.rendering.renderer import Renderer
 from vlcrender.scene.diffuser import DIM_SHARE, Diffuser
 from vlcrender.scene.loader import Scene
@@ -97,7 +99,7 @@ def test_a_sheet_is_seen_with_the_luminance_and_the_flux_of_the_model() -> None:
     scene = panelled(diffuser=True, frame=False)
     camera = Camera(width_px=500, height_px=400, pixel_pitch_um=16.0)
     pose = Pose((1.5, 1.5, 0.4))
-    view = Renderer(scene).expected_image(camera, pose)
+    view = Renderer(scene).expected_image(PosedCamera(camera, pose))
     rate = electron_rate_per_cd_m2(camera, "LED-B3", Silicon())
     assert [patch.led_id for patch in view.patches] == [1, 2, 3, 4, 5, 6]
     area_m2 = (2.0 * 16e-6 / 18e-3) ** 2
@@ -127,9 +129,9 @@ def test_a_rim_hides_leds_from_aside(slope: float, share: float) -> None:
     assert led[0] - (1.5 - 0.25 + 0.02) == pytest.approx(0.08)
     pose = Pose((0.1, float(led[1]), float(led[2] - (led[0] - 0.1) / slope)), 0.0, 60.0)
     camera = Camera(width_px=600, height_px=400, pixel_pitch_um=20.0)
-    middle, _ = project(camera, pose, led)
+    middle = PosedCamera(camera, pose).project(led)
     assert 100 < middle[0] < 500
-    seen = [patch for patch in Renderer(scene).expected_image(camera, pose).patches if patch.led_id == 1]
+    seen = [patch for patch in Renderer(scene).expected_image(PosedCamera(camera, pose)).patches if patch.led_id == 1]
     assert sum(patch.visible_fraction for patch in seen) == pytest.approx(share, abs=0.02)
 
 
@@ -146,8 +148,8 @@ def test_diffusers_and_frames_are_as_in_the_reference(frame: bool) -> None:
     # pixel of 1.6 cm is half of d and averaged from 2 x 2 places: (1/2)^4 / 4320 of the fourth derivative, 4 * 6 * 8 *
     # 10 at the foot, 0.3 %; and the light that the frame's inside, which is baked too dark, reflects: 0.4 % measured.
     sensor = Roi.of_sensor(camera)
-    _, labels = Renderer(scene)._background.images(camera, pose, (sensor,), (1.0, 1.0))
-    inside = lit & ~differs_from_neighbour(labels[0])
+    (region,) = Renderer(scene)._background.regions(PosedCamera(camera, pose), (sensor,), ElectronRates(1.0, 1.0))
+    inside = lit & ~differs_from_neighbour(region.surfaces)
     assert inside.sum() > 200
     z = (ours - reference)[inside] / np.sqrt(variance + (0.01 * reference) ** 2)[inside]
     assert np.abs(z).max() < 7.9

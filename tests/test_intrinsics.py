@@ -1,69 +1,60 @@
-"""Axes and signs: each one written down here, so that no two can cancel."""
+"""Axes and signs of projection, each stated once, and lenses against closed forms and OpenCV."""
 
 import cv2
 import numpy as np
 import pytest
 
-from vlcrender.camera.distortion import Distortion, distort_with_slope
-from vlcrender.camera.intrinsics import (
-    Camera,
-    Pose,
-    image_of_points,
-    mitsuba_to_world,
-    pixel_of_point,
-    project,
-    ray_of_pixel,
-    rays_world,
-    rotation_cam_world,
-)
+from vlcrender.camera.distortion import Distortion
+from vlcrender.camera.intrinsics import Camera, Pose, rotation_cam_world
+from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.config.toml_model import check
 from vlcrender.core.backend import dr, mi
 from vlcrender.errors import InputError
 
-LAMP = np.array([3.0, 4.0, 3.5])
+LED_M = np.array([3.0, 4.0, 3.5])
 
 
-def spot(lamp: np.ndarray = LAMP, camera: Camera | None = None, **pose: float) -> np.ndarray:
+def image_of(led_m: np.ndarray = LED_M, camera: Camera | None = None, **pose: float) -> np.ndarray:
     at = (pose.pop("x", 3.0), pose.pop("y", 4.0), pose.pop("z", 0.5))
-    pixels, _ = project(camera or Camera(), Pose(at, **pose), lamp)
+    pixels = PosedCamera(camera or Camera(), Pose(at, **pose)).project(led_m)
     return pixels
 
 
-def test_a_lamp_straight_above_a_level_camera_is_at_the_principal_point() -> None:
-    assert spot() == pytest.approx([2000.0, 1500.0])
+def test_an_led_straight_above_a_level_camera_is_at_the_principal_point() -> None:
+    assert image_of() == pytest.approx([2000.0, 1500.0])
 
 
-def test_the_level_pose_is_the_identity_looking_up() -> None:
+def test_the_level_pose_is_the_identity_and_points_up() -> None:
     assert np.array_equal(Pose((0, 0, 0)).rotation, np.eye(3))
 
 
-def test_a_lamp_moved_to_plus_x_moves_its_spot_to_plus_u() -> None:
+def test_an_led_moved_to_plus_x_moves_its_image_to_plus_u() -> None:
     # f = 18 mm / 1.2 um = 15 000 px; 0.1 m at 3 m depth is 500 px
-    assert spot(LAMP + [0.1, 0, 0]) == pytest.approx([2500.0, 1500.0])
+    assert image_of(LED_M + [0.1, 0, 0]) == pytest.approx([2500.0, 1500.0])
 
 
-def test_a_lamp_moved_to_plus_y_moves_its_spot_to_plus_v() -> None:
-    assert spot(LAMP + [0, 0.1, 0]) == pytest.approx([2000.0, 2000.0])
+def test_an_led_moved_to_plus_y_moves_its_image_to_plus_v() -> None:
+    assert image_of(LED_M + [0, 0.1, 0]) == pytest.approx([2000.0, 2000.0])
 
 
-def test_a_camera_moved_to_plus_x_moves_the_spot_to_minus_u() -> None:
-    assert spot(x=3.1) == pytest.approx([1500.0, 1500.0])
+def test_a_camera_moved_to_plus_x_moves_the_image_to_minus_u() -> None:
+    assert image_of(x=3.1) == pytest.approx([1500.0, 1500.0])
 
 
 def test_a_camera_raised_makes_the_image_larger() -> None:
-    assert spot(LAMP + [0.1, 0, 0], z=2.0)[0] == pytest.approx(2000 + 15000 * 0.1 / 1.5)
+    assert image_of(LED_M + [0.1, 0, 0], z=2.0)[0] == pytest.approx(2000 + 15000 * 0.1 / 1.5)
 
 
-def test_raising_tilt_x_moves_the_spot_to_plus_v() -> None:
-    assert spot(tilt_x_deg=1.0) == pytest.approx([2000.0, 1500 + 15000 * np.tan(np.radians(1.0))])
+def test_raising_tilt_x_moves_the_image_to_plus_v() -> None:
+    assert image_of(tilt_x_deg=1.0) == pytest.approx([2000.0, 1500 + 15000 * np.tan(np.radians(1.0))])
 
 
-def test_raising_tilt_y_moves_the_spot_to_minus_u() -> None:
-    assert spot(tilt_y_deg=1.0) == pytest.approx([2000 - 15000 * np.tan(np.radians(1.0)), 1500.0])
+def test_raising_tilt_y_moves_the_image_to_minus_u() -> None:
+    assert image_of(tilt_y_deg=1.0) == pytest.approx([2000 - 15000 * np.tan(np.radians(1.0)), 1500.0])
 
 
-def test_raising_yaw_turns_a_spot_from_plus_u_towards_minus_v() -> None:
-    assert spot(LAMP + [0.1, 0, 0], yaw_deg=90.0) == pytest.approx([2000.0, 1000.0])
+def test_raising_yaw_turns_an_image_from_plus_u_towards_minus_v() -> None:
+    assert image_of(LED_M + [0.1, 0, 0], yaw_deg=90.0) == pytest.approx([2000.0, 1000.0])
 
 
 def test_tilts_compose_as_equation_5_of_the_paper() -> None:
@@ -76,23 +67,25 @@ def test_tilts_compose_as_equation_5_of_the_paper() -> None:
 def test_principal_point_and_skew_enter_as_in_k() -> None:
     camera = Camera(principal_point_px=(1990.5, 1510.25), skew_px=30.0)
     # x/z = 0.1/3, y/z = 0.2/3
-    u, v = spot(LAMP + [0.1, 0.2, 0], camera)
+    u, v = image_of(LED_M + [0.1, 0.2, 0], camera)
     assert (u, v) == pytest.approx((1990.5 + 500 + 30 * 0.2 / 3, 1510.25 + 1000))
 
 
-def test_rays_undo_projection(rng: np.random.Generator) -> None:
+def test_rays_invert_projection(rng: np.random.Generator) -> None:
     camera = Camera(principal_point_px=(1900.0, 1600.0), skew_px=12.0)
     pose = Pose((3.0, 2.0, 1.0), 35.0, -50.0, 120.0)
     pixels = rng.uniform([0, 0], [4000, 3000], (100, 2))
-    points = np.array(pose.position_m) + 2.5 * rays_world(camera, pose, pixels)
-    again, depth = project(camera, pose, points)
+    points = np.array(pose.position_m) + 2.5 * PosedCamera(camera, pose).rays_world(pixels)
+    posed = PosedCamera(camera, pose)
+    again, depth = posed.project(points), posed.camera_coordinates(points)[:, 2]
     # double precision: 1e4 px * 2^-52 * a few operations
     assert np.allclose(again, pixels, atol=1e-9)
     assert np.allclose(depth, 2.5)
 
 
-def test_what_is_behind_the_camera_has_no_pixel() -> None:
-    pixels, depth = project(Camera(), Pose((3.0, 4.0, 0.5)), np.array([3.0, 4.0, 0.1]))
+def test_a_point_behind_the_camera_has_no_pixel() -> None:
+    posed, point = PosedCamera(Camera(), Pose((3.0, 4.0, 0.5))), np.array([3.0, 4.0, 0.1])
+    pixels, depth = posed.project(point), posed.camera_coordinates(point)[2]
     assert np.isnan(pixels).all()
     assert depth < 0
 
@@ -104,26 +97,26 @@ def test_the_field_of_view_is_15_19_degrees_not_the_printed_24() -> None:
 
 def test_mitsubas_camera_is_a_proper_rotation_with_x_left_and_y_up() -> None:
     pose = Pose((1.0, 2.0, 0.5), 20.0, 40.0, 60.0)
-    matrix = mitsuba_to_world(pose)
+    matrix = PosedCamera(Camera(), pose).mitsuba_to_world()
     assert np.linalg.det(matrix[:3, :3]) == pytest.approx(1.0)
     assert np.allclose(matrix[:3, 0], -pose.rotation[0])  # Mitsuba's +x is our image's left
     assert np.allclose(matrix[:3, 1], -pose.rotation[1])  # its +y our image's up
-    assert np.allclose(matrix[:3, 2], pose.rotation[2])  # both look along +z
+    assert np.allclose(matrix[:3, 2], pose.rotation[2])  # +z of both is the optical axis
 
 
 WIDE = {"width_px": 4000, "height_px": 3000, "pixel_pitch_um": 1.2, "focal_length_mm": 4.0}
-"""62 x 48 deg: distorted positions reach a radius of 0.75."""
+"""62 x 48 deg: distorted positions have radii up to 0.75."""
 BARREL = Camera(**WIDE, skew_px=5.0, distortion=Distortion(k1=-0.2, k2=0.05, k3=-0.01, p1=0.002, p2=-0.003))
 PINCUSHION = Camera(**WIDE, distortion=Distortion(k1=0.2, k2=0.1, p1=-0.01, p2=0.01))
 FISHEYE = Camera(**(WIDE | {"focal_length_mm": 1.4}), projection="equidistant", principal_point_px=(1950.0, 1540.0))
-"""Sees 102 deg off the axis in the corners."""
+"""Field angles up to 102 deg in the corners."""
 LENSES = {"barrel": BARREL, "pincushion": PINCUSHION, "fish-eye": FISHEYE}
 
 
 @pytest.mark.parametrize("camera", LENSES.values(), ids=LENSES)
-def test_rays_and_pixels_undo_each_other(camera: Camera, rng: np.random.Generator) -> None:
+def test_unproject_inverts_project(camera: Camera, rng: np.random.Generator) -> None:
     u, v = rng.uniform([[0], [0]], [[4000], [3000]], (2, 10_000))
-    again = pixel_of_point(camera, *ray_of_pixel(camera, u, v))
+    again = camera.project(*camera.unproject(u, v))
     # 4000 px * 2^-52 = 1e-12 px, times the dozen operations there and back
     assert np.abs(again[0] - u).max() < 1e-10
     assert np.abs(again[1] - v).max() < 1e-10
@@ -132,16 +125,16 @@ def test_rays_and_pixels_undo_each_other(camera: Camera, rng: np.random.Generato
 @pytest.mark.parametrize("camera", LENSES.values(), ids=LENSES)
 def test_rays_are_the_same_in_a_kernel(camera: Camera, rng: np.random.Generator) -> None:
     u, v = rng.uniform([[0], [0]], [[4000], [3000]], (2, 1000)).astype(np.float32)
-    rays = np.stack(ray_of_pixel(camera, u.astype(float), v.astype(float)))
-    kernel = np.stack([x.numpy() for x in ray_of_pixel(camera, mi.Float(u), mi.Float(v), dr)])
+    rays = np.stack(camera.unproject(u.astype(float), v.astype(float)))
+    kernel = np.stack([x.numpy() for x in camera.unproject(mi.Float(u), mi.Float(v), dr)])
     # float32: 2^-24 = 6e-8 an operation, a few dozen operations on numbers up to 1
     assert np.abs(kernel - rays).max() < 2e-6
-    pixels = np.stack([x.numpy() for x in pixel_of_point(camera, *(mi.Float(x.astype(np.float32)) for x in rays), dr)])
+    pixels = np.stack([x.numpy() for x in camera.project(*(mi.Float(x.astype(np.float32)) for x in rays), dr)])
     assert np.abs(pixels - [u, v]).max() < 4000 * 2e-6
 
 
 @pytest.mark.parametrize("camera", [BARREL, PINCUSHION], ids=["barrel", "pincushion"])
-def test_distortion_is_opencvs(camera: Camera, rng: np.random.Generator) -> None:
+def test_distortion_agrees_with_opencv(camera: Camera, rng: np.random.Generator) -> None:
     points = rng.uniform([-1, -0.7, 1.8], [1, 0.7, 2.2], (500, 3))
     d = camera.distortion
     assert d is not None
@@ -151,13 +144,13 @@ def test_distortion_is_opencvs(camera: Camera, rng: np.random.Generator) -> None
     expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), straight.matrix, coefficients)
     expected = expected.reshape(-1, 2)
     expected[:, 0] += camera.skew_px * (expected[:, 1] - camera.center_px[1]) / camera.focal_px
-    assert np.allclose(image_of_points(camera, points), expected, atol=1e-9)
+    assert np.allclose(camera.image_of_points(points), expected, atol=1e-9)
 
 
 def test_negative_k1_is_a_barrel_and_p1_and_p2_pull_along_v_and_u() -> None:
     at = np.array([0.3, 0.2, 1.0])
     plain, barrel, p1, p2 = (
-        image_of_points(Camera(**WIDE, distortion=Distortion(**d)), at) - [2000, 1500]
+        Camera(**WIDE, distortion=Distortion(**d)).image_of_points(at) - [2000, 1500]
         for d in ({}, {"k1": -0.1}, {"p1": 0.01}, {"p2": 0.01})
     )
     # r^2 = 0.13; f = 10 000 / 3 px
@@ -166,13 +159,13 @@ def test_negative_k1_is_a_barrel_and_p1_and_p2_pull_along_v_and_u() -> None:
     assert np.allclose(p2 - plain, 1e4 / 3 * 0.01 * np.array([0.13 + 2 * 0.09, 2 * 0.06]))
 
 
-def test_the_slope_of_the_distortion_is_its_slope(rng: np.random.Generator) -> None:
+def test_the_jacobian_of_the_distortion_agrees_with_differences(rng: np.random.Generator) -> None:
     d = Distortion(k1=-0.2, k2=0.05, k3=-0.3, p1=0.02, p2=-0.03)
     x, y = rng.uniform(-0.7, 0.7, (2, 100))
     h = 1e-6
-    right, left = distort_with_slope(d, x + h, y), distort_with_slope(d, x - h, y)
-    below, above = distort_with_slope(d, x, y + h), distort_with_slope(d, x, y - h)
-    _, _, xx, xy, yy = distort_with_slope(d, x, y)
+    right, left = d.distort(x + h, y), d.distort(x - h, y)
+    below, above = d.distort(x, y + h), d.distort(x, y - h)
+    _, _, xx, xy, yy = d.distort(x, y)
     # central differences: h^2 = 1e-12 and 2^-52 / h = 2e-10
     assert np.allclose((right[0] - left[0]) / (2 * h), xx, atol=2e-9)
     assert np.allclose((below[0] - above[0]) / (2 * h), xy, atol=2e-9)
@@ -180,24 +173,24 @@ def test_the_slope_of_the_distortion_is_its_slope(rng: np.random.Generator) -> N
     assert np.allclose((below[1] - above[1]) / (2 * h), yy, atol=2e-9)
 
 
-def test_what_lies_beyond_the_fold_of_a_barrel_has_no_pixel() -> None:
+def test_a_point_beyond_the_fold_of_a_barrel_has_no_pixel() -> None:
     # r (1 - 0.3 r^2) turns at r = 1.054; r = 1.6 would come back to 0.37, in the middle of the image
     camera = Camera(**(WIDE | {"focal_length_mm": 6.0}), distortion=Distortion(k1=-0.3))
-    assert np.isnan(image_of_points(camera, np.array([1.6, 0.0, 1.0]))).all()
-    assert np.isfinite(image_of_points(camera, np.array([0.4, 0.0, 1.0]))).all()
+    assert np.isnan(camera.image_of_points(np.array([1.6, 0.0, 1.0]))).all()
+    assert np.isfinite(camera.image_of_points(np.array([0.4, 0.0, 1.0]))).all()
 
 
 @pytest.mark.parametrize("theta_deg", [0.0, 1e-7, 60.0, 90.0, 100.0])
-def test_a_fisheye_puts_light_as_far_out_as_its_angle(theta_deg: float) -> None:
+def test_a_fisheye_images_at_a_radius_equal_to_the_field_angle(theta_deg: float) -> None:
     theta = np.radians(theta_deg)
     direction = np.array([np.sin(theta) * 0.6, -np.sin(theta) * 0.8, np.cos(theta)])
     f = FISHEYE.focal_px
-    pixel = image_of_points(FISHEYE, 3.0 * direction)
+    pixel = FISHEYE.image_of_points(3.0 * direction)
     assert pixel == pytest.approx([1950 + 0.6 * f * theta, 1540 - 0.8 * f * theta], abs=1e-9)
-    assert np.allclose(ray_of_pixel(FISHEYE, *pixel), direction, atol=1e-12)
+    assert np.allclose(FISHEYE.unproject(*pixel), direction, atol=1e-12)
 
 
-def test_focusing_near_moves_the_sensor_back() -> None:
+def test_a_near_focus_moves_the_sensor_back() -> None:
     # 1/f = 1/s + 1/f_i: f = 18 mm and s = 198 mm give f_i = 19.8 mm
     camera = Camera(focus_distance_m=0.198)
     assert camera.image_distance_mm == pytest.approx(19.8)
@@ -240,7 +233,7 @@ def test_view_angles_follow_the_lens() -> None:
         ({"vignetting_deg": 0.0}, "vignetting_deg"),
     ],
 )
-def test_a_lens_that_cannot_be_is_refused_in_one_line(settings: dict[str, object], said: str) -> None:
+def test_an_impossible_lens_is_refused_in_one_line(settings: dict[str, object], said: str) -> None:
     with pytest.raises(InputError) as refusal:
         check(settings, Camera, "recipe.toml")
     assert said in str(refusal.value)

@@ -1,4 +1,4 @@
-"""LEDs after a narrow blur, against brute force; light kept; slopes for the bound."""
+"""LEDs after a narrow blur: against closed forms; sum and centroid of the light; slopes for the bound."""
 
 from typing import Any
 
@@ -7,11 +7,12 @@ import pytest
 from scipy.special import j1
 
 from vlcrender.camera.intrinsics import Camera, Pose
-from vlcrender.camera.lens import AIRY_TAIL, defocus_diameter_px, split_for, split_kernel
+from vlcrender.camera.posed_camera import PosedCamera
+from vlcrender.camera.psf import AIRY_TAIL, defocus_diameter_px, split_for, split_kernel
 from vlcrender.camera.roi import Roi
 from vlcrender.core.planar_shapes import Disc
-from vlcrender.rendering.led_blur import LedBlur, led_blur
-from vlcrender.rendering.led_coverage import coverage_of_led
+from vlcrender.rendering.led_blur import LedKernel, led_blur
+from vlcrender.rendering.led_coverage import LedFace, coverage_of_led
 from vlcrender.rendering.led_edges import LedEdges, edges_of_led
 from vlcrender.rendering.renderer import Renderer
 from vlcrender.scene.loader import Scene
@@ -19,17 +20,17 @@ from vlcrender.scene.loader import Scene
 Array = np.ndarray[Any, np.dtype[np.float64]]
 
 PEAK_E, BACKGROUND_E = 4000.0, 24.0
-"""An LED and the ceiling beside it, as in a quickstart's frame."""
+"""An LED and the ceiling beside it, as in a frame of the quickstart."""
 OVERHEAD_M = 2.5
 LENS = {"width_px": 64, "height_px": 64, "pixel_pitch_um": 10.0, "focal_length_mm": 18.0}
 RADIUS_PX = 6.3
 RADIUS_M = RADIUS_PX * OVERHEAD_M / 1800
 CENTER_PX = np.array([32.3, 31.85])
-"""Where the LED is imaged: neither in a pixel's centre nor on its border."""
+"""Image of the LED's centre: neither a pixel's centre nor on its border."""
 
 
 def defocused(diameter_px: float) -> Camera:
-    """A camera focused at infinity that makes such a disc of a point overhead."""
+    """A camera focused at infinity whose defocus disc of a point overhead has this diameter."""
     wide_open = Camera(**LENS, focus_distance_m="infinity", f_number=1.0)
     return Camera(
         **LENS,
@@ -39,7 +40,7 @@ def defocused(diameter_px: float) -> Camera:
 
 
 def diffracting(scale_px: float) -> Camera:
-    """A camera whose lambda N is so many pixels."""
+    """A camera whose lambda N is this many pixels."""
     return Camera(**LENS, psf="diffraction", f_number=scale_px * 10.0 / 0.55)
 
 
@@ -49,26 +50,26 @@ CAMERAS = {f"disc {d} px": defocused(d) for d in (0.2, 0.35, 0.7, 1.0, 2.0, 3.0,
 
 
 def sharp_image(camera: Camera) -> tuple[Array, Roi, LedEdges]:
-    """Coverage of an LED overhead imaged at CENTER_PX, its window and edges."""
+    """Coverage of an LED overhead imaged at CENTER_PX, its region and edges."""
     pose = Pose((1.0, 1.0, 1.0))
     center_m = np.array([*(1.0 + (CENTER_PX - 32) * OVERHEAD_M / camera.focal_px), 1.0 + OVERHEAD_M])
-    image = coverage_of_led(camera, pose, center_m, Disc(RADIUS_M), 40)
+    posed, face = PosedCamera(camera, pose), LedFace(center_m, Disc(RADIUS_M))
+    image = coverage_of_led(posed, face, 40)
     assert image is not None
-    edges = edges_of_led(camera, pose, center_m, Disc(RADIUS_M), image, split_for(camera, OVERHEAD_M))
-    return image.coverage, Roi(image.row, image.column, *image.coverage.shape), edges
+    return image.coverage, image.roi, edges_of_led(posed, face, image, split_for(camera, OVERHEAD_M))
 
 
 def blurred_image(camera: Camera) -> tuple[Array, Roi]:
-    """The same after the lens."""
+    """The LED's image after the lens, and its region."""
     coverage, roi, edges = sharp_image(camera)
-    kernel = split_kernel(camera, OVERHEAD_M)
-    assert kernel is not None
-    blur = LedBlur((kernel.whole,), (kernel,), None)
-    return blur.blurred(0, coverage, roi, [edges], 1.0), roi.padded(blur.spread_px)
+    parts = split_kernel(camera, OVERHEAD_M)
+    assert parts is not None
+    kernel = LedKernel(parts.whole, parts)
+    return kernel.blurred(coverage, roi, [edges], 1.0), roi.padded(kernel.radius_px)
 
 
 def shared_by_discs(distance: Array, first: float, second: float) -> Array:
-    """Area that two discs of these radii share whose centres are so far apart."""
+    """Area that two discs of these radii share, with their centres at a distance."""
     near, far = abs(first - second), first + second
     d = np.clip(distance, near + 1e-12, far - 1e-12)
     half_1 = np.arccos(np.clip((d**2 + first**2 - second**2) / (2 * d * first), -1, 1))
@@ -78,11 +79,11 @@ def shared_by_discs(distance: Array, first: float, second: float) -> Array:
 
 
 def behind_airy(distance: Array, scale: float) -> Array:
-    """What an Airy pattern makes of a disc of RADIUS_PX, so far from its centre.
+    """A disc of RADIUS_PX blurred by an Airy pattern, at distances from its centre.
 
-    Ring by ring of the pattern about the place: its light times the share of the ring inside the disc.
+    Sum over rings of the pattern: light of the ring times the share of the ring inside the disc.
     """
-    s = (np.arange(20_000) + 0.5) * (24.0 / 20_000)  # farther than any of the disc is from where we look
+    s = (np.arange(20_000) + 0.5) * (24.0 / 20_000)  # greater than the distance of any point of the disc
     x = np.pi * s / scale
     light = (2 * j1(x) / x) ** 2 * np.pi / 4 / scale**2 * 2 * np.pi * s * (s[1] - s[0])
     table = np.linspace(0.0, 14.0, 1401)
@@ -93,21 +94,21 @@ def behind_airy(distance: Array, scale: float) -> Array:
 
 
 def share_kept(scale: float) -> float:
-    """The Airy pattern's light within the square that kernels follow it to."""
-    reach = int(np.ceil(2 / (np.pi**2 * AIRY_TAIL) * scale)) + 0.5
-    at = (np.arange(4000) + 0.5) * (reach / 4000)
+    """Share of the Airy pattern's light in the square of the kernel."""
+    half_side = int(np.ceil(2 / (np.pi**2 * AIRY_TAIL) * scale)) + 0.5
+    at = (np.arange(4000) + 0.5) * (half_side / 4000)
     x = np.pi / scale * np.hypot(*np.meshgrid(at, at))
-    return float(4 * ((2 * j1(x) / x) ** 2).sum() * (reach / 4000) ** 2 * np.pi / 4 / scale**2)
+    return float(4 * ((2 * j1(x) / x) ** 2).sum() * (half_side / 4000) ** 2 * np.pi / 4 / scale**2)
 
 
 @pytest.mark.parametrize("name", CAMERAS)
-def test_an_edge_is_true_to_a_twentieth_of_its_shot_noise(name: str) -> None:
-    """Against the closed form of a disc behind a disc, or rings of the Airy pattern, at 64 x 64 places a pixel."""
+def test_an_edge_errs_by_less_than_a_twentieth_of_the_shot_noise(name: str) -> None:
+    """Against the closed form of a disc behind a disc, or rings of the Airy pattern, at 64 x 64 points a pixel."""
     camera = CAMERAS[name]
     image, roi = blurred_image(camera)
     if camera.psf == "diffraction":
         scale = camera.working_f_number * 0.55 / 10.0
-        image = image * share_kept(scale)  # kernels make up for what they leave out
+        image = image * share_kept(scale)  # kernels are scaled up by the light left out
     inside = (np.arange(64) + 0.5) / 64 - 0.5
     centers = np.stack(np.broadcast_arrays(*roi.centers_px()), axis=-1)
     near = np.hypot(*np.moveaxis(centers - CENTER_PX, -1, 0)) < 13
@@ -121,21 +122,21 @@ def test_an_edge_is_true_to_a_twentieth_of_its_shot_noise(name: str) -> None:
         truth = (shared_by_discs(distance, RADIUS_PX, disc / 2) / (np.pi * disc**2 / 4)).mean(axis=(1, 2))
     error_e = PEAK_E * (image[rows, columns] - truth)
     share = error_e**2 / (PEAK_E * truth + BACKGROUND_E)
-    print(f"{name}: {np.abs(error_e).max():.2f} e, {share.max():.2%} of the variance at the worst")
-    # The promise itself. The truth's own error: 64^2 places at a disc's rim, 0.3 / 64^1.5 of what it blurs in, 6e-4
-    # where that is no more than a place's width, and far less where the blur is wider.
+    print(f"{name}: {np.abs(error_e).max():.2f} e, {share.max():.2%} of the variance at most")
+    # The bound of `split_for`. Error of the truth: 64^2 points at a disc's rim, 0.3 / 64^1.5 = 6e-4 of the step where
+    # the blur is no wider than the spacing of the points, and far less where it is wider.
     assert share.max() < 0.05
 
 
 @pytest.mark.parametrize("name", CAMERAS)
-def test_parts_keep_the_light_and_move_it_nowhere(name: str) -> None:
+def test_parts_keep_the_light_and_its_centroid(name: str) -> None:
     camera = CAMERAS[name]
     image, roi = blurred_image(camera)
     coverage, _, _ = sharp_image(camera)
     # rounding, 2^-52 of each of some thousand pixels
     assert image.sum() == pytest.approx(coverage.sum(), rel=1e-11)
     assert image.min() >= 0
-    centroid = np.array([(image * place).sum() for place in roi.centers_px()]) / image.sum()
+    centroid = np.array([(image * coordinate).sum() for coordinate in roi.centers_px()]) / image.sum()
     # parts hold their light at their centres: that moves an edge by up to 1 / (8 n) of a part's width, n >= 4 here,
     # at 80 places and more around the rim which it moves either way
     assert np.abs(centroid - CENTER_PX).max() < 1 / (8 * 4**2) / np.sqrt(80) * 3
@@ -146,7 +147,7 @@ def test_each_led_near_the_focus_has_its_own_kernel(table1: Scene) -> None:
     leds, camera = table1.leds, Camera(focus_distance_m=2.5)
     pose = Pose((float(leds.centers_m[0, 0]), float(leds.centers_m[0, 1]), 0.98))
     lower = Pose((pose.position_m[0], pose.position_m[1], 0.982))
-    one, other = (led_blur(leds, camera, at).splits[0] for at in (pose, lower))
+    one, other = (led_blur(leds, PosedCamera(camera, at)).kernels[0].parts for at in (pose, lower))
     assert one is not None
     assert other is not None
     expected = split_kernel(camera, float(leds.centers_m[0, 2]) - 0.98)
@@ -156,8 +157,8 @@ def test_each_led_near_the_focus_has_its_own_kernel(table1: Scene) -> None:
 
 
 @pytest.mark.parametrize("lens", [{"focus_distance_m": 2.95}, {"psf": "diffraction"}], ids=["focus", "diffraction"])
-def test_slopes_of_blurred_edges_do_not_depend_on_the_step(table1: Scene, lens: dict[str, Any]) -> None:
-    """What the bound needs: central differences over 2e-5 px that are not rounding, of a kernel that stays."""
+def test_slopes_of_blurred_edges_are_independent_of_the_step(table1: Scene, lens: dict[str, Any]) -> None:
+    """For the bound: central differences over 2e-5 px with one kernel, not dominated by rounding."""
     camera = Camera(**lens)
     at = Pose((0.31, 1.92, 0.5), 2.0, -1.0, 10.0)
     renderer = Renderer(table1)
@@ -166,7 +167,7 @@ def test_slopes_of_blurred_edges_do_not_depend_on_the_step(table1: Scene, lens: 
         images = []
         for sign in (1, -1):
             moved = Pose((0.31 + sign * step_px * 3.0 / camera.focal_px, *at.position_m[1:]), 2.0, -1.0, 10.0)
-            (patch,) = (p for p in renderer.led_patches(camera, moved, None, at) if p.led_id == 2)
+            (patch,) = (p for p in renderer.led_patches(PosedCamera(camera, moved), None, at) if p.led_id == 2)
             images.append(patch.electrons_per_s)
         return (images[0] - images[1]) / (2 * step_px)
 

@@ -1,4 +1,4 @@
-"""The exact image of a disc: coverage of pixels against closed forms and against brute force."""
+"""Pixel coverage of discs and rectangles against closed forms and brute force."""
 
 import numpy as np
 import pytest
@@ -6,9 +6,10 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from vlcrender.camera.distortion import Distortion
-from vlcrender.camera.intrinsics import Camera, Pose, project, rays_world
+from vlcrender.camera.intrinsics import Camera, Pose
+from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.core.planar_shapes import Disc, Rectangle, circle_polygon_area, rectangle_polygon_area
-from vlcrender.rendering.led_coverage import LedCoverage, coverage_of_led, leds_that_may_be_seen
+from vlcrender.rendering.led_coverage import LedCoverage, LedFace, candidate_leds, coverage_of_led
 
 SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 
@@ -16,7 +17,7 @@ SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 def image_of_disc(
     camera: Camera, pose: Pose, center_m: np.ndarray, radius_m: float, margin_px: int = 0
 ) -> LedCoverage | None:
-    return coverage_of_led(camera, pose, center_m, Disc(radius_m), margin_px)
+    return coverage_of_led(PosedCamera(camera, pose), LedFace(center_m, Disc(radius_m)), margin_px)
 
 
 def area(polygon: np.ndarray, radius: float) -> float:
@@ -32,7 +33,7 @@ def area(polygon: np.ndarray, radius: float) -> float:
         (SQUARE + [1, 0], 0.5, np.pi / 8),  # half a disc
         (SQUARE + [5, 0], 1.0, 0.0),  # apart
         (SQUARE[::-1] + [1, 1], 1.0, np.pi / 4),  # clockwise
-        # half of each side sticks out: 4 minus 4 corners; area = 4 sqrt(r2-1) + r2 (pi - 4 acos(1/r)), r2 = 1.25
+        # the disc cuts off the vertices: 4 minus 4 of them; area = 4 sqrt(r2-1) + r2 (pi - 4 acos(1/r)), r2 = 1.25
         (SQUARE, np.sqrt(1.25), 4 * 0.5 + 1.25 * (np.pi - 4 * np.arccos(1 / np.sqrt(1.25)))),
     ],
 )
@@ -47,9 +48,9 @@ def test_area_shared_by_disc_and_polygon(polygon: np.ndarray, radius: float, exp
     st.floats(0, np.pi),
     st.floats(0.2, 3),
 )
-@example(x=0.0, y=1.0, radius=1.0, angle=3.8e-16, stretch=1.0)  # a corner within rounding of the centre
+@example(x=0.0, y=1.0, radius=1.0, angle=3.8e-16, stretch=1.0)  # a vertex within rounding of the centre
 @example(x=2.9e-9, y=2.9e-9, radius=1.0, angle=0.0, stretch=1.0)  # and near it
-def test_the_areas_of_the_parts_add_up(x: float, y: float, radius: float, angle: float, stretch: float) -> None:
+def test_areas_shared_with_parts_add_up(x: float, y: float, radius: float, angle: float, stretch: float) -> None:
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     quad = (SQUARE * [stretch, 1]) @ turn.T + [x, y]
     middle = quad.mean(axis=0)
@@ -83,9 +84,9 @@ def test_coverage_adds_up_to_the_solid_angle_of_the_disc(pose: Pose, pitch_um: f
     image = image_of_disc(camera, pose, center, radius)
     assert image is not None
     axis_pixel_sr = 1 / camera.focal_px**2
-    to_lamp = center - np.array(pose.position_m)
-    distance = np.linalg.norm(to_lamp)
-    disc_sr = np.pi * radius**2 * (to_lamp[2] / distance) / distance**2
+    to_led = center - np.array(pose.position_m)
+    distance = np.linalg.norm(to_led)
+    disc_sr = np.pi * radius**2 * (to_led[2] / distance) / distance**2
     # On the axis, cos^3 = 1 to (r f / h)^2; the small-disc formula is off by about (r / d)^2 too: 2e-5 together.
     assert image.coverage.sum() * axis_pixel_sr == pytest.approx(disc_sr, rel=1e-4)
     assert image.visible_fraction == 1.0
@@ -98,8 +99,8 @@ def test_each_pixels_coverage_is_the_share_of_its_area(pose: Pose, small_camera:
     assert image is not None
     n = 64
     rows, columns = image.coverage.shape
-    u = image.column + (np.arange(columns * n) + 0.5) / n
-    v = image.row + (np.arange(rows * n) + 0.5) / n
+    u = image.roi.column + (np.arange(columns * n) + 0.5) / n
+    v = image.roi.row + (np.arange(rows * n) + 0.5) / n
     # independent of the module: conic of the disc's image through the inverse homography of its plane
     r, t = pose.rotation, pose.rotation @ (center - np.array(pose.position_m))
     homography = np.linalg.inv(small_camera.matrix @ np.column_stack([r[:, 0], r[:, 1], t]))
@@ -124,30 +125,34 @@ def test_the_centroid_is_not_the_image_of_the_centre_when_tilted() -> None:
         image = image_of_disc(camera, pose, center, 0.02)
         assert image is not None
         rows, columns = image.coverage.shape
-        u = (image.coverage.sum(axis=0) * (image.column + 0.5 + np.arange(columns))).sum() / image.coverage.sum()
-        v = (image.coverage.sum(axis=1) * (image.row + 0.5 + np.arange(rows))).sum() / image.coverage.sum()
-        pixels, _ = project(camera, pose, center)
+        u = (image.coverage.sum(axis=0) * (image.roi.column + 0.5 + np.arange(columns))).sum() / image.coverage.sum()
+        v = (image.coverage.sum(axis=1) * (image.roi.row + 0.5 + np.arange(rows))).sum() / image.coverage.sum()
+        pixels = PosedCamera(camera, pose).project(center)
         offsets.append(float(np.hypot(u - pixels[0], v - pixels[1])))
     assert offsets[0] < 1e-6
     # f r^2 tan / d^2 with f = 15000, r = 0.02, d = 2.1, tan = 0.8: 1.1 px * cos^2 terms; half to double is the claim
     assert 0.3 < offsets[1] < 2.0
 
 
-def test_a_disc_cut_by_the_border_says_what_share_is_seen() -> None:
+def test_visible_fraction_of_a_disc_cut_by_the_border() -> None:
     camera = Camera()
     # centre exactly on the left border: half is seen
     center = np.array([3.0 - 2000 * 3.0 / 15000, 3.0, 3.5])
     image = image_of_disc(camera, Pose((3.0, 3.0, 0.5)), center, 0.01)
     assert image is not None
-    assert image.column == 0
+    assert image.roi.column == 0
     assert image.visible_fraction == pytest.approx(0.5, abs=1e-6)
 
 
 @pytest.mark.parametrize(
     ("center", "why"),
-    [([3.0, 3.0, 0.4], "behind"), ([5.0, 3.0, 3.5], "outside the view"), ([3.0, 3.0, 0.5], "level with the lens")],
+    [
+        ([3.0, 3.0, 0.4], "behind"),
+        ([5.0, 3.0, 3.5], "out of view"),
+        ([3.0, 3.0, 0.5], "level with the lens"),
+    ],
 )
-def test_a_disc_that_cannot_be_seen_has_no_image(center: list[float], why: str) -> None:
+def test_a_disc_out_of_sight_has_no_image(center: list[float], why: str) -> None:
     assert image_of_disc(Camera(), Pose((3.0, 3.0, 0.5)), np.array(center), 0.01) is None, why
 
 
@@ -164,12 +169,12 @@ DIAMOND = np.array([[0.0, -1.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
         (SQUARE, (0.5, 0.25), 0.5),  # the rectangle is inside
         (SQUARE, (2.0, 3.0), 4.0),  # the square is inside
         (SQUARE, (1.0, 1.0), 4.0),  # the same
-        (SQUARE + [1.5, 1.5], (1.0, 1.0), 0.25),  # corners overlap
+        (SQUARE + [1.5, 1.5], (1.0, 1.0), 0.25),  # vertices overlap
         (SQUARE + [2.0, 0.0], (1.0, 1.0), 0.0),  # they touch
-        (SQUARE + [3.0, 3.0], (1.0, 1.0), 0.0),  # apart, beyond a corner
+        (SQUARE + [3.0, 3.0], (1.0, 1.0), 0.0),  # apart, beyond a vertex
         (SQUARE + [0.0, 1.0], (1.0, 1.0), 2.0),  # sides run along each other
-        (DIAMOND, (0.5, 0.5), 1.0),  # its sides pass through the corners
-        (DIAMOND, (0.75, 0.75), 2 - 4 * 0.25**2),  # four corners cut off
+        (DIAMOND, (0.5, 0.5), 1.0),  # its sides pass through the vertices
+        (DIAMOND, (0.75, 0.75), 2 - 4 * 0.25**2),  # four vertices cut off
         (DIAMOND[::-1] + [1.0, 0.0], (1.0, 1.0), 1.0),  # clockwise; half of it
     ],
 )
@@ -178,7 +183,7 @@ def test_area_shared_by_rectangle_and_polygon(polygon: np.ndarray, half: tuple[f
 
 
 @given(st.floats(-2, 2), st.floats(-2, 2), st.floats(0.1, 2), st.floats(0.1, 2), st.floats(0, np.pi))
-def test_the_areas_in_a_rectangles_parts_add_up(x: float, y: float, w: float, h: float, angle: float) -> None:
+def test_areas_shared_with_parts_of_a_rectangle_add_up(x: float, y: float, w: float, h: float, angle: float) -> None:
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     quad = SQUARE @ turn.T + [x, y]
     quarters = [quad - [i * w / 2, j * h / 2] for i in (-1, 1) for j in (-1, 1)]
@@ -207,20 +212,20 @@ def test_every_shape_through_every_lens_covers_the_share_of_each_pixel(
 ) -> None:
     pose = Pose((3.0, 2.0, 0.5), 12.0, -8.0, 25.0)
     on_sensor = np.array(where) * [camera.width_px, camera.height_px] + [0.3, 0.7]
-    ray = rays_world(camera, pose, on_sensor)
+    ray = PosedCamera(camera, pose).rays_world(on_sensor)
     center = np.array(pose.position_m) + ray * (3.45 - 0.5) / ray[2]
     size = 15 * float(np.linalg.norm(center - pose.position_m)) / camera.focal_px  # about 30 px
     if isinstance(shape, Disc):
         shape = Disc(size * shape.radius_m)
     else:
         shape = Rectangle((size * shape.size_m[0], size * shape.size_m[1]), shape.yaw_deg)
-    image = coverage_of_led(camera, pose, center, shape)
+    image = coverage_of_led(PosedCamera(camera, pose), LedFace(center, shape))
     assert image is not None
     n = 64
     rows, columns = image.coverage.shape
-    u = image.column + (np.arange(columns * n) + 0.5) / n
-    v = image.row + (np.arange(rows * n) + 0.5) / n
-    rays = rays_world(camera, pose, np.stack(np.meshgrid(u, v), axis=-1))
+    u = image.roi.column + (np.arange(columns * n) + 0.5) / n
+    v = image.roi.row + (np.arange(rows * n) + 0.5) / n
+    rays = PosedCamera(camera, pose).rays_world(np.stack(np.meshgrid(u, v), axis=-1))
     xy = rays[..., :2] / rays[..., 2:] * (3.45 - 0.5) + np.array(pose.position_m[:2]) - center[:2]
     if isinstance(shape, Disc):
         inside = np.hypot(xy[..., 0], xy[..., 1]) < shape.radius_m
@@ -235,38 +240,41 @@ def test_every_shape_through_every_lens_covers_the_share_of_each_pixel(
     # and half a line of it at worst, and the change of scale within a pixel: less than 1e-3 here.
     assert np.sqrt((error[mixed] ** 2).mean()) < 3 * 0.3 / n**1.5
     assert np.abs(error).max() < 0.5 / n + 1e-3
-    assert abs(error.mean()) < 1e-4  # the grid errs either way, the coverage may not
+    assert abs(error.mean()) < 1e-4  # the errors of the grid have mean 0, and those of the coverage should
     assert mixed.sum() > 10
 
 
 @pytest.mark.parametrize("camera", LENSES.values(), ids=LENSES)
-def test_an_image_goes_on_beyond_the_sensor_where_asked(camera: Camera) -> None:
+def test_an_image_extends_into_the_margin_beyond_the_sensor(camera: Camera) -> None:
     pose = Pose((3.0, 2.0, 0.5), yaw_deg=10.0)
-    ray = rays_world(camera, pose, np.array([0.0, camera.height_px / 2]))  # half of it is off the left border
+    # half of it is off the left border
+    ray = PosedCamera(camera, pose).rays_world(np.array([0.0, camera.height_px / 2]))
     center = np.array(pose.position_m) + ray * 3.0 / ray[2]
     radius = 8 * float(np.linalg.norm(center - pose.position_m)) / camera.focal_px
     cut = image_of_disc(camera, pose, center, radius)
     whole = image_of_disc(camera, pose, center, radius, margin_px=20)
     assert cut is not None
     assert whole is not None
-    assert cut.column == 0
-    assert -20 <= whole.column < 0
-    assert np.array_equal(whole.coverage[:, -whole.column :], cut.coverage)
+    assert cut.roi.column == 0
+    assert -20 <= whole.roi.column < 0
+    assert np.array_equal(whole.coverage[:, -whole.roi.column :], cut.coverage)
     assert whole.visible_fraction == cut.visible_fraction
     assert cut.coverage.sum() / whole.coverage.sum() == pytest.approx(cut.visible_fraction, abs=1e-4)
 
 
-def test_a_level_square_of_whole_pixels_covers_them_and_nothing_else() -> None:
+def test_a_level_square_of_whole_pixels_covers_exactly_them() -> None:
     # 0.1 m at 3 m is 500 px; sides run along pixel borders
-    image = coverage_of_led(Camera(), Pose((3.0, 3.0, 0.5)), np.array([3.0, 3.0, 3.5]), Rectangle((0.1, 0.1)))
+    posed = PosedCamera(Camera(), Pose((3.0, 3.0, 0.5)))
+    image = coverage_of_led(posed, LedFace(np.array([3.0, 3.0, 3.5]), Rectangle((0.1, 0.1))))
     assert image is not None
     assert image.coverage.sum() == pytest.approx(250_000, rel=1e-9)
     assert image.coverage[1:-1, 1:-1].min() > 1 - 1e-9
 
 
-def test_a_turned_square_turns_from_x_towards_y() -> None:
+def test_yaw_rotates_a_rectangle_from_x_towards_y() -> None:
     # a long thin one turned by 45 deg runs from the upper left to the lower right: +x is +u, +y is +v
-    image = coverage_of_led(Camera(), Pose((3.0, 3.0, 0.5)), np.array([3.0, 3.0, 3.5]), Rectangle((0.02, 0.002), 45.0))
+    posed = PosedCamera(Camera(), Pose((3.0, 3.0, 0.5)))
+    image = coverage_of_led(posed, LedFace(np.array([3.0, 3.0, 3.5]), Rectangle((0.02, 0.002), 45.0)))
     assert image is not None
     rows, columns = np.indices(image.coverage.shape)
     u, v = columns - columns.mean(), rows - rows.mean()
@@ -280,15 +288,15 @@ COARSE_LENSES = LENSES | {
 
 
 @pytest.mark.parametrize("camera", COARSE_LENSES.values(), ids=COARSE_LENSES)
-def test_no_led_that_lights_a_pixel_is_left_out(camera: Camera, rng: np.random.Generator) -> None:
+def test_candidates_include_every_led_that_lights_a_pixel(camera: Camera, rng: np.random.Generator) -> None:
     centers = np.column_stack([rng.uniform(0, 7, (250, 2)), rng.uniform(2.5, 3.5, 250)])
     radii = rng.uniform(0.05, 0.5, 250)
-    candidates_in_vain = 0
+    false_candidates = 0
     for _ in range(8):
         pose = Pose((3.0, 3.0, 1.0), *rng.uniform(-40, 40, 2), rng.uniform(-180, 180))
-        candidates = leds_that_may_be_seen(camera, pose, centers, radii, margin_px=5.0)
+        candidates = candidate_leds(PosedCamera(camera, pose), centers, radii, margin_px=5.0)
         images = [image_of_disc(camera, pose, c, float(r), 5) for c, r in zip(centers, radii, strict=True)]
         seen = [i for i, image in enumerate(images) if image is not None]
         assert set(seen) <= set(candidates.tolist())
-        candidates_in_vain += len(candidates) - len(seen)
-    assert candidates_in_vain < 8 * 250 / 4
+        false_candidates += len(candidates) - len(seen)
+    assert false_candidates < 8 * 250 / 4

@@ -1,12 +1,13 @@
-"""The lens: falloff against solid angles, blur against similar triangles, Airy and energy."""
+"""The lens: relative illumination against solid angles, blur against similar triangles, Airy pattern and energy."""
 
 import numpy as np
 import pytest
 from scipy.special import j0, j1
 
 from vlcrender.camera.distortion import Distortion
-from vlcrender.camera.intrinsics import Camera, ray_of_pixel
-from vlcrender.camera.lens import blur, blur_kernel, defocus_diameter_px, relative_illumination
+from vlcrender.camera.intrinsics import Camera
+from vlcrender.camera.psf import blur, blur_kernel, defocus_diameter_px
+from vlcrender.camera.vignetting import relative_illumination
 from vlcrender.core.backend import dr, mi
 from vlcrender.core.planar_shapes import rectangle_polygon_area
 
@@ -20,23 +21,23 @@ LENSES = {
 
 
 @pytest.mark.parametrize("camera", LENSES.values(), ids=LENSES)
-def test_falloff_is_the_cosine_times_a_pixels_solid_angle(camera: Camera, rng: np.random.Generator) -> None:
+def test_relative_illumination_is_cosine_times_solid_angle(camera: Camera, rng: np.random.Generator) -> None:
     u, v = rng.uniform([[0], [0]], [[400], [300]], (2, 200))
     h = 1e-3
     corners = [
-        np.stack(ray_of_pixel(camera, u + i * h, v + j * h), axis=-1) for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1))
+        np.stack(camera.unproject(u + i * h, v + j * h), axis=-1) for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1))
     ]
     corners = [c / np.linalg.norm(c, axis=-1, keepdims=True) for c in corners]
     spread = np.cross(corners[2] - corners[0], corners[3] - corners[1])
     solid_angle = np.linalg.norm(spread, axis=-1) / 2 / (2 * h) ** 2
-    ray = np.stack(ray_of_pixel(camera, u, v), axis=-1)
+    ray = np.stack(camera.unproject(u, v), axis=-1)
     cosine = ray[:, 2] / np.linalg.norm(ray, axis=-1)
     # differences over 2 h = 2e-3 px: 2^-52 / (2e-3 / 167 px) = 2e-11, twice; curvature (2e-3 / 167)^2 is less
     expected = cosine * solid_angle * camera.focal_px**2
     assert np.allclose(relative_illumination(camera, u, v), expected, rtol=1e-8)
 
 
-def test_a_pinhole_falls_off_by_cos4_and_a_fisheye_as_it_should() -> None:
+def test_relative_illumination_is_cos4_of_a_pinhole_and_cos_sinc_of_a_fisheye() -> None:
     camera = Camera(**WIDE)
     u = 200 + camera.focal_px * np.tan(np.radians(20.0))
     assert relative_illumination(camera, u, 150.0) == pytest.approx(np.cos(np.radians(20.0)) ** 4)
@@ -48,17 +49,17 @@ def test_a_pinhole_falls_off_by_cos4_and_a_fisheye_as_it_should() -> None:
 
 
 @pytest.mark.parametrize("camera", LENSES.values(), ids=LENSES)
-def test_falloff_is_the_same_in_a_kernel(camera: Camera, rng: np.random.Generator) -> None:
+def test_relative_illumination_is_the_same_in_a_kernel(camera: Camera, rng: np.random.Generator) -> None:
     camera = camera.model_copy(update={"vignetting_deg": 50.0})
     u, v = rng.uniform([[0], [0]], [[400], [300]], (2, 500)).astype(np.float32)
     plain = relative_illumination(camera, u.astype(float), v.astype(float), luminance=7.0)
     kernel = relative_illumination(camera, mi.Float(u), mi.Float(v), dr, mi.Float(7.0)).numpy()
-    # float32: 2^-24 = 6e-8 an operation; acos near a closed pupil loses half the digits of what is left
+    # float32: 2^-24 = 6e-8 an operation; acos near a hidden pupil loses half the digits of the visible share
     assert np.abs(kernel - plain).max() < 7 * 1e-5
     assert kernel.min() >= 0
 
 
-def test_a_second_stop_closes_the_pupil() -> None:
+def test_a_second_stop_hides_the_pupil_step_by_step() -> None:
     camera = Camera(**WIDE, vignetting_deg=40.0)
     stop = np.tan(np.radians(40.0))
     open_camera = Camera(**WIDE)
@@ -67,11 +68,11 @@ def test_a_second_stop_closes_the_pupil() -> None:
     left = relative_illumination(camera, u, np.full(4, 150.0)) / relative_illumination(
         open_camera, u, np.full(4, 150.0)
     )
-    # two circles of which each passes through the other's centre share 2/3 - sqrt(3)/(2 pi) of one
+    # two circles, each through the centre of the other, share 2/3 - sqrt(3)/(2 pi) of one
     assert np.allclose(left, [1.0, 2 / 3 - np.sqrt(3) / (2 * np.pi), 0.0, 0.0], atol=1e-12)
 
 
-def test_the_pupils_overlap_counted() -> None:
+def test_the_visible_pupil_agrees_with_a_count() -> None:
     camera = Camera(**WIDE, vignetting_deg=40.0)
     s = 0.3
     u = 200 + camera.focal_px * np.tan(np.radians(40.0)) * s
@@ -112,7 +113,7 @@ KERNELS = {
 
 
 @pytest.mark.parametrize("camera", KERNELS.values(), ids=KERNELS)
-def test_a_kernel_is_odd_and_symmetric_and_keeps_the_light(camera: Camera) -> None:
+def test_a_kernel_is_odd_and_symmetric_with_sum_1(camera: Camera) -> None:
     kernel = blur_kernel(camera, 3.5)
     assert kernel is not None
     assert kernel.shape[0] == kernel.shape[1]
@@ -123,7 +124,7 @@ def test_a_kernel_is_odd_and_symmetric_and_keeps_the_light(camera: Camera) -> No
         assert np.allclose(kernel, other, atol=1e-15)
 
 
-def test_what_is_sharp_has_no_kernel() -> None:
+def test_a_point_in_focus_has_no_kernel() -> None:
     assert blur_kernel(Camera(), 3.5) is None
     assert blur_kernel(Camera(focus_distance_m=3.5), 3.5) is None
 
@@ -134,7 +135,7 @@ def second_moment(kernel: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("diameter", [4.0, 10.0, 35.0])
-def test_a_discs_second_moment_is_c2_over_16_and_a_pixels(diameter: float) -> None:
+def test_a_discs_second_moment_is_c2_over_16_plus_a_pixels(diameter: float) -> None:
     camera = Camera(focus_distance_m="infinity")
     depth = float(defocus_diameter_px(camera, 1.0)) / diameter
     kernel = blur_kernel(camera, depth)
@@ -164,7 +165,7 @@ def test_the_airy_pattern_is_dark_at_1_22_lambda_n() -> None:
     assert profile[30] < 1e-3  # averaged over a pixel: (pi / scale)^2 / 12 of the slope^2, 2e-4
     x = np.pi * np.arange(60) / scale_px + 1e-9
     assert np.allclose(profile[:60], (2 * j1(x) / x) ** 2, atol=2e-3)  # 1/24 of the curvature, (pi / scale)^2
-    # Encircled energy 1 - J0^2 - J1^2 at the first dark ring, of all; of what a circle of 150 px holds at the most
+    # Encircled energy 1 - J0^2 - J1^2 at the first dark ring, of all light; of the light within 150 px at most
     r = np.hypot(*np.meshgrid(np.arange(len(kernel)) - middle, np.arange(len(kernel)) - middle))
     v0, v150 = np.pi * 30 / scale_px, np.pi * 150 / scale_px
     encircled, held = (1 - j0(v) ** 2 - j1(v) ** 2 for v in (v0, v150))
@@ -172,14 +173,14 @@ def test_the_airy_pattern_is_dark_at_1_22_lambda_n() -> None:
 
 
 def test_a_pixels_share_of_a_small_airy_pattern() -> None:
-    """A pixel of Table 1's phone, 1.2 um at f/2.2, holds the square's share, here added up on a grid."""
+    """A pixel of Table 1's phone, 1.2 um at f/2.2, has the square's share, here summed on a grid."""
     kernel = blur_kernel(Camera(psf="diffraction"), 3.5)
     assert kernel is not None
     n = 400
     at = ((np.arange(n) + 0.5) / n - 0.5) * 1.2
     x = np.pi * np.hypot(*np.meshgrid(at, at)) / (0.55 * 2.2)
     share = ((2 * j1(x) / x) ** 2).mean() * 1.2**2 * np.pi / 4 / (0.55 * 2.2) ** 2
-    # the kernel makes up for up to AIRY_TAIL = 1 % left out
+    # the kernel is scaled up by the light left out, at most AIRY_TAIL = 1 %
     assert share < kernel.max() < share / 0.99
 
 
@@ -193,7 +194,7 @@ def test_diffraction_widens_with_the_wavelength_and_the_working_f_number() -> No
     assert peaks[2] == pytest.approx(peaks[1], rel=1e-9)
 
 
-def test_blur_keeps_the_light_of_a_patch_and_moves_it_nowhere(rng: np.random.Generator) -> None:
+def test_blur_keeps_the_light_and_the_centroid_of_a_patch(rng: np.random.Generator) -> None:
     kernel = blur_kernel(KERNELS["disc"], 3.5)
     assert kernel is not None
     patch = rng.random((40, 30)).astype(np.float32)
@@ -210,7 +211,7 @@ def test_blur_keeps_the_light_of_a_patch_and_moves_it_nowhere(rng: np.random.Gen
         assert after == pytest.approx(before, rel=1e-6)
 
 
-def test_blur_at_an_edge_goes_on_as_the_border_pixels_do(rng: np.random.Generator) -> None:
+def test_blur_with_border_edge_repeats_the_border_pixels(rng: np.random.Generator) -> None:
     kernel = blur_kernel(KERNELS["near disc"], 3.5)
     assert kernel is not None
     assert np.allclose(blur(np.full((50, 60), 7.0), kernel, "edge"), 7.0, rtol=1e-12)
@@ -223,7 +224,7 @@ def test_blur_at_an_edge_goes_on_as_the_border_pixels_do(rng: np.random.Generato
 
 
 @pytest.mark.parametrize("diameter", [1.0, 2.0, 4.0, 8.0, 16.0])
-def test_the_error_of_blurring_averages_is_bounded(diameter: float) -> None:
+def test_the_error_of_blurring_pixel_averages_is_bounded(diameter: float) -> None:
     """A sharp edge, exact in each pixel, then blurred, against the exact blurred edge averaged over pixels."""
     camera = Camera(focus_distance_m="infinity")
     kernel = blur_kernel(camera, float(defocus_diameter_px(camera, 1.0)) / diameter)
@@ -234,7 +235,7 @@ def test_the_error_of_blurring_averages_is_bounded(diameter: float) -> None:
     u, v = np.meshgrid(left, left)
     quads = np.stack([np.stack([u + i, v + j], -1) for i, j in ((0, 0), (1, 0), (1, 1), (0, 1))], 2).reshape(-1, 4, 2)
     fine = np.add.outer(left, (np.arange(8) + 0.5) / 8).ravel()
-    worst = 0.0
+    max_error = 0.0
     for angle in np.radians([0, 20, 45]):
         c, s = np.cos(angle), np.sin(angle)
         across = quads @ np.array([[c, -s], [s, c]])
@@ -245,8 +246,9 @@ def test_the_error_of_blurring_averages_is_bounded(diameter: float) -> None:
             truth = 0.5 + (t * np.sqrt(1 - t * t) + np.arcsin(t)) / np.pi
             truth = truth.reshape(pixels, 8, pixels, 8).mean(axis=(1, 3))
             inner = slice(m, pixels - m)
-            worst = max(
-                worst, float(np.abs(blur(sharp, kernel)[m : -m or None, m : -m or None] - truth)[inner, inner].max())
+            max_error = max(
+                max_error,
+                float(np.abs(blur(sharp, kernel)[m : -m or None, m : -m or None] - truth)[inner, inner].max()),
             )
-    assert worst < 0.2 / diameter**1.5
-    assert worst > 0  # it is an approximation
+    assert max_error < 0.2 / diameter**1.5
+    assert max_error > 0  # the kernel is an approximation

@@ -1,4 +1,4 @@
-"""The fast way against Mitsuba's own integrator where furniture stands and panes light the room."""
+"""`Renderer` against Mitsuba's path integrator with furniture and with glazings that light the room."""
 
 from pathlib import Path
 
@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from vlcrender.camera.intrinsics import Camera, Pose
-from vlcrender.camera.lens import relative_illumination
+from vlcrender.camera.posed_camera import PosedCamera
+from vlcrender.camera.vignetting import relative_illumination
 from vlcrender.config.toml_model import check
 from vlcrender.errors import InputError
 from vlcrender.rendering.path_traced import reference_cd_m2
@@ -32,7 +33,7 @@ v -0.2 -0.25 0.1\nv 0.2 -0.25 0.1\nv 0.2 0.25 0.1\nv -0.2 0.25 0.1
 f 1 3 2\nf 1 4 3\nf 5 6 7\nf 5 7 8
 f 1 2 6\nf 1 6 5\nf 2 3 7\nf 2 7 6\nf 3 4 8\nf 3 8 7\nf 4 1 5\nf 4 5 8
 """
-"""A closed box, 0.4 x 0.5 x 0.1 m; corners counter-clockwise as seen from outside."""
+"""A closed box, 0.4 x 0.5 x 0.1 m; vertices counter-clockwise as seen from outside."""
 
 
 def scene_of(folder: Path = Path(), **changes: object) -> Scene:
@@ -40,15 +41,15 @@ def scene_of(folder: Path = Path(), **changes: object) -> Scene:
 
 
 def both_ways(scene: Scene, camera: Camera, pose: Pose, samples: int) -> tuple[np.ndarray, ...]:
-    """In cd/m2, (rows, columns) each: the fast way, the reference, its variance; and which pixels LEDs light."""
-    reference, variance = reference_cd_m2(scene, camera, pose, samples)
+    """In cd/m2, (rows, columns) each: `Renderer`, the reference, its variance; and the pixels that LEDs light."""
+    reference, variance = reference_cd_m2(scene, PosedCamera(camera, pose), samples)
     rate = electron_rate_per_cd_m2(camera, "LED-B3", Silicon())
     u, v = np.meshgrid(np.arange(camera.width_px) + 0.5, np.arange(camera.height_px) + 0.5)
-    view = Renderer(scene).expected_image(camera, pose)
-    ours = view.expected_electrons(1.0) / rate / relative_illumination(camera, u, v)
+    mean = Renderer(scene).expected_image(PosedCamera(camera, pose))
+    ours = mean.expected_electrons(1.0) / rate / relative_illumination(camera, u, v)
     lit = np.zeros(ours.shape, dtype=bool)
-    for patch in (*view.patches, *view.parts[0].reflections):
-        lit[view.parts[0].roi.slices(patch.roi)] |= patch.electrons_per_s > 0
+    for patch in (*mean.patches, *mean.parts[0].reflections):
+        lit[mean.parts[0].roi.slices(patch.roi)] |= patch.electrons_per_s > 0
     return ours, reference, variance, lit
 
 
@@ -57,7 +58,7 @@ def blocks(*images: np.ndarray) -> list[np.ndarray]:
     return [image.reshape(9, 10, 12, 10).mean(axis=(1, 3)).ravel() for image in images]
 
 
-def test_furniture_hides_leds_and_is_lit_as_in_the_reference(tmp_path: Path) -> None:
+def test_furniture_occludes_leds_and_is_lit_as_in_the_reference(tmp_path: Path) -> None:
     (tmp_path / "box.obj").write_text(BOX)
     piece = {"file": "box.obj", "position_m": [1.6, 1.4, 1.6], "yaw_deg": 20.0, "reflectance": 0.6}
     places = [(x, y) for y in (1.0, 1.5, 2.0) for x in (1.0, 1.5, 2.0)]
@@ -72,20 +73,20 @@ def test_furniture_hides_leds_and_is_lit_as_in_the_reference(tmp_path: Path) -> 
     )
     alone = (
         Renderer(scene_of(led=leds))
-        .expected_image(Camera(**SMALL_VIEW), Pose((1.5, 1.5, 0.4), 4.0, -6.0, 30.0))
+        .expected_image(PosedCamera(Camera(**SMALL_VIEW), Pose((1.5, 1.5, 0.4), 4.0, -6.0, 30.0)))
         .patches
     )
-    # the box hides one LED at least in part: otherwise this would test nothing
+    # the box occludes one LED at least in part: otherwise nothing is tested
     assert lit.sum() < sum((patch.electrons_per_s > 0).sum() for patch in alone) - 10
 
     # LEDs: a pixel's share p of luminance L, sampled n times, has variance p (1 - p) L^2 / n <= |ours| L / n. Edges of
-    # the box against LEDs are 8 x 8 rays, 1.3 % of the step; 1 cd/m2 is for the bake.
+    # the box against LEDs are 8 x 8 rays, 1.3 % of the step; 1 cd/m2 is for the lightmap.
     bound = np.maximum(variance, ours * 8000 / samples) + 1.0 + (0.013 * 8000 * (ours < 7000)) ** 2
     z = (ours - reference)[lit] / np.sqrt(bound[lit])
     assert np.abs(z).max() < 6
 
-    # The room and the box, in blocks: noise of the reference (Student's t, 7 degrees of freedom); the bake's noise and
-    # interpolation 0.5 %: corners 0.1 m apart below LEDs 0.8 m away, second order (0.1 / 0.8)^2 / 8 = 0.2 %
+    # The room and the box, in blocks: noise of the reference (Student's t, 7 degrees of freedom); noise of the lightmap
+    # and interpolation 0.5 %: vertices 0.1 m apart below LEDs 0.8 m away, second order (0.1 / 0.8)^2 / 8 = 0.2 %
     kept = blocks(lit.astype(float))[0] == 0
     mine, theirs, spread = (b[kept] for b in blocks(ours, reference, variance))
     assert kept.sum() > 40
@@ -94,8 +95,8 @@ def test_furniture_hides_leds_and_is_lit_as_in_the_reference(tmp_path: Path) -> 
     assert abs((mine - theirs).mean()) < 5 * np.sqrt(spread.mean() / 100 / len(mine)) + 0.005 * theirs.mean()
 
 
-def test_the_light_that_a_pane_mirrors_is_as_in_the_reference() -> None:
-    """A pane of index 3 mirrors 40 % and more of an LED half a metre before it onto the floor, which is looked at."""
+def test_light_reflected_by_a_glazing_agrees_with_the_reference() -> None:
+    """A glazing of index 3 reflects 40 % and more of the light of an LED half a metre before it onto the floor."""
     led = {"id": 1, "position_m": [0.5, 1.5, 2.5], "radius_m": 0.15, "luminance_cd_m2": 8000.0}
     glazing = {
         "wall": "x=0",
@@ -109,16 +110,16 @@ def test_the_light_that_a_pane_mirrors_is_as_in_the_reference() -> None:
     ours, reference, variance, lit = both_ways(scene, Camera(**SMALL_VIEW), Pose((1.0, 1.5, 2.2), 180.0), 64)
     assert not lit.any()
     # The mean over all pixels: the reference's noise, the point source's (r / d)^2 = 0.4 %, and 0.5 % as above. Not
-    # block by block: the pane's border makes a half-shadow as wide as the LED, which a point source does not have.
+    # block by block: the glazing's border casts a penumbra as wide as the LED, which a point source does not have.
     allowed = 5 * np.sqrt(variance.mean() / variance.size) + 0.009 * reference.mean()
     assert abs((ours - reference).mean()) < allowed
-    # what is tested is there, and the tolerance does not hide it
+    # the reflected light exceeds the tolerance
     without = Renderer(scene_of(led=[led], room=dark, ambient=scene.settings.ambient.model_dump()))
-    plain = without.background_cd_m2(Camera(**SMALL_VIEW), Pose((1.0, 1.5, 2.2), 180.0))
+    plain = without.background_cd_m2(PosedCamera(Camera(**SMALL_VIEW), Pose((1.0, 1.5, 2.2), 180.0)))
     assert ours.mean() - plain.mean() > 3 * allowed
 
 
 def test_leds_that_are_not_lambertian_are_refused() -> None:
     led = {"id": 1, "position_m": [0.5, 1.5, 2.5], "radius_m": 0.1, "luminance_cd_m2": 8000.0, "half_power_deg": 40.0}
     with pytest.raises(InputError, match="half_power_deg"):
-        reference_cd_m2(scene_of(led=[led]), Camera(**SMALL_VIEW), Pose((1.0, 1.0, 1.0)), 8)
+        reference_cd_m2(scene_of(led=[led]), PosedCamera(Camera(**SMALL_VIEW), Pose((1.0, 1.0, 1.0))), 8)

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from conftest import ROOT
 
-from vlcrender.camera.intrinsics import Camera, Pose, project
-from vlcrender.camera.lens import relative_illumination
+from vlcrender.camera.intrinsics import Camera, Pose
+from vlcrender.camera.posed_camera import PosedCamera
+from vlcrender.camera.vignetting import relative_illumination
 from vlcrender.config.toml_model import check, read_toml
 from vlcrender.rendering.expected_image import LedPatch
 from vlcrender.rendering.renderer import Renderer
@@ -28,7 +29,7 @@ def room(folder: Path | None = None, **changes: object) -> Scene:
 
 
 def patch_of(scene: Scene, pose: Pose) -> LedPatch:
-    return Renderer(scene).expected_image(WIDE, pose).patches[0]
+    return Renderer(scene).expected_image(PosedCamera(WIDE, pose)).patches[0]
 
 
 def test_a_pane_reflects_by_fresnels_law() -> None:
@@ -48,10 +49,10 @@ def test_the_mirror_image_of_an_led_is_where_geometry_puts_it() -> None:
     renderer = Renderer(room(glazing=[PANE]))
     # towards the wall and up: the mirror image is 5 m away across and 2.5 m up
     pose = Pose((2.0, 3.4, 1.0), tilt_y_deg=-60.0)
-    view = renderer.expected_image(WIDE, pose)
+    view = renderer.expected_image(PosedCamera(WIDE, pose))
     (reflection,) = view.parts[0].reflections
     assert reflection.led_id == 1
-    expected, _ = project(WIDE, pose, np.array([-3.0, 3.5, 3.5]))
+    expected = PosedCamera(WIDE, pose).project(np.array([-3.0, 3.5, 3.5]))
     rows, columns = reflection.electrons_per_s.shape
     weight = reflection.electrons_per_s.sum(dtype=float)
     u = (reflection.electrons_per_s.sum(axis=0) * (reflection.column + 0.5 + np.arange(columns))).sum() / weight
@@ -70,12 +71,16 @@ def test_the_mirror_image_of_an_led_is_where_geometry_puts_it() -> None:
 def test_no_led_is_mirrored_where_the_pane_is_not() -> None:
     low = {**PANE, "corner_m": [0.5, 0.1], "size_m": [6.0, 0.5]}
     renderer = Renderer(room(glazing=[low]))
-    view = renderer.expected_image(WIDE, Pose((2.0, 3.4, 1.0), tilt_y_deg=-60.0))
+    view = renderer.expected_image(PosedCamera(WIDE, Pose((2.0, 3.4, 1.0), tilt_y_deg=-60.0)))
     assert not view.parts[0].reflections
 
 
 def test_a_reflection_flickers_with_its_led() -> None:
-    part = Renderer(room(glazing=[PANE])).expected_image(WIDE, Pose((2.0, 3.4, 1.0), tilt_y_deg=-60.0)).parts[0]
+    part = (
+        Renderer(room(glazing=[PANE]))
+        .expected_image(PosedCamera(WIDE, Pose((2.0, 3.4, 1.0), tilt_y_deg=-60.0)))
+        .parts[0]
+    )
     assert np.array_equal(part.expected_electrons(1e-3, {1: 0.0}), part.background_e_per_s * np.float32(1e-3))
 
 
@@ -87,7 +92,7 @@ def test_a_board_hides_as_much_of_an_led_as_it_covers(tmp_path: Path, edge_x: fl
     (tmp_path / "board.obj").write_text(text)
     piece = {"file": "board.obj", "position_m": [0.0, 0.0, 3.49]}
     camera = Camera(width_px=400, height_px=300, pixel_pitch_um=12.0)
-    view = Renderer(room(tmp_path, furniture=[piece])).expected_image(camera, Pose((3.0, 3.5, 0.5)))
+    view = Renderer(room(tmp_path, furniture=[piece])).expected_image(PosedCamera(camera, Pose((3.0, 3.5, 0.5))))
     seen = [patch for patch in view.patches if patch.led_id == 1]
     if share == 0:
         assert not seen
@@ -111,7 +116,7 @@ def test_a_board_between_pane_and_led_hides_as_much_of_the_false_image(
     piece = {"file": "board.obj", "position_m": [-0.02, 0.0, 3.49]}
     pose = Pose((2.0, 3.4, 1.0), tilt_y_deg=-60.0)
     scenes = room(tmp_path, glazing=[PANE], furniture=[piece]), room(glazing=[PANE])
-    hidden, free = (Renderer(scene).expected_image(WIDE, pose).parts[0].reflections for scene in scenes)
+    hidden, free = (Renderer(scene).expected_image(PosedCamera(WIDE, pose)).parts[0].reflections for scene in scenes)
     light = sum(r.electrons_per_s.sum(dtype=float) for r in hidden)
     # 64 rays a pixel of an image 9 px wide, and a disc seen under perspective: a few parts of a thousand
     assert light / free[0].electrons_per_s.sum(dtype=float) == pytest.approx(share, abs=0.02)
@@ -149,5 +154,5 @@ def test_a_panel_hung_low_hides_an_led_above_it() -> None:
     }
     panel |= {"reflectance": 0.7, "leds": {**leds, "luminance_cd_m2": [5000.0, 5000.0]}}
     lamps = [LAMP, {**LAMP, "id": 2, "position_m": [3.6, 3.5, 3.5]}]
-    view = Renderer(room(led=lamps, panels=[panel])).expected_image(WIDE, Pose((3.0, 3.5, 0.5)))
+    view = Renderer(room(led=lamps, panels=[panel])).expected_image(PosedCamera(WIDE, Pose((3.0, 3.5, 0.5))))
     assert sorted(patch.led_id for patch in view.patches) == [2, 10]

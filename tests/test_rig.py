@@ -1,4 +1,4 @@
-"""Cameras beside each other: where they are, what they see at once, and what each is told of gravity."""
+"""Rigs: poses of the cameras, frames of one shot, and the accelerometer reading of each camera."""
 
 import json
 from pathlib import Path
@@ -23,7 +23,7 @@ angles = st.floats(-179, 179)
 
 
 @given(angles, st.floats(-90, 90), angles)
-def test_a_pose_is_found_again_from_its_rotation(tilt_x: float, tilt_y: float, yaw: float) -> None:
+def test_pose_of_inverts_rotation(tilt_x: float, tilt_y: float, yaw: float) -> None:
     rotation = Pose((1, 2, 3), tilt_x, tilt_y, yaw).rotation
     again = pose_of(np.array([1.0, 2.0, 3.0]), rotation)
     assert again.position_m == (1, 2, 3)
@@ -54,7 +54,7 @@ def test_a_shot_is_a_row_for_each_camera(made: Path) -> None:
     assert [row["camera"] for row in frames] == ["main", "right", "aside"] * 2
 
 
-def test_truth_and_mounting_agree(made: Path) -> None:
+def test_truth_agrees_with_the_mounting(made: Path) -> None:
     """p_cam = R_cam_rig (p_rig - offset), by FORMAT.md alone."""
     cameras = json.loads((made / "dataset.json").read_text())["cameras"]
     frames = pq.read_table(made / "frames.parquet").to_pylist()
@@ -69,7 +69,7 @@ def test_truth_and_mounting_agree(made: Path) -> None:
         assert in_camera == pytest.approx(expected, abs=1e-9)
 
 
-def test_the_second_camera_sees_the_disparity(made: Path) -> None:
+def test_the_second_camera_has_the_disparity(made: Path) -> None:
     """f b / z: a camera 0.1 m to the right has each LED further left by 1500 px * 0.1 m / depth."""
     truth = pq.read_table(made / "truth.parquet").to_pylist()
     leds = {led["id"]: led["position_m"] for led in json.loads((made / "dataset.json").read_text())["led_map"]}
@@ -93,7 +93,7 @@ def test_a_shot_has_one_reading_in_the_axes_of_each_camera(made: Path) -> None:
 
 
 def test_each_frame_is_estimated_by_itself(made: Path) -> None:
-    """PnP, which gravity cannot mislead: each camera finds its own place, 0.02 px of 1500 px: millimetres."""
+    """PnP, which gravity cannot mislead: each camera estimates its own position, 0.02 px of 1500 px: millimetres."""
     rows = estimate_dataset(read_dataset(made), [VARIANTS["pnp"]], on_frame=lambda: None)["pnp"]
     truth = pq.read_table(made / "truth.parquet").to_pylist()
     found = [(row.position_m, true["position_m"]) for row, true in zip(rows, truth, strict=True) if row.position_m]

@@ -1,4 +1,4 @@
-"""Fewer, larger pixels of the same camera."""
+"""Recipes scaled to fewer, larger pixels of the same camera."""
 
 from pathlib import Path
 
@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from conftest import ROOT
 
-from vlcrender.camera.intrinsics import Pose, project, rays_world
+from vlcrender.camera.intrinsics import Pose
+from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.dataset.recipe import Recipe, ScaleMode, load_plan
 from vlcrender.errors import InputError
 from vlcrender.rendering.renderer import Renderer
@@ -21,17 +22,19 @@ def recipe(*assignments: str, scale: int = 1, mode: ScaleMode = "binned", path: 
     return load_plan(path, [*FULL, *assignments], scale, mode).recipe
 
 
-def test_every_point_lands_on_a_tenth_of_its_pixel() -> None:
+def test_pixel_positions_scale_with_the_pixels() -> None:
     """u' = u / 10 and v' = v / 10, with the principal point off centre and skew."""
     full, small = (recipe(*SKEWED, scale=scale).camera for scale in (1, 10))
     assert (small.width_px, small.height_px) == (80, 60)
     points = np.random.Generator(np.random.Philox(3)).uniform([2, 2, 2.5], [4, 4, 3.4], (50, 3))
     pose = Pose((3.0, 3.0, 0.5), 5.0, -3.0, 40.0)
-    assert project(small, pose, points)[0] == pytest.approx(project(full, pose, points)[0] / 10, rel=1e-12)
+    assert PosedCamera(small, pose).project(points) == pytest.approx(
+        PosedCamera(full, pose).project(points) / 10, rel=1e-12
+    )
 
 
-def test_keys_in_pixels_are_scaled_and_the_light_is_as_the_mode_says() -> None:
-    regions = ('windows={ kind = "leds", margin_px = 30 }', "poses.border_px=20")
+def test_keys_in_pixels_are_scaled_and_the_light_follows_the_mode() -> None:
+    regions = ('regions={ kind = "leds", margin_px = 30 }', "poses.border_px=20")
     full = recipe(*regions)
     binned, same = (recipe(*regions, scale=10, mode=mode) for mode in ("binned", "same-photons"))
     for small in (binned, same):
@@ -45,8 +48,8 @@ def test_keys_in_pixels_are_scaled_and_the_light_is_as_the_mode_says() -> None:
     assert same.sensor == full.sensor
 
 
-def test_a_metered_exposure_is_the_full_cameras(office: Scene) -> None:
-    """Binned pixels gather a hundred times the light in one time, by either metering; else a quick look is too dark.
+def test_a_metered_exposure_equals_that_of_the_full_camera(office: Scene) -> None:
+    """Binned pixels gather a hundred times the light in one time, by either metering; else a frame is too dark.
 
     In the middle of an image of an LED, 4 of the large pixels wide; across one light changes by the cos^4 of 10 of the
     small ones, below 4 tan(17 deg) 10 / 3000 = 0.4 %.
@@ -59,7 +62,7 @@ def test_a_metered_exposure_is_the_full_cameras(office: Scene) -> None:
     for metering in kinds.values():
         of_camera = ("camera.width_px=2000", "camera.height_px=1500", "camera.pixel_pitch_um=2.4")
         full, small = (recipe(*of_camera, *metering, scale=scale) for scale in (1, 10))
-        views = [Renderer(office).expected_image(r.camera, pose) for r in (full, small)]
+        views = [Renderer(office).expected_image(PosedCamera(r.camera, pose)) for r in (full, small)]
         times = [r.time_s(view) for r, view in zip((full, small), views, strict=True)]
         assert max(patch.roi.columns for patch in views[1].patches) > 4
         assert times[1] == pytest.approx(times[0], rel=4e-3)
@@ -72,13 +75,13 @@ def test_a_metered_exposure_is_the_full_cameras(office: Scene) -> None:
 def test_a_binned_pixel_holds_the_sum_of_its_pixels(office: Scene, pose: Pose, skewed: tuple[str, ...]) -> None:
     full, small = (recipe(*skewed, scale=scale) for scale in (1, 10))
     renderer = Renderer(office)
-    image = renderer.expected_image(full.camera, pose).expected_electrons(full.exposure_s).astype(float)
+    image = renderer.expected_image(PosedCamera(full.camera, pose)).expected_electrons(full.exposure_s).astype(float)
     sums = image.reshape(60, 10, 80, 10).sum(axis=(1, 3))
-    binned = renderer.expected_image(small.camera, pose).expected_electrons(small.exposure_s)
+    binned = renderer.expected_image(PosedCamera(small.camera, pose)).expected_electrons(small.exposure_s)
     # Two first-order errors of a pixel that an LED covers in part, f = 300 px. cos^4 is taken at its centre, its light
     # may be a quarter of a pixel off: 4 * 0.17 / (4 * 300) = 6e-4. Coverage is an area on the LED's plane, where the
     # pixel's far side counts for more by 3 tan(angle from the vertical) / 300; its half errs by 1/4 of it.
-    corners = rays_world(small.camera, pose, np.array([[0.0, 0.0], [80.0, 0.0], [0.0, 60.0], [80.0, 60.0]]))
+    corners = PosedCamera(small.camera, pose).rays_world(np.array([[0.0, 0.0], [80.0, 0.0], [0.0, 60.0], [80.0, 60.0]]))
     steepest = (np.hypot(corners[:, 0], corners[:, 1]) / corners[:, 2]).max()
     tolerance = (1e-3 + 3 * steepest / 300 / 4) * sums
     # Where surfaces meet, an 8 x 8 grid errs by 1.3 % of the step between them, which is at most the whole of the
@@ -87,14 +90,16 @@ def test_a_binned_pixel_holds_the_sum_of_its_pixels(office: Scene, pose: Pose, s
     off = np.abs(binned - sums) > tolerance
     assert off.mean() < 0.1
     assert (np.abs(binned - sums) <= tolerance + 4 * 0.013 * 2 * background).all()
-    assert binned.max() > 5 * background, "an LED has to be in view"
+    assert binned.max() > 5 * background, "an LED must be in view"
 
 
 def test_same_photons_in_a_larger_pixel(office: Scene) -> None:
     pose = Pose((3.15, 3.1, 0.6), 6, -8, 20)
     renderer = Renderer(office)
     full, small = recipe(), recipe(scale=10, mode="same-photons")
-    images = [renderer.expected_image(r.camera, pose).expected_electrons(r.exposure_s) for r in (full, small)]
+    images = [
+        renderer.expected_image(PosedCamera(r.camera, pose)).expected_electrons(r.exposure_s) for r in (full, small)
+    ]
     assert np.median(images[1]) == pytest.approx(np.median(images[0]), rel=0.02)
 
 

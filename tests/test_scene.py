@@ -9,6 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from vlcrender.camera.intrinsics import Camera, Pose
+from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.config.toml_model import check
 from vlcrender.errors import InputError
 from vlcrender.light.lightmap import room_mesh
@@ -186,7 +187,7 @@ def test_a_square_led_counts_as_seen_only_with_its_corners() -> None:
     for shape in ("disc", "square"):
         tree = {**tomllib.loads(TABLE1), "led": [{**led, "shape": shape}]}
         scene = build_scene(check(tree, SceneSettings, "test"), "test")
-        seen[shape] = len(leds_in_view(Camera(), pose, scene))
+        seen[shape] = len(leds_in_view(PosedCamera(Camera(), pose), scene))
     assert seen == {"disc": 1, "square": 0}
 
 

@@ -7,12 +7,14 @@ import pytest
 from PIL import Image
 from test_path_traced import ROOM, SMALL_VIEW, blocks, both_ways, scene_of
 
-from vlcrender.camera.intrinsics import Camera, Pose, project, rays_world
-from vlcrender.camera.lens import relative_illumination
+from vlcrender.camera.intrinsics import Camera, Pose
+from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.roi import Roi
+from vlcrender.camera.vignetting import relative_illumination
 from vlcrender.errors import InputError
 from vlcrender.light.lightmap import Lightmap, bake, room_mesh
 from vlcrender.rendering.background import Background
+from vlcrender.rendering.electron_rates import ElectronRates
 from vlcrender.scene.loader import Scene
 from vlcrender.scene.mesh import mesh_of_surfaces
 from vlcrender.scene.texture import Texture, read_reflectances
@@ -61,7 +63,7 @@ def brute_force(texture: Texture, camera: Camera, pose: Pose, grid: int) -> np.n
     for a in within:
         for b in within:
             u, v = np.meshgrid(np.arange(camera.width_px) + a, np.arange(camera.height_px) + b)
-            ray = rays_world(camera, pose, np.stack([u, v], axis=-1))
+            ray = PosedCamera(camera, pose).rays_world(np.stack([u, v], axis=-1))
             point = np.array(pose.position_m) + ray * ((2.5 - pose.position_m[2]) / ray[..., 2:])
             at = texture.at_px(point) - 0.5
             whole = np.floor(at).astype(int)
@@ -89,16 +91,17 @@ def test_a_view_of_a_texture_errs_by_less_than_a_hundredth_of_the_shot_noise(
     """
     scene = papered(tmp_path, speckled(), (0.6, 0.6))
     camera = Camera(width_px=80, height_px=60, pixel_pitch_um=pitch_um)
-    images, labels = evenly_lit(scene, 440.0).images(camera, pose, (Roi.of_sensor(camera),), (0.0, 4000 / 16000))
+    rates = ElectronRates(led=0.0, ambient=4000 / 16000)
+    (region,) = evenly_lit(scene, 440.0).regions(PosedCamera(camera, pose), (Roi.of_sensor(camera),), rates)
     texture = scene.surfaces[1].texture
     assert texture is not None
     # brute force itself errs by 0.3 / 24^1.5 = 0.25 % of a step in a pixel with an edge: 1e-4 of the shot noise
     u, v = np.meshgrid(np.arange(80) + 0.5, np.arange(60) + 0.5)
     expected = brute_force(texture, camera, pose, 24) * 440 / np.pi * 4000 / 16000 * relative_illumination(camera, u, v)
-    seen = labels[0] == 1
+    seen = region.surfaces == 1
     seen[1:-1, 1:-1] &= seen[2:, 1:-1] & seen[:-2, 1:-1] & seen[1:-1, 2:] & seen[1:-1, :-2]  # no wall in the pixel
     assert seen.sum() > 500
-    error = (images[0] - expected)[seen]
+    error = (region.image - expected)[seen]
     assert (error**2).mean() < 0.01 * expected[seen].mean()
     if pose.yaw_deg == 0 and pitch_um == 1.2:
         # sides along the image's, and finer: linear interpolation itself, to float32's 2.5 m * 6e-8 / 4.7 mm
@@ -124,11 +127,12 @@ def test_an_image_lies_as_written(tmp_path: Path, name: str, place: list[float],
         at[1 if place[0] in (0.0, 3.0) and place[1] == 0.4 else 0] += 0.025
     scene = papered(tmp_path, image, (0.6, 0.3), name)
     camera = Camera(width_px=400, height_px=300, pixel_pitch_um=20.0)
-    background, _ = evenly_lit(scene, 100.0).images(camera, pose, (Roi.of_sensor(camera),), (0.0, 1.0))
-    pixel, _ = project(camera, pose, at)
+    rates = ElectronRates(led=0.0, ambient=1.0)
+    (region,) = evenly_lit(scene, 100.0).regions(PosedCamera(camera, pose), (Roi.of_sensor(camera),), rates)
+    pixel = PosedCamera(camera, pose).project(at)
     u, v = np.meshgrid(np.arange(400) + 0.5, np.arange(300) + 0.5)
     near = np.hypot(u - pixel[0], v - pixel[1]) < 25
-    light = background[0] * near
+    light = region.image * near
     assert light.sum() > 0.1 * 100 / np.pi
     found = np.array([(light * u).sum(), (light * v).sum()]) / light.sum()
     # the spot is 22 px wide: half a pixel is far less than any wrong turn, which moves it by tiles

@@ -10,8 +10,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
-from vlcrender.camera.intrinsics import Camera, Pose, project, rays_world
-from vlcrender.camera.lens import relative_illumination
+from vlcrender.camera.intrinsics import Camera, Pose
+from vlcrender.camera.posed_camera import PosedCamera
+from vlcrender.camera.vignetting import relative_illumination
 from vlcrender.rendering.path_traced import reference_cd_m2
 from vlcrender.rendering.renderer import Renderer
 from vlcrender.scene.loader import Scene
@@ -24,7 +25,7 @@ REFERENCE_SAMPLES = 128
 WHITE_E = 4000.0
 
 
-def show_pose(scene: Scene, camera: Camera) -> Pose:
+def show_pose(scene: Scene, camera: Camera) -> PosedCamera:
     """A level pose on the floor that sees as many LEDs as can be, of those under the middle of LEDs near each other."""
     best, most = None, -1
     centers = scene.leds.centers_m
@@ -34,10 +35,10 @@ def show_pose(scene: Scene, camera: Camera) -> Pose:
         for center in centers[order]:
             near = centers[np.linalg.norm(centers - center, axis=1) < 0.5]
             x, y = near[:, :2].mean(axis=0)
-            pose = Pose((float(x), float(y), 0.05), yaw_deg=yaw)
-            count = len(leds_in_view(camera, pose, scene))
+            posed = PosedCamera(camera, Pose((float(x), float(y), 0.05), yaw_deg=yaw))
+            count = len(leds_in_view(posed, scene))
             if count > most:
-                best, most = pose, count
+                best, most = posed, count
     assert best is not None  # a scene has at least one LED
     return best
 
@@ -47,21 +48,22 @@ def draw(scene: Scene, camera: Camera, path: Path, reference: bool = False) -> N
 
     With `reference` the view is path-traced by Mitsuba, slowly and in larger pixels.
     """
-    pose = show_pose(scene, camera)
+    posed = show_pose(scene, camera)
     electrons: NDArray[Any]
     if reference:
-        electrons = _reference_electrons(scene, camera, pose)
+        electrons = _reference_electrons(scene, posed)
     else:
-        electrons = Renderer(scene).expected_image(camera, pose).expected_electrons(EXPOSURE_S)
+        electrons = Renderer(scene).expected_image(posed).expected_electrons(EXPOSURE_S)
     figure = Figure(figsize=(14, 6.2), layout="constrained")
     plan, image = figure.subplots(1, 2, width_ratios=[1, 1.25])
-    discs = _draw_plan(plan, scene, camera, pose)
+    discs = _draw_plan(plan, scene, posed)
     figure.colorbar(discs, ax=plan, label="LED luminance, cd/m$^2$", shrink=0.8)
-    _draw_view(image, scene, camera, pose, electrons)
+    _draw_view(image, scene, posed, electrons)
     figure.savefig(path, dpi=110)
 
 
-def _draw_plan(axes: Axes, scene: Scene, camera: Camera, pose: Pose) -> EllipseCollection:
+def _draw_plan(axes: Axes, scene: Scene, posed: PosedCamera) -> EllipseCollection:
+    camera, pose = posed.camera, posed.pose
     x_m, y_m, z_m = scene.room_m
     undersides = [s for s in scene.surfaces if s.name.endswith("underside")]
     axes.add_patch(Rectangle((0, 0), x_m, y_m, fill=False, lw=1.5))
@@ -90,7 +92,7 @@ def _draw_plan(axes: Axes, scene: Scene, camera: Camera, pose: Pose) -> EllipseC
     discs.set_array(leds.luminances_cd_m2)
     axes.add_collection(discs)
     size = np.array([camera.width_px, camera.height_px])
-    rays = rays_world(camera, pose, size * np.array([[0, 0], [1, 0], [1, 1], [0, 1]]))
+    rays = posed.rays_world(size * np.array([[0, 0], [1, 0], [1, 1], [0, 1]]))
     reach = (scene.leds.centers_m[:, 2].mean() - pose.position_m[2]) / rays[:, 2]
     footprint = np.array(pose.position_m[:2]) + rays[:, :2] * reach[:, None]
     axes.add_collection(PolyCollection([footprint], facecolors="none", edgecolors="tab:blue", linewidths=1.5))
@@ -106,7 +108,8 @@ def _draw_plan(axes: Axes, scene: Scene, camera: Camera, pose: Pose) -> EllipseC
     return discs
 
 
-def _reference_electrons(scene: Scene, camera: Camera, pose: Pose) -> NDArray[np.float64]:
+def _reference_electrons(scene: Scene, posed: PosedCamera) -> NDArray[np.float64]:
+    camera = posed.camera
     coarse = camera.model_copy(
         update={
             "width_px": camera.width_px // REFERENCE_SCALE,
@@ -114,7 +117,7 @@ def _reference_electrons(scene: Scene, camera: Camera, pose: Pose) -> NDArray[np
             "pixel_pitch_um": camera.pixel_pitch_um * REFERENCE_SCALE,
         }
     )
-    cd_m2, _ = reference_cd_m2(scene, coarse, pose, REFERENCE_SAMPLES)
+    cd_m2, _ = reference_cd_m2(scene, PosedCamera(coarse, posed.pose), REFERENCE_SAMPLES)
     u, v = np.meshgrid(np.arange(coarse.width_px) + 0.5, np.arange(coarse.height_px) + 0.5)
     # electrons of a pixel of the real size; both spectra as the LEDs'
     rate = electron_rate_per_cd_m2(camera, scene.settings.led_spectrum, Silicon())
@@ -122,7 +125,8 @@ def _reference_electrons(scene: Scene, camera: Camera, pose: Pose) -> NDArray[np
     return electrons
 
 
-def _draw_view(axes: Axes, scene: Scene, camera: Camera, pose: Pose, electrons: NDArray[Any]) -> None:
+def _draw_view(axes: Axes, scene: Scene, posed: PosedCamera, electrons: NDArray[Any]) -> None:
+    camera, pose = posed.camera, posed.pose
     block = max(1, electrons.shape[1] // 1000)
     rows, columns = (n // block * block for n in electrons.shape)
     small = electrons[:rows, :columns].reshape(rows // block, block, columns // block, block).mean(axis=(1, 3))
@@ -133,9 +137,9 @@ def _draw_view(axes: Axes, scene: Scene, camera: Camera, pose: Pose, electrons: 
         vmax=1,
         extent=(0, camera.width_px, camera.height_px, 0),
     )
-    for index in leds_in_view(camera, pose, scene):
+    for index in leds_in_view(posed, scene):
         led_id = int(scene.leds.ids[index])
-        center, _ = project(camera, pose, scene.leds.centers_m[index])
+        center = posed.project(scene.leds.centers_m[index])
         axes.annotate(
             str(led_id),
             (float(center[0]), float(center[1])),

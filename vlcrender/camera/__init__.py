@@ -1,4 +1,4 @@
-"""Cameras: intrinsics, lens distortion and blur, rigs of several cameras, and regions of interest of their sensors.
+"""Cameras: intrinsics, projections, poses, lens blur, rigs of several cameras, and regions of interest.
 
-Maps world points to pixels and pixels to rays. Nothing here knows about light, scenes or files.
+Maps world points to pixels and pixels to rays. Depends on neither light, scenes nor files.
 """

@@ -1,36 +1,35 @@
-"""The camera: intrinsics, pose, and the one place that turns our axes into Mitsuba's.
+"""Cameras and poses: intrinsics, and the tilts of Huynh & Yoo 2016.
 
 Camera axes are OpenCV's: x right, y down, z forward. The level pose looks straight up with R_cam_world = I.
 Pixels are continuous (u, v) = (column, row), (0, 0) at the image's top-left corner, pixel centres at +0.5.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, ValidationError, ValidatorFunctionWrapHandler, WrapValidator, model_validator
 
-from vlcrender.camera.distortion import Distortion, distort, fold_radius2, folds, undistort
+from vlcrender.camera.distortion import Distortion
+from vlcrender.camera.projection import Equidistant, FieldOfView, Perspective, Projection
 from vlcrender.config.toml_model import Settings
 
 Pixels = Annotated[int, Field(ge=8, le=20000)]
 Positive = Annotated[float, Field(gt=0, le=1e6)]
 
-MITSUBA_FROM_OPENCV = np.diag([-1.0, -1.0, 1.0])
-"""Mitsuba's camera looks along +z with x to the image's left and y up; ours has x right and y down."""
-
-BEYOND_SENSOR = 1 / 20
-"""A lens has to be sane out to this share of the sensor's width and height beyond its borders."""
-ON_AXIS = 1e-30
-"""Added to squared radii: 0 / 0 on the axis becomes its limit, and nothing else changes, in float32 as in float64."""
+SENSOR_MARGIN = 1 / 20
+"""Share of the sensor's width and height beyond its borders out to which a lens has to be valid."""
+BORDER_POINTS = 65
+"""Pixel positions along each side of a border whose field of view is wanted."""
 
 
 def _number_or_infinity(value: Any, handler: ValidatorFunctionWrapHandler) -> Any:
     try:
         return handler(value)
     except ValidationError:
-        # a union's own errors name its members, of which a TOML file knows nothing
+        # A union's own errors name its members, which are not in the TOML file.
         raise ValueError('has to be a distance in m above 0, or "infinity"') from None
 
 
@@ -41,28 +40,36 @@ class Camera(Settings):
     """A camera and its lens. The defaults are Table 1 of Huynh & Yoo 2016 at f/2.2, sharp everywhere."""
 
     width_px: Pixels = 4000
+    """Columns of the sensor."""
     height_px: Pixels = 3000
+    """Rows of the sensor."""
     pixel_pitch_um: Positive = 1.2
+    """Side of a pixel, um; pixels are square."""
     focal_length_mm: Positive = 18.0
+    """Focal length of the lens, mm."""
     f_number: Annotated[float, Field(ge=0.5, le=100)] = 2.2
+    """Focal length over the diameter of the pupil."""
     principal_point_px: tuple[float, float] | None = None
-    """Where the optical axis meets the image; the image's centre where not given."""
+    """Pixel (u, v) where the optical axis meets the sensor; the image's centre where not given."""
     skew_px: Annotated[float, Field(ge=-1e4, le=1e4)] = 0.0
+    """Skew of the pixel axes, K[0, 1], px."""
     transmittance: Annotated[float, Field(gt=0, le=1)] = 0.9
-    """Of the lens, at all wavelengths."""
+    """Transmittance of the lens, the same at all wavelengths."""
 
     projection: Literal["perspective", "equidistant"] = "perspective"
-    """How far from the axis light at field angle theta lands: f_i tan(theta), or f_i theta (a fish-eye lens)."""
+    """Distance from the axis of the image at field angle theta: f_i tan(theta), or f_i theta (a fish-eye lens)."""
     distortion: Distortion | None = None
+    """Brown-Conrady distortion of a perspective lens; none where not given."""
     focus_distance_m: FocusDistance = None
-    """From the projection centre to what is sharp, or "infinity". Everything is sharp where not given."""
+    """Distance from the projection centre to the plane of focus, m, or "infinity"; all is sharp where not given."""
     psf: Literal["none", "diffraction", "measured"] = "none"
-    """What a sharp point of light becomes: a point, the Airy pattern, or `psf_kernel`."""
+    """Point spread function in focus: a point, the Airy pattern, or `psf_kernel`."""
     psf_wavelength_nm: Annotated[float, Field(ge=200, le=2000)] = 550.0
+    """Wavelength of the Airy pattern, nm."""
     psf_kernel: tuple[tuple[Annotated[float, Field(ge=0, le=1)], ...], ...] | None = None
-    """Rows of an odd number of pixels each, as many rows, that add up to 1; `psf` has to be "measured"."""
+    """Measured point spread function: an odd number of rows, as many columns, sum 1; with psf = "measured" only."""
     vignetting_deg: Annotated[float, Field(gt=0, lt=90)] | None = None
-    """Field angle at which a second stop hides the whole pupil. Nothing hides it where not given."""
+    """Field angle at which a second stop hides the whole pupil, deg; no mechanical vignetting where not given."""
 
     @model_validator(mode="after")
     def _principal_point_is_near_the_image(self) -> Self:
@@ -98,23 +105,20 @@ class Camera(Settings):
         return self
 
     @model_validator(mode="after")
-    def _every_pixel_has_oneray_of_sensor(self) -> Self:
-        x, y = pixel_on_sensor(self, *_pixels_in_and_around(self))
-        if self.projection == "equidistant":
-            if self.distortion is not None:
-                raise ValueError('distortion: is for projection = "perspective" only')
-            widest = float(np.degrees(np.hypot(x, y).max()))
-            if widest >= 180:
-                raise ValueError(
-                    f'projection = "equidistant": the sensor reaches {widest:.0f} deg off the axis, 180 are too many'
-                )
-        elif self.distortion is not None and folds(self.distortion, x, y):
-            given = ", ".join(f"{key} = {value:g}" for key, value in self.distortion if value)
-            raise ValueError(
-                f"distortion: {given} folds the image on or near the sensor; the distorted radius has to grow with "
-                f"the radius out to {BEYOND_SENSOR:.0%} beyond the borders"
-            )
+    def _every_pixel_has_one_direction(self) -> Self:
+        if self.projection == "equidistant" and self.distortion is not None:
+            raise ValueError('distortion: is for projection = "perspective" only')
+        across = np.linspace(-SENSOR_MARGIN, 1 + SENSOR_MARGIN, 33)
+        u, v = np.meshgrid(across * self.width_px, across * self.height_px)
+        problem = self.lens_projection.problem_on(*self.sensor_position(u, v))
+        if problem is not None:
+            raise ValueError(f"{problem} out to {SENSOR_MARGIN:.0%} beyond the sensor's borders")
         return self
+
+    @property
+    def lens_projection(self) -> Projection:
+        """The mapping between directions and positions on the sensor that `projection` names."""
+        return Equidistant() if self.projection == "equidistant" else Perspective(self.distortion)
 
     @property
     def center_px(self) -> tuple[float, float]:
@@ -123,7 +127,7 @@ class Camera(Settings):
 
     @property
     def image_distance_mm(self) -> float:
-        """f_i = f s / (s - f), from the pupil to the sensor; the focal length where focused at infinity or nowhere."""
+        """f_i = f s / (s - f), from the pupil to the sensor; the focal length where the focus is infinity or none."""
         if not isinstance(self.focus_distance_m, float):
             return self.focal_length_mm
         focus_mm = self.focus_distance_m * 1000
@@ -136,7 +140,7 @@ class Camera(Settings):
 
     @property
     def working_f_number(self) -> float:
-        """f_i / D: what counts for exposure and diffraction. The f-number where focused at infinity or nowhere."""
+        """f_i / D, for exposure and diffraction; the f-number where the focus is infinity or none."""
         return self.f_number * (self.image_distance_mm / self.focal_length_mm)
 
     @property
@@ -151,27 +155,87 @@ class Camera(Settings):
         return np.array([[self.focal_px, self.skew_px, u], [0.0, self.focal_px, v], [0.0, 0.0, 1.0]])
 
     def view_angles_deg(self) -> tuple[float, float]:
-        """Full angles across and down of a sensor centred on the axis.
+        """Full angles of view across and down, for a sensor centred on the axis.
 
-        Huynh & Yoo 2016, Eq. 15, for a pinhole, which gives 15.19 deg for their camera, not 24.
+        Huynh & Yoo 2016, Eq. 15, for a pinhole: 15.19 deg for their camera, not the printed 24.
         """
         half = np.array([-0.5, 0.5])
         zero = np.zeros(2)
-        x, _, zx = ray_of_sensor(self, half * self.width_px / self.focal_px, zero)
-        _, y, zy = ray_of_sensor(self, zero, half * self.height_px / self.focal_px)
+        lens = self.lens_projection
+        x, _, zx = lens.unproject(half * self.width_px / self.focal_px, zero)
+        _, y, zy = lens.unproject(zero, half * self.height_px / self.focal_px)
         left, right = np.degrees(np.arctan2(x, zx))
         top, bottom = np.degrees(np.arctan2(y, zy))
         return float(right - left), float(bottom - top)
 
+    def sensor_position(self, u: Any, v: Any) -> tuple[Any, Any]:
+        """Position on the sensor, K^-1 [u, v, 1]: (x, y) from the axis in units of f_i. Arrays as in `unproject`."""
+        # Python floats: a NumPy scalar times a Dr.Jit array would become a NumPy array
+        inverse = np.linalg.inv(self.matrix).tolist()
+        x = inverse[0][0] * u + inverse[0][1] * v + inverse[0][2]
+        y = inverse[1][1] * v + inverse[1][2]
+        return x, y
+
+    def unproject(self, u: Any, v: Any, xp: Any = np) -> tuple[Any, Any, Any]:
+        """Direction (x, y, z) in camera axes of pixel positions (u, v), elementwise.
+
+        `u` and `v` are arrays of any shape, NumPy's with `xp` = numpy or Dr.Jit's with `xp` = drjit. Perspective:
+        z = 1. Equidistant: unit length, with z < 0 beyond 90 deg off the axis. Valid to SENSOR_MARGIN outside the
+        sensor.
+        """
+        return self.lens_projection.unproject(*self.sensor_position(u, v), xp)
+
+    def project(self, x: Any, y: Any, z: Any, xp: Any = np) -> tuple[Any, Any]:
+        """Pixel position (u, v) of a point (x, y, z) in camera axes, any unit. Arrays as in `unproject`.
+
+        The caller knows that the lens images the point: see `image_of_points`.
+        """
+        x, y = self.lens_projection.project(x, y, z, xp)
+        (fx, skew, cx), (_, fy, cy), _ = self.matrix.tolist()
+        return x * fx + y * skew + cx, y * fy + cy
+
+    def image_of_points(self, p_cam: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Pixel positions (..., 2) of points (..., 3) in camera axes; NaN where the lens does not image the point.
+
+        A perspective lens images points before it, within the radius where its distortion folds the image; an
+        equidistant lens all points but those straight behind it.
+        """
+        x, y, z = p_cam[..., 0], p_cam[..., 1], p_cam[..., 2]
+        with np.errstate(all="ignore"):
+            imaged = self.lens_projection.images(x, y, z)
+            pixels = np.stack(self.project(x, y, z), axis=-1)
+        return np.where(imaged[..., None], pixels, np.nan)
+
+    def field_of_view(self, margin_px: float = 0.0) -> FieldOfView:
+        """Directions from which light reaches the sensor or up to `margin_px` beside it."""
+        return _field_of_view(self, margin_px)
+
+
+@lru_cache(maxsize=64)
+def _field_of_view(camera: Camera, margin_px: float) -> FieldOfView:
+    t = np.linspace(0.0, 1.0, BORDER_POINTS)
+    u = -margin_px + t * (camera.width_px + 2 * margin_px)
+    v = -margin_px + t * (camera.height_px + 2 * margin_px)
+    u_border = np.concatenate([u, u, np.full(BORDER_POINTS, u[0]), np.full(BORDER_POINTS, u[-1])])
+    v_border = np.concatenate([np.full(BORDER_POINTS, v[0]), np.full(BORDER_POINTS, v[-1]), v, v])
+    return camera.lens_projection.field_of_view(*camera.sensor_position(u_border, v_border))
+
 
 @dataclass(frozen=True)
 class Pose:
-    """Where the camera is: projection centre in the world, and tilts as in Huynh & Yoo 2016, Eq. 5."""
+    """Position and attitude of a camera: R_cam_world = Rx(tilt_x) Ry(tilt_y) Rz(yaw), Huynh & Yoo 2016, Eq. 5.
+
+    The level pose looks straight up, with +x of the room to the right in the image and +y down.
+    """
 
     position_m: tuple[float, float, float]
+    """Projection centre, world, m."""
     tilt_x_deg: float = 0.0
+    """Raising it moves the image of an LED overhead to +v, deg."""
     tilt_y_deg: float = 0.0
+    """Raising it moves the image of an LED overhead to -u, deg."""
     yaw_deg: float = 0.0
+    """Raising it turns the image from +u towards -v, deg."""
 
     @property
     def rotation(self) -> NDArray[np.float64]:
@@ -180,104 +244,13 @@ class Pose:
 
 
 def rotation_cam_world(tilt_x_deg: float, tilt_y_deg: float, yaw_deg: float) -> NDArray[np.float64]:
-    """Rx(tilt_x) Ry(tilt_y) Rz(yaw) in the paper's signs: raising tilt_x moves a lamp overhead to +v, tilt_y to -u."""
+    """Rx(tilt_x) Ry(tilt_y) Rz(yaw) in the paper's signs: raising tilt_x moves an LED image to +v, tilt_y to -u."""
     a, b, c = np.radians([tilt_x_deg, tilt_y_deg, yaw_deg])
     rx = np.array([[1, 0, 0], [0, np.cos(a), np.sin(a)], [0, -np.sin(a), np.cos(a)]])
     ry = np.array([[np.cos(b), 0, -np.sin(b)], [0, 1, 0], [np.sin(b), 0, np.cos(b)]])
     rz = np.array([[np.cos(c), np.sin(c), 0], [-np.sin(c), np.cos(c), 0], [0, 0, 1]])
     product: NDArray[np.float64] = rx @ ry @ rz
     return product
-
-
-def ray_of_pixel(camera: Camera, u: Any, v: Any, xp: Any = np) -> tuple[Any, Any, Any]:
-    """Direction (x, y, z) in camera axes in which a pixel position (u, v) looks, elementwise.
-
-    `u` and `v` are arrays of any shape, NumPy's with `xp` = numpy or Dr.Jit's with `xp` = drjit. Perspective: z = 1.
-    Equidistant: unit length; beyond 90 deg off the axis z is negative. Valid to BEYOND_SENSOR outside the sensor.
-    """
-    return ray_of_sensor(camera, *pixel_on_sensor(camera, u, v), xp)
-
-
-def pixel_on_sensor(camera: Camera, u: Any, v: Any) -> tuple[Any, Any]:
-    """Where pixel positions (u, v) are on the sensor: K^-1 applied to them, from the axis, in units of f_i."""
-    # Python floats: a NumPy scalar times a Dr.Jit array would become a NumPy array
-    inverse = np.linalg.inv(camera.matrix).tolist()
-    x = inverse[0][0] * u + inverse[0][1] * v + inverse[0][2]
-    y = inverse[1][1] * v + inverse[1][2]
-    return x, y
-
-
-def ray_of_sensor(camera: Camera, x: Any, y: Any, xp: Any = np) -> tuple[Any, Any, Any]:
-    """`ray_of_pixel` of a place on the sensor, as `pixel_on_sensor` gives it."""
-    if camera.projection == "equidistant":
-        theta = xp.sqrt(x * x + y * y + ON_AXIS)
-        scale = xp.sin(theta) / theta
-        return x * scale, y * scale, xp.cos(theta)
-    if camera.distortion is not None:
-        x, y = undistort(camera.distortion, x, y)
-    return x, y, 1.0 + 0.0 * x
-
-
-def pixel_of_point(camera: Camera, x: Any, y: Any, z: Any, xp: Any = np) -> tuple[Any, Any]:
-    """Where a point (x, y, z) in camera axes, any unit, is imaged: (u, v) in pixels. Arrays as in `ray_of_pixel`.
-
-    Says nothing of whether the lens images the point at all: see `image_of_points`.
-    """
-    if camera.projection == "equidistant":
-        radius = xp.sqrt(x * x + y * y + ON_AXIS)
-        scale = xp.atan2(radius, z) / radius
-        x, y = x * scale, y * scale
-    else:
-        x, y = x / z, y / z
-        if camera.distortion is not None:
-            x, y = distort(camera.distortion, x, y)
-    (fx, skew, cx), (_, fy, cy), _ = camera.matrix.tolist()
-    return x * fx + y * skew + cx, y * fy + cy
-
-
-def image_of_points(camera: Camera, p_cam: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Pixels (..., 2) of points (..., 3) in camera axes; NaN for those the lens does not image.
-
-    A perspective lens images what is in front of it, as far out as its distortion does not fold the image; an
-    equidistant lens everything but what is straight behind it.
-    """
-    x, y, z = p_cam[..., 0], p_cam[..., 1], p_cam[..., 2]
-    with np.errstate(all="ignore"):
-        if camera.projection == "equidistant":
-            seen = (z > 0) | (x != 0) | (y != 0)
-        else:
-            seen = z > 0
-            if camera.distortion is not None:
-                seen &= x * x + y * y < fold_radius2(camera.distortion) * z * z
-        pixels = np.stack(pixel_of_point(camera, x, y, z), axis=-1)
-    return np.where(seen[..., None], pixels, np.nan)
-
-
-def project(
-    camera: Camera, pose: Pose, points_m: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Project world points (..., 3): pixels (..., 2), NaN as in `image_of_points`, and depth z_cam in metres."""
-    p_cam = transform(pose.rotation, points_m - np.array(pose.position_m))
-    return image_of_points(camera, p_cam), p_cam[..., 2]
-
-
-def rays_world(camera: Camera, pose: Pose, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Directions in the world of pixels (..., 2), shape (..., 3), as long as `ray_of_pixel` makes them."""
-    return np.stack(ray_world(camera, pose, pixels[..., 0], pixels[..., 1]), axis=-1)
-
-
-def ray_world(camera: Camera, pose: Pose, u: Any, v: Any) -> tuple[Any, Any, Any]:
-    """`rays_world` as (x, y, z) of NumPy arrays u and v that broadcast, which is faster for megapixels of a window."""
-    x, y, z = ray_of_pixel(camera, u, v)
-    east, north, up = (x * r[0] + y * r[1] + z * r[2] for r in pose.rotation.T)
-    return east, north, up
-
-
-def _pixels_in_and_around(camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """A grid (33, 33) of pixel positions out to BEYOND_SENSOR outside the sensor."""
-    across = np.linspace(-BEYOND_SENSOR, 1 + BEYOND_SENSOR, 33)
-    u, v = np.meshgrid(across * camera.width_px, across * camera.height_px)
-    return u, v
 
 
 def transform(matrix: NDArray[np.float64], vectors: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -289,11 +262,3 @@ def transform(matrix: NDArray[np.float64], vectors: NDArray[np.float64]) -> NDAr
         vectors[..., 0:1] * matrix[:, 0] + vectors[..., 1:2] * matrix[:, 1] + vectors[..., 2:3] * matrix[:, 2]
     )
     return result
-
-
-def mitsuba_to_world(pose: Pose) -> NDArray[np.float64]:
-    """Mitsuba's `to_world` of a sensor at this pose, shape (4, 4), a proper rotation."""
-    matrix = np.eye(4)
-    matrix[:3, :3] = pose.rotation.T @ MITSUBA_FROM_OPENCV
-    matrix[:3, 3] = pose.position_m
-    return matrix

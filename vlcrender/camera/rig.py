@@ -1,4 +1,4 @@
-"""Cameras that are rigidly mounted beside each other and exposed at once; the rig's axes are those of `main`."""
+"""Rigs: cameras mounted rigidly beside each other and exposed at once. The axes of a rig are the axes of `main`."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -8,43 +8,48 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from vlcrender.camera.intrinsics import Camera, Pose, rotation_cam_world
+from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.config.toml_model import Settings
 
 MAIN = "main"
 Offset = Annotated[float, Field(ge=-10, le=10)]
 Angle = Annotated[float, Field(ge=-180, le=180)]
 GIMBAL_LOCK = 1e-9
-"""cos(tilt_y) below which tilt_x and yaw turn about one axis, and all is given to yaw."""
+"""cos(tilt_y) below which tilt_x and yaw turn about the same axis; the whole turn is then yaw."""
 
 
 class RigCamera(Settings):
     """A camera beside `main`."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_-]{0,49}$")]
+    """Name of the camera: a letter, then at most 49 letters, digits, "_" or "-"; not "main"."""
     offset_m: tuple[Offset, Offset, Offset]
-    """Its projection centre in the axes of `main`."""
+    """Projection centre in the axes of `main`, m."""
     tilt_x_deg: Angle = 0.0
+    """tilt_x of R_cam_rig = Rx(tilt_x) Ry(tilt_y) Rz(yaw), deg, with the signs of a pose's R_cam_world."""
     tilt_y_deg: Angle = 0.0
+    """tilt_y of R_cam_rig, deg."""
     yaw_deg: Angle = 0.0
-    """R_cam_rig = Rx(tilt_x) Ry(tilt_y) Rz(yaw), as a pose's R_cam_world."""
+    """yaw of R_cam_rig, deg."""
     camera: Camera | None = None
-    """The same as `main` where not given."""
+    """The camera; the same as `main` where not given."""
 
 
 @dataclass(frozen=True)
 class Mounted:
-    """A camera with its place on the rig: p_cam = R_cam_rig @ (p_rig - offset_m)."""
+    """A camera mounted on a rig: p_cam = R_cam_rig @ (p_rig - offset_m)."""
 
     name: str
     camera: Camera
     rotation: NDArray[np.float64]
     offset_m: NDArray[np.float64]
 
-    def pose(self, main: Pose) -> Pose:
-        """Where this camera is when `main` is there."""
+    def posed(self, main: Pose) -> PosedCamera:
+        """This camera at its pose, for a pose of `main`."""
         if self.name == MAIN:
-            return main
-        return pose_of(np.array(main.position_m) + main.rotation.T @ self.offset_m, self.rotation @ main.rotation)
+            return PosedCamera(self.camera, main)
+        position_m = np.array(main.position_m) + main.rotation.T @ self.offset_m
+        return PosedCamera(self.camera, pose_of(position_m, self.rotation @ main.rotation))
 
 
 def mounted_cameras(main: Camera, rig: tuple[RigCamera, ...]) -> tuple[Mounted, ...]:

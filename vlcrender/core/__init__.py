@@ -1,4 +1,4 @@
-"""Foundations without a subject of their own: Mitsuba and Dr.Jit, random keys, planar shapes, quantities with errors.
+"""Foundations: Mitsuba and Dr.Jit, random keys, planar shapes, and quantities with standard errors.
 
-Counter-based random numbers make every draw reproducible alone and in any order.
+Random numbers are counter-based, so that every draw is reproducible alone and in any order.
 """

@@ -1,28 +1,30 @@
-"""Random numbers by counter: those of a pixel depend on a key, on the pixel, and on nothing else.
+"""Random numbers by counter, for Dr.Jit kernels: a pixel's numbers depend on a key, the pixel, and nothing else.
 
-So a window of a frame gets the numbers that the whole frame would, in any order and on any number of threads. Philox
-4x32-10 (Salmon et al., Parallel random numbers: as easy as 1, 2, 3, SC 2011), keyed by a hash of a text. Within
-Dr.Jit kernels; callers hold `backend.exact_math`.
+A region of a frame therefore gets the numbers of the whole frame, in any order and on any number of threads. Generator:
+Philox 4x32-10 (Salmon et al., Parallel random numbers: as easy as 1, 2, 3, SC 2011). Callers hold `backend.exact_math`.
 """
 
-import hashlib
 from typing import Any
 
 from vlcrender.core.backend import dr, mi
+from vlcrender.core.random_keys import KERNEL_KEY_BITS, key_number
 
 PHILOX: Any = mi.Philox4x32
-"""To be used as it is in a loop, through which its objects carry no state."""
+"""Mitsuba's generator. Loops construct it afresh each turn, since its objects carry no state through a loop."""
 
 
-def seed_of(key: str) -> Any:
-    """A text as a 64-bit key, UInt64 of one element. As data: a literal would make a kernel of each."""
-    return dr.opaque(mi.UInt64, int.from_bytes(hashlib.blake2b(key.encode(), digest_size=8).digest(), "little"))
+def kernel_seed(*parts: int | str) -> Any:
+    """Seed of the key with these parts (`random_keys.random_key`), UInt64 of one element.
+
+    The seed is data of the kernel: a literal would compile a new kernel for each key.
+    """
+    return dr.opaque(mi.UInt64, key_number(KERNEL_KEY_BITS, *parts))
 
 
-def places(shape: tuple[int, ...], row: int, column: int) -> tuple[Any, Any]:
-    """Column and row in the frame of each pixel of a window of this shape (rows, columns), flat, UInt32.
+def pixel_indices(shape: tuple[int, ...], row: int, column: int) -> tuple[Any, Any]:
+    """Column and row in the frame of each pixel of a region of this shape (rows, columns), flat, UInt32.
 
-    The window starts at (row, column), which may be negative: numbers go round at 2^32.
+    The region starts at (row, column), which may be negative: numbers are taken modulo 2^32.
     """
     columns, first_row, first_column = (dr.opaque(mi.UInt32, number % 2**32) for number in (shape[1], row, column))
     index = dr.arange(mi.UInt32, shape[0] * shape[1])
@@ -31,11 +33,11 @@ def places(shape: tuple[int, ...], row: int, column: int) -> tuple[Any, Any]:
 
 
 def normals(seed: Any, column: Any, row: Any) -> tuple[Any, Any]:
-    """Two independent standard normal numbers a place, Float32 (Box & Muller, Ann. Math. Stat. 29 (1958) 610).
+    """Two independent standard normal numbers a pixel, Float32 (Box & Muller, Ann. Math. Stat. 29 (1958) 610).
 
-    Uniforms have 23 bits, so that no number is beyond sqrt(2 ln 2^24) = 5.8, where 1e-8 of all would be.
+    seed: of `kernel_seed`; column, row: UInt32. Uniform numbers have 23 bits, so that no normal number is beyond
+    sqrt(2 ln 2^24) = 5.8, where a share of 1e-8 would lie.
     """
     u = PHILOX(seed, column, row, mi.UInt32(0), iterations=10).next_float32x4()
-    radius = dr.sqrt(-2.0 * dr.log(1.0 - u[0]))
-    sine, cosine = dr.sincos(2.0 * dr.pi * u[1])
-    return radius * cosine, radius * sine
+    normal = mi.warp.square_to_std_normal(mi.Point2f(u[0], u[1]))
+    return normal.x, normal.y

@@ -1,4 +1,4 @@
-"""Shapes of LED faces in their own plane, and the exact area each shares with a polygon."""
+"""Shapes of LED faces in their own plane, and the exact area that each shares with a polygon."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 BEYOND_HORIZON_M = 1e8
-"""Farther away than any LED: where a ray meets the LEDs' plane nowhere."""
+"""Distance beyond every LED, m: of a ray that does not meet the LEDs' plane."""
 
 
 @dataclass(frozen=True)
@@ -18,23 +18,21 @@ class Disc:
 
     radius_m: float
 
-    @property
-    def reach_m(self) -> float:
-        """From its centre to the farthest point."""
-        return self.radius_m
-
     def rim(self, points: int) -> Array:
         """Points of the rim (points, 2), relative to the centre, evenly spaced."""
         angles = np.linspace(0.0, 2 * np.pi, points, endpoint=False)
         return self.radius_m * np.stack([np.cos(angles), np.sin(angles)], axis=1)
 
     def image_area_px(self, outline: Array) -> float:
-        """Area of the image, of which `outline` (points, 2) is the rim: the polygon and the arcs it cuts off."""
+        """Area of the image with this rim, `outline` (points, 2): the polygon and the segments beyond its sides."""
         step = 2 * np.pi / len(outline)
         return _polygon_area(outline) * step / float(np.sin(step))
 
     def whole_and_mixed(self, x: Array, y: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Which cells of a grid of corners (rows + 1, columns + 1) are inside whole, which others may be in part."""
+        """Masks of cells that are inside whole, and of others that may be in part.
+
+        x, y: of the cells' corners, (rows + 1, columns + 1).
+        """
         distance = np.hypot(x, y)
         farthest = _corner_extreme(distance, np.maximum)
         whole = farthest <= self.radius_m
@@ -46,40 +44,38 @@ class Disc:
         return whole, near & ~whole & (farthest < BEYOND_HORIZON_M)
 
     def shared_area(self, quads: Array) -> Array:
-        """Area common to the face and each polygon (n, corners, 2) in its plane, (n,)."""
+        """Area that the face shares with each polygon (n, vertices, 2) in its plane, (n,)."""
         return circle_polygon_area(quads, self.radius_m)
 
 
 @dataclass(frozen=True)
 class Rectangle:
-    """A rectangular LED face, `size_m` along x and y of the room, turned by `yaw_deg` from x towards y."""
+    """A rectangular LED face, `size_m` along x and y of the room, rotated by `yaw_deg` from x towards y."""
 
     size_m: tuple[float, float]
     yaw_deg: float = 0.0
 
-    @property
-    def reach_m(self) -> float:
-        """From its centre to the farthest point."""
-        return float(np.hypot(*self.size_m)) / 2
-
     def rim(self, points: int) -> Array:
-        """Points of the rim (points, 2), relative to the centre, a quarter of them on each side, corners included."""
+        """Points of the rim (points, 2), relative to the centre, a quarter of them on each side, vertices included."""
         along = np.linspace(-1, 1, points // 4, endpoint=False)
         side = np.stack([along, -np.ones_like(along)], axis=1)
         quarter_turn = np.array([[0, 1], [-1, 0]])
         sides = [side]
         for _ in range(3):
             sides.append(sides[-1] @ quarter_turn)
-        return self._turned(np.concatenate(sides) * np.array(self.size_m) / 2, 1)
+        return self._rotated(np.concatenate(sides) * np.array(self.size_m) / 2, 1)
 
     def image_area_px(self, outline: Array) -> float:
         """Area of the image, of which `outline` (points, 2) is the rim."""
         return _polygon_area(outline)
 
     def whole_and_mixed(self, x: Array, y: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Which cells of a grid of corners (rows + 1, columns + 1) are inside whole, which others may be in part."""
+        """Masks of cells that are inside whole, and of others that may be in part.
+
+        x, y: of the cells' corners, (rows + 1, columns + 1).
+        """
         if self.yaw_deg != 0:
-            x, y = np.moveaxis(self._turned(np.stack([x, y], axis=-1), -1), -1, 0)
+            x, y = np.moveaxis(self._rotated(np.stack([x, y], axis=-1), -1), -1, 0)
         whole = np.ones((x.shape[0] - 1, x.shape[1] - 1), dtype=bool)
         mixed = whole.copy()
         for own, size in zip((x, y), self.size_m, strict=True):
@@ -88,17 +84,17 @@ class Rectangle:
                 mixed &= ~_corner_extreme(beyond, np.logical_and)
         mixed &= ~whole
         row, column = np.nonzero(mixed)
-        for own in (x, y):  # no cell is as large as that, but where a corner is beyond the horizon
+        for own in (x, y):  # only a cell with a corner beyond the horizon is as large as that
             corners = np.stack([own[row + i, column + j] for i in (0, 1) for j in (0, 1)])
             mixed[row, column] &= np.ptp(corners, axis=0) < BEYOND_HORIZON_M / 2
         return whole, mixed
 
     def shared_area(self, quads: Array) -> Array:
-        """Area common to the face and each polygon (n, corners, 2) in its plane, (n,)."""
+        """Area that the face shares with each polygon (n, vertices, 2) in its plane, (n,)."""
         width, depth = self.size_m
-        return rectangle_polygon_area(self._turned(quads, -1), width / 2, depth / 2)
+        return rectangle_polygon_area(self._rotated(quads, -1), width / 2, depth / 2)
 
-    def _turned(self, points: Array, sense: int) -> Array:
+    def _rotated(self, points: Array, sense: int) -> Array:
         if self.yaw_deg == 0:
             return points
         c, s = np.cos(np.radians(self.yaw_deg)), sense * np.sin(np.radians(self.yaw_deg))
@@ -107,10 +103,10 @@ class Rectangle:
 
 
 def circle_polygon_area(polygons: Array, radius: float) -> Array:
-    """Area common to the disc of this radius about the origin and each polygon.
+    """Area that the disc of this radius about the origin shares with each polygon.
 
-    polygons: (n, corners, 2), any orientation. Returns (n,), >= 0. Sum over the edges of the signed area that the disc
-    shares with the triangle of the origin and that edge: straight where the edge is inside, a sector where outside.
+    polygons: (n, vertices, 2), any orientation. Returns (n,), >= 0. Sum over the edges of the signed area that the disc
+    shares with the triangle of the origin and the edge: a triangle where the edge is inside, a sector where outside.
     """
     p = polygons
     q = np.roll(polygons, -1, axis=1)
@@ -126,7 +122,7 @@ def circle_polygon_area(polygons: Array, radius: float) -> Array:
     a = p + enter[..., None] * edge
     b = p + leave[..., None] * edge
     inside = _cross(a, b) / 2
-    # b is q where q is inside, but for rounding, which near the centre turns a direction as far as it likes.
+    # b is q where q is inside, except for rounding, which near the centre may change its direction by any angle.
     at_center = (q**2).sum(-1) < (1e-3 * radius) ** 2
     outside = radius**2 / 2 * (_angle(p, a) + np.where(at_center, 0.0, _angle(b, q)))
     area: Array = np.abs((inside + outside).sum(axis=1))
@@ -134,18 +130,18 @@ def circle_polygon_area(polygons: Array, radius: float) -> Array:
 
 
 def rectangle_polygon_area(polygons: Array, half_x: float, half_y: float) -> Array:
-    """Area common to the rectangle |x| <= half_x, |y| <= half_y and each polygon.
+    """Area that the rectangle |x| <= half_x, |y| <= half_y shares with each polygon.
 
-    polygons: (n, corners, 2), any orientation. Returns (n,), >= 0. Every point is moved to the rectangle's nearest one:
-    what is inside stays, what is outside collapses onto the rectangle's sides and encloses nothing. The polygon that
-    this makes of each has new corners where an edge crosses a side's line. Continuous also where edges coincide.
+    polygons: (n, vertices, 2), any orientation. Returns (n,), >= 0. Every point is moved to the rectangle's nearest
+    point: points inside stay, points outside collapse onto the rectangle's sides and enclose no area. The moved polygon
+    has additional vertices where an edge crosses the line of a side. The result is continuous where edges coincide.
     """
     limits = np.array([half_x, half_y])
     p = polygons
     edge = np.roll(polygons, -1, axis=1) - p
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
         crossings = np.concatenate([(-limits - p) / edge, (limits - p) / edge], axis=-1)
-    # an edge along a side crosses it nowhere
+    # an edge parallel to a side does not cross it
     crossings = np.clip(np.nan_to_num(crossings, nan=0.0, posinf=0.0, neginf=0.0), 0.0, 1.0)
     t = np.concatenate([np.zeros((*p.shape[:-1], 1)), np.sort(crossings, axis=-1)], axis=-1)
     moved = np.clip(p[:, :, None] + t[..., None] * edge[:, :, None], -limits, limits).reshape(len(p), 5 * p.shape[1], 2)
@@ -169,12 +165,12 @@ def quadrilateral_area(quads: Array) -> Array:
     return area
 
 
-def _polygon_area(corners: Array) -> float:
-    u, v = corners.T
+def _polygon_area(vertices: Array) -> float:
+    u, v = vertices.T
     return abs(float(np.dot(u, np.roll(v, -1)) - np.dot(v, np.roll(u, -1)))) / 2
 
 
-def _corner_extreme(values: NDArray[Any], of: np.ufunc) -> NDArray[Any]:
-    """Of each cell's four corners, on a grid of corners (rows + 1, columns + 1)."""
-    extreme: NDArray[Any] = of(of(values[:-1, :-1], values[:-1, 1:]), of(values[1:, :-1], values[1:, 1:]))
+def _corner_extreme(values: NDArray[Any], reduce: np.ufunc) -> NDArray[Any]:
+    """Reduce values at cell corners (rows + 1, columns + 1) over the four corners of each cell, (rows, columns)."""
+    extreme: NDArray[Any] = reduce(reduce(values[:-1, :-1], values[:-1, 1:]), reduce(values[1:, :-1], values[1:, 1:]))
     return extreme

@@ -1,4 +1,4 @@
-"""A measured value with its standard error, and what becomes of the error in ratios and lines."""
+"""Measured values with standard errors, and the propagation of the errors."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -7,24 +7,24 @@ import numpy as np
 
 
 class Quantity(NamedTuple):
-    """A value as measured, and its standard error."""
+    """A measured value and its standard error."""
 
     value: float
     error: float
 
     def over(self, other: "Quantity") -> "Quantity":
-        """The ratio to another quantity, their errors independent."""
+        """The ratio to another quantity with an independent error."""
         ratio = self.value / other.value
         return Quantity(ratio, float(np.hypot(self.error, ratio * other.error) / abs(other.value)))
 
     def times(self, factor: "float | Quantity") -> "Quantity":
-        """The product with a number, as into another unit, or with another quantity, their errors independent."""
+        """The product with a number, or with another quantity with an independent error."""
         other = factor if isinstance(factor, Quantity) else Quantity(factor, 0.0)
         error = float(np.hypot(self.error * other.value, self.value * other.error))
         return Quantity(self.value * other.value, error)
 
     def plus(self, other: "Quantity") -> "Quantity":
-        """The sum with another quantity, their errors independent."""
+        """The sum with another quantity with an independent error."""
         return Quantity(self.value + other.value, float(np.hypot(self.error, other.error)))
 
 
@@ -34,5 +34,5 @@ def line(x: Sequence[float], y: Sequence[Quantity]) -> tuple[Quantity, Quantity]
     design = np.stack([np.ones(len(x)), np.array(x)], axis=1) / errors[:, None]
     covariance = np.linalg.inv(design.T @ design)
     intercept, slope = covariance @ design.T @ (values / errors)
-    of_intercept, of_slope = np.sqrt(covariance.diagonal())
-    return Quantity(float(intercept), float(of_intercept)), Quantity(float(slope), float(of_slope))
+    intercept_error, slope_error = np.sqrt(covariance.diagonal())
+    return Quantity(float(intercept), float(intercept_error)), Quantity(float(slope), float(slope_error))

@@ -10,8 +10,8 @@ import numpy as np
 
 from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.rig import Mounted
-from vlcrender.camera.roi import Roi
-from vlcrender.core.random_keys import stream
+from vlcrender.camera.roi import RegionImage, Roi
+from vlcrender.core.random_keys import random_key, stream
 from vlcrender.dataset.downlink import decoded_spots
 from vlcrender.dataset.files import EXPECTED, FRAMES, PREVIEWS, PROCESSED, exr_attributes, write_exr, write_preview
 from vlcrender.dataset.motion import poses_during
@@ -20,7 +20,7 @@ from vlcrender.dataset.recipe import Recipe
 from vlcrender.light.lightmap import bake
 from vlcrender.rendering.bayer import MosaicRenderer
 from vlcrender.rendering.crlb import position_bound_m2
-from vlcrender.rendering.expected_image import ExpectedImage, Image
+from vlcrender.rendering.expected_image import ExpectedImage
 from vlcrender.rendering.renderer import Renderer
 from vlcrender.scene.loader import Scene, build_scene
 from vlcrender.scene.schema import SceneSettings
@@ -51,9 +51,9 @@ def make_frame(job: Job, frame: int) -> Record:
     camera, sensor = mounted.camera, Roi.of_sensor(mounted.camera)
     seen = _seen(job, pose_number, which)
     main, pose, view, exposure_s, expected = seen.main, seen.pose, seen.view, seen.exposure_s, seen.expected
-    noise = f"{recipe.seed}/{frame}/shot-noise"
+    noise = random_key(recipe.seed, frame, "shot-noise")
     dn = [
-        (roi, expose(recipe.sensor, image, noise, roi.row, roi.column, exposure_s, mounted.name))
+        RegionImage(roi, expose(recipe.sensor, image, noise, roi.row, roi.column, exposure_s, mounted.name))
         for roi, image in expected
     ]
     attributes = exr_attributes(camera, mounted.name, exposure_s, frame)
@@ -105,7 +105,7 @@ class _Seen:
     pose: Pose
     view: ExpectedImage
     exposure_s: float
-    expected: list[tuple[Roi, Image]]
+    expected: list[RegionImage]
     bound_m2: list[float] | None
 
 
@@ -115,11 +115,12 @@ def _seen(job: Job, pose_number: int, which: int) -> _Seen:
     recipe, renderer = _renderer(job.recipe_json, job.scene_json, job.scene_folder)
     mounted = recipe.cameras[which]
     main, during = poses_of(recipe, renderer.scene, pose_number, which)
-    view = renderer.expected_image(mounted.camera, mounted.pose(main), recipe.regions, during)
+    posed = mounted.posed(main)
+    view = renderer.expected_image(posed, recipe.regions, during)
     exposure_s = recipe.time_s(view)
-    expected = [(part.roi, part.expected_electrons(exposure_s)) for part in view.parts]
+    expected = [RegionImage(part.roi, part.expected_electrons(exposure_s)) for part in view.parts]
     bound = _bound_m2(recipe, renderer, mounted, main, exposure_s, expected)
-    return _Seen(main, mounted.pose(main), view, exposure_s, expected, bound)
+    return _Seen(main, posed.pose, view, exposure_s, expected, bound)
 
 
 def _bound_m2(
@@ -128,22 +129,21 @@ def _bound_m2(
     mounted: Mounted,
     main: Pose,
     exposure_s: float,
-    expected: Sequence[tuple[Roi, Image]],
+    expected: Sequence[RegionImage],
 ) -> list[float] | None:
     """The frame's Cramér-Rao bound, row by row; None where it is not asked for or nothing is determined."""
     if not recipe.bound:
         return None
-    position = np.array(mounted.pose(main).position_m)
+    at = mounted.posed(main)
     bound = position_bound_m2(
-        mounted.camera,
+        mounted,
         main,
-        lambda pose: renderer.led_patches(mounted.camera, mounted.pose(pose), recipe.regions, mounted.pose(main)),
+        lambda posed: renderer.led_patches(posed, recipe.regions, at.pose),
         exposure_s,
-        [(roi, variance_e2(recipe.sensor, image, exposure_s)) for roi, image in expected],
-        float(np.median(np.linalg.norm(renderer.scene.leds.centers_m - position, axis=1))),
+        [RegionImage(roi, variance_e2(recipe.sensor, image, exposure_s)) for roi, image in expected],
+        float(np.median(np.linalg.norm(renderer.scene.leds.centers_m - at.position_m, axis=1))),
         recipe.accelerometer.tilt_errors_deg(main),
         recipe.regions is not None and recipe.regions.overscan,
-        mounted.pose,
     )
     return None if bound is None else bound.ravel().tolist()
 

@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from vlcrender.camera.intrinsics import Camera, Pose, project, rays_world
+from vlcrender.camera.intrinsics import Pose
+from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.rig import Mounted, pose_of
 from vlcrender.config.toml_model import Settings
 from vlcrender.errors import InputError
@@ -46,9 +47,9 @@ def poses_during(
     Raises InputError where the image moves too far.
     """
     if motion is None:
-        return (mounted.pose(middle),)
-    ends = [mounted.pose(motion.pose_at(middle, time_s)) for time_s in (-exposure_s / 2, exposure_s / 2)]
-    way_px = _longest_way_px(mounted.camera, ends, scene)
+        return (mounted.posed(middle).pose,)
+    ends = [mounted.posed(motion.pose_at(middle, time_s)) for time_s in (-exposure_s / 2, exposure_s / 2)]
+    way_px = _longest_way_px(ends, scene)
     steps = max(1, int(np.ceil(way_px / STEP_PX)))
     if steps > MAX_STEPS:
         raise InputError(
@@ -56,18 +57,18 @@ def poses_during(
             f"{MAX_STEPS * STEP_PX:.0f} px are allowed"
         )
     times_s = ((np.arange(steps) + 0.5) / steps - 0.5) * exposure_s
-    return tuple(mounted.pose(motion.pose_at(middle, float(time_s))) for time_s in times_s)
+    return tuple(mounted.posed(motion.pose_at(middle, float(time_s))).pose for time_s in times_s)
 
 
-def _longest_way_px(camera: Camera, ends: list[Pose], scene: Scene) -> float:
+def _longest_way_px(ends: list[PosedCamera], scene: Scene) -> float:
     """The farthest that anything goes that is on the sensor or a sensor's width beside it."""
-    size = np.array([camera.width_px, camera.height_px])
+    size = np.array([ends[0].camera.width_px, ends[0].camera.height_px])
     grid = np.stack(np.meshgrid([0.0, 0.5, 1.0], [0.0, 0.5, 1.0]), axis=-1).reshape(-1, 2) * size
     centers = scene.leds.centers_m
-    nearest_m = float(np.abs(centers[:, 2] - ends[0].position_m[2]).min())
-    around = [np.array(end.position_m) + rays_world(camera, end, grid) * nearest_m for end in ends]
+    nearest_m = float(np.abs(centers[:, 2] - ends[0].pose.position_m[2]).min())
+    around = [end.position_m + end.rays_world(grid) * nearest_m for end in ends]
     points: NDArray[np.float64] = np.concatenate([centers, *around])
-    start, stop = (project(camera, end, points)[0] for end in ends)
+    start, stop = (end.project(points) for end in ends)
     near = ((start >= -size) & (start <= 2 * size)).all(axis=1) | ((stop >= -size) & (stop <= 2 * size)).all(axis=1)
     way = np.hypot(*(stop - start).T)[near]
     return float(np.nanmax(way, initial=0.0))

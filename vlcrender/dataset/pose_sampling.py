@@ -6,6 +6,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from vlcrender.camera.intrinsics import Camera, Pose, rotation_cam_world
+from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.config.toml_model import Settings
 from vlcrender.core.random_keys import stream
 from vlcrender.errors import InputError
@@ -123,7 +124,7 @@ def _aimed_pose(poses: AimedPoses, frame: int, seed: int, camera: Camera, scene:
         if (position <= low_corner).any() or (position >= high_corner).any():
             continue
         pose = Pose((float(position[0]), float(position[1]), height), tilt_x, tilt_y, yaw)
-        if len(leds_in_view(camera, pose, scene, poses.border_px)) >= poses.min_leds:
+        if len(leds_in_view(PosedCamera(camera, pose), scene, poses.border_px)) >= poses.min_leds:
             return pose
     raise InputError(
         f"poses: frame {frame}: no position in {TRIES} tries sees {poses.min_leds} LEDs whole at tilts "

@@ -98,7 +98,7 @@ class Recipe(Settings):
 
     @model_validator(mode="after")
     def _overscan_needs_a_lens_that_goes_on(self) -> Self:
-        bent = [c.name for c in self.cameras if c.camera.distortion is not None]
+        bent = [c.name for c in self.cameras if not c.camera.lens_projection.extends_beyond_sensor]
         if self.regions is not None and self.regions.overscan and bent:
             raise ValueError(
                 f"regions.overscan = true: camera {bent[0]!r} has a distortion, which says nothing of what lies far "

@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from vlcrender.camera.intrinsics import Camera, image_of_points, transform
+from vlcrender.camera.intrinsics import Camera, transform
 from vlcrender.camera.roi import Roi
 from vlcrender.config.toml_model import check
 from vlcrender.dataset.files import (
@@ -143,7 +143,7 @@ def _problems_of_truth(row: Mapping[str, Any], camera: Camera | None, dataset: D
     for led in row["leds"]:
         if led["led"] not in positions:
             return [f"{where}: LED {led['led']} is not in the LED map"]
-        u, v = image_of_points(camera, transform(rotation, positions[led["led"]] - np.array(row["position_m"])))
+        u, v = camera.image_of_points(transform(rotation, positions[led["led"]] - np.array(row["position_m"])))
         # Not `>`: what the lens does not image has no pixel, and NaN is not above anything.
         if not np.hypot(u - led["u_px"], v - led["v_px"]) <= 1e-6:
             return [f"{where}: LED {led['led']} is not where the pose puts it"]

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from vlcrender.config.presets import KINDS, preset, with_presets
 from vlcrender.config.toml_model import Settings, check, read_toml
 from vlcrender.core.quantity import Quantity
+from vlcrender.core.random_keys import random_key
 from vlcrender.emva1288.photon_transfer import (
     FLAT_EXPOSURE_S,
     ROUNDING_DN2,
@@ -148,7 +149,7 @@ def bench(
         progress(taken)
         warm = sensor.model_copy(update={"temperature_c": sensor.temperature_c + warmer_c})
         light = np.full((side_px, side_px), photons * efficiency, dtype=np.float32)
-        return expose(warm, light, f"datasheet/{sensor.serial}/{taken}", exposure_s=exposure_s)
+        return expose(warm, light, random_key("datasheet", sensor.serial, taken), exposure_s=exposure_s)
 
     return shoot
 

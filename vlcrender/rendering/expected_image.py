@@ -1,4 +1,4 @@
-"""A view as parts: background plus one patch of light an LED, so that any exposure is their sum."""
+"""Expected images as parts, a background and one patch of light for each LED, so that any exposure is their sum."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,18 +13,18 @@ Image = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class LedPatch:
-    """One LED's own light. `electrons_per_s` (rows, columns) starts at pixel (row, column) of the sensor."""
+    """The light of one LED itself. `electrons_per_s` (rows, columns) starts at pixel (row, column) of the sensor."""
 
     led_id: int
     center_px: tuple[float, float]
-    """Image of the LED's centre (u, v); may lie outside the sensor."""
+    """Image (u, v) of the LED's centre; may lie outside the sensor."""
     row: int
     column: int
     electrons_per_s: NDArray[np.floating]
     visible_fraction: float
-    """Share of the LED's image that falls on the sensor and that nothing hides."""
+    """Share of the LED's image that is on the sensor and not occluded."""
     imaged_fraction: float
-    """Share of the LED's image that is in the view: more where windows reach beyond the sensor."""
+    """Share of the LED's image that is in the regions and not occluded: more where regions extend beyond the sensor."""
 
     @property
     def roi(self) -> Roi:
@@ -34,7 +34,7 @@ class LedPatch:
 
 @dataclass(frozen=True)
 class SpecularReflection:
-    """An LED's light by way of a window pane: a false image of it, which flickers with the LED."""
+    """The light of one LED by way of a glazing; it flickers with the LED. Fields as in `LedPatch`."""
 
     led_id: int
     row: int
@@ -49,7 +49,7 @@ class SpecularReflection:
 
 @dataclass(frozen=True)
 class ExpectedRegion:
-    """The view in one window: `background_e_per_s` (rows, columns), and a patch for each LED that lights a pixel."""
+    """Expected image of a region: `background_e_per_s` (rows, columns), and a patch of each LED that lights a pixel."""
 
     roi: Roi
     background_e_per_s: Image
@@ -57,27 +57,27 @@ class ExpectedRegion:
     reflections: tuple[SpecularReflection, ...] = ()
 
     def expected_electrons(self, exposure_s: float, gains: Mapping[int, float] | None = None) -> Image:
-        """Mean electrons of an exposure, (rows, columns). `gains`: by LED id, 1 where not given."""
+        """Mean electrons of an exposure, (rows, columns). `gains`: of LEDs by id; 1 where not given."""
         image = self.background_e_per_s * np.float32(exposure_s)
         lights: list[LedPatch | SpecularReflection] = [*self.patches, *self.reflections]
-        for patch in lights:
-            gain = 1.0 if gains is None else gains.get(patch.led_id, 1.0)
-            image[self.roi.slices(patch.roi)] += patch.electrons_per_s * np.float32(gain * exposure_s)
+        for light in lights:
+            gain = 1.0 if gains is None else gains.get(light.led_id, 1.0)
+            image[self.roi.slices(light.roi)] += light.electrons_per_s * np.float32(gain * exposure_s)
         return image
 
 
 @dataclass(frozen=True)
 class ExpectedImage:
-    """A camera's view of a scene: parts that share no pixel. A full frame is one part."""
+    """Expected image of a frame: regions that share no pixel. A full frame is one region."""
 
     parts: tuple[ExpectedRegion, ...]
 
     @property
     def patches(self) -> tuple[LedPatch, ...]:
-        """The LEDs' own light, all parts' together."""
+        """The patches of all regions."""
         return tuple(patch for part in self.parts for patch in part.patches)
 
     def expected_electrons(self, exposure_s: float, gains: Mapping[int, float] | None = None) -> Image:
-        """Mean electrons of an exposure of a full frame, (height, width); of windows each part has its own."""
+        """Mean electrons of an exposure of a full frame, (height, width); of several regions see each of `parts`."""
         (whole,) = self.parts
         return whole.expected_electrons(exposure_s, gains)

@@ -1,110 +1,117 @@
-"""What hides LEDs from the camera: furniture, frames, and panels that hang lower than an LED."""
+"""Occlusion of LEDs by furniture, by frames of panels, and by panels that hang lower than an LED."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vlcrender.camera.intrinsics import Camera, Pose, ray_of_pixel
+from vlcrender.camera.intrinsics import Pose
+from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.roi import Roi, merged
 from vlcrender.core.backend import dr, exact_math, mi
 from vlcrender.rendering.background import Background, differs_from_neighbour, sub_pixels
 from vlcrender.scene.loader import Scene
 
-SAME_PLACE = 1e-4
-"""Relative difference of two distances that are the same but for float32."""
+DISTANCE_TOLERANCE = 1e-4
+"""Relative difference below which two distances, computed in float32, count as equal."""
 OUTSIDE = np.uint8(2)
-"""Label of pixels that an LED does not light, where others are 0 and 1."""
+"""Label of pixels that an LED does not light; lit ones have 0 (occluded) or 1 (clear)."""
 
 Array = NDArray[np.float64]
 
 
+@dataclass(frozen=True)
+class LitRegion:
+    """The pixels that one LED lights: its height, m, a region, and which of its pixels are lit (rows, columns)."""
+
+    height_m: float
+    roi: Roi
+    lit: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Mirror:
+    """A glazing that rays are reflected by: its number in the scene, and the camera's mirror image in it."""
+
+    glazing: int
+    pose: Pose
+
+
 class Occlusion:
-    """What may stand between a camera and the LEDs of one scene, found by rays through its surfaces."""
+    """Surfaces of one scene between a camera and the LEDs, found by casting rays."""
 
     def __init__(self, scene: Scene, background: Background) -> None:
-        """Prepare a scene, whose surfaces `background` holds."""
+        """Prepare a scene; `background` holds its surfaces."""
         self._background = background
         panels = scene.settings.panels
         undersides_m = [grid.first_center_m[2] for grid in panels]
-        self.there_are_some = (
+        self.possible = (
             bool(scene.settings.furniture)
             or any(grid.frame is not None for grid in panels)
-            or min(undersides_m, default=np.inf) < scene.leds.centers_m[:, 2].max() * (1 - SAME_PLACE)
+            or min(undersides_m, default=np.inf) < scene.leds.centers_m[:, 2].max() * (1 - DISTANCE_TOLERANCE)
         )
-        """Whether an LED seen directly may be hidden at all."""
+        """Whether anything in the scene can occlude an LED that is seen directly."""
 
     def clear_shares(
-        self,
-        camera: Camera,
-        pose: Pose,
-        images: Sequence[tuple[float, Roi, NDArray[np.bool_]]],
-        mirror: tuple[int, Pose] | None = None,
+        self, posed: PosedCamera, images: Sequence[LitRegion], mirror: Mirror | None = None
     ) -> list[Array | float]:
-        """Share of each lit pixel from which nothing hides the plane of an LED, (rows, columns); 1.0 where nowhere.
+        """Share of each lit pixel from which the LED's plane is seen, (rows, columns); 1.0 for an LED in full view.
 
-        images: of each LED its height (m), its window and the pixels lit. mirror: number of the pane that has to be
-        met, and the camera's mirror image in it; None looks directly.
+        mirror: the glazing by way of which the LEDs are seen; None for LEDs seen directly.
         """
         shares: list[Array | float] = [1.0] * len(images)
-        for height_m in dict.fromkeys(height for height, _, _ in images):
-            same = [(n, roi, lit) for n, (height, roi, lit) in enumerate(images) if height == height_m]
+        for height_m in dict.fromkeys(image.height_m for image in images):
+            level = {n: image for n, image in enumerate(images) if image.height_m == height_m}
             # LEDs behind one diffuser light the same pixels: each pixel's ray is cast once.
-            for around in merged(roi for _, roi, _ in same):
-                inside = [(n, roi, lit) for n, roi, lit in same if around.contains(roi)]
-                asked = np.zeros((around.rows, around.columns), dtype=bool)
-                for _, roi, lit in inside:
-                    asked[around.slices(roi)] |= lit
-                rows, columns = np.nonzero(asked)
+            for union in merged(image.roi for image in level.values()):
+                inside = {n: image for n, image in level.items() if union.contains(image.roi)}
+                lit = np.zeros((union.rows, union.columns), dtype=bool)
+                for image in inside.values():
+                    lit[union.slices(image.roi)] |= image.lit
+                rows, columns = np.nonzero(lit)
                 with exact_math():
                     u, v = (
                         mi.Float((index + first + 0.5).astype(np.float32))
-                        for index, first in ((columns, around.column), (rows, around.row))
+                        for index, first in ((columns, union.column), (rows, union.row))
                     )
-                    clear = np.ones(asked.shape, dtype=bool)
-                    clear[rows, columns] = self._reaches(camera, pose, height_m, mirror, u, v)
-                    for n, roi, lit in inside:
-                        here = clear[around.slices(roi)]
-                        if not here[lit].all():
-                            shares[n] = self._finer(camera, pose, height_m, mirror, roi, lit, here)
+                    clear = np.ones(lit.shape, dtype=bool)
+                    clear[rows, columns] = self._reach_height(posed, height_m, mirror, u, v)
+                    for n, image in inside.items():
+                        centers_clear = clear[union.slices(image.roi)]
+                        if not centers_clear[image.lit].all():
+                            shares[n] = self._pixel_shares(posed, image, mirror, centers_clear)
         return shares
 
-    def _finer(
-        self,
-        camera: Camera,
-        pose: Pose,
-        height_m: float,
-        mirror: tuple[int, Pose] | None,
-        roi: Roi,
-        lit: NDArray[np.bool_],
-        clear: NDArray[np.bool_],
+    def _pixel_shares(
+        self, posed: PosedCamera, image: LitRegion, mirror: Mirror | None, centers_clear: NDArray[np.bool_]
     ) -> Array:
-        """The share of each pixel, by many rays where an edge may cross it. `clear`: whether its centre is."""
-        share = clear.astype(np.float64)
-        if clear[lit].any():  # an edge crosses the LED
-            labels = np.where(lit, clear, OUTSIDE)
-            rows, columns = np.nonzero(lit & differs_from_neighbour(labels))
-            u, v = sub_pixels(rows + roi.row, columns + roi.column)
-            each = self._reaches(camera, pose, height_m, mirror, u, v)
-            share[rows, columns] = each.reshape(len(rows), -1).mean(axis=1)
+        """The clear share of each pixel: of its centre, or of a grid of rays in pixels that an edge may cross."""
+        share = centers_clear.astype(np.float64)
+        if centers_clear[image.lit].any():  # an edge crosses the LED
+            labels = np.where(image.lit, centers_clear, OUTSIDE)
+            rows, columns = np.nonzero(image.lit & differs_from_neighbour(labels))
+            u, v = sub_pixels(rows + image.roi.row, columns + image.roi.column)
+            clear = self._reach_height(posed, image.height_m, mirror, u, v)
+            share[rows, columns] = clear.reshape(len(rows), -1).mean(axis=1)
         return share
 
-    def _reaches(
-        self, camera: Camera, pose: Pose, height_m: float, mirror: tuple[int, Pose] | None, u: "mi.Float", v: "mi.Float"
+    def _reach_height(
+        self, posed: PosedCamera, height_m: float, mirror: Mirror | None, u: "mi.Float", v: "mi.Float"
     ) -> NDArray[np.bool_]:
-        """Whether the ray of a pixel position gets to this height, with nothing in its way."""
-        hit = self._background.trace(camera, pose, u, v)
+        """Whether the rays of pixel positions reach this height without meeting a surface."""
+        hit = self._background.trace(posed, u, v)
         if mirror is None:
-            way_m, seen_from = hit.distance_m, pose
+            path_m, rotation = hit.distance_m, posed.rotation
         else:
-            glazing, seen_from = mirror
-            way_m = dr.select(hit.surface == self._background.room.first_glazing + glazing, hit.path_m, 0.0)
+            rotation = mirror.pose.rotation
+            path_m = dr.select(hit.surface == self._background.room.first_glazing + mirror.glazing, hit.path_m, 0.0)
         # Double precision, and numbers as data: as literals each pose would compile a kernel of its own.
-        x, y, z = ray_of_pixel(camera, mi.Float64(u), mi.Float64(v), dr)
-        up = [dr.opaque(mi.Float64, number) for number in seen_from.rotation[:, 2].tolist()]
+        x, y, z = posed.camera.unproject(mi.Float64(u), mi.Float64(v), dr)
+        up = [dr.opaque(mi.Float64, number) for number in rotation[:, 2].tolist()]
         slope = (up[0] * x + up[1] * y + up[2] * z) / dr.sqrt(x * x + y * y + z * z)
-        rise_m = dr.opaque(mi.Float64, height_m - pose.position_m[2])
-        reached = mi.Float64(way_m) > rise_m / slope * (1 - SAME_PLACE)
+        rise_m = dr.opaque(mi.Float64, height_m - posed.pose.position_m[2])
+        reached = mi.Float64(path_m) > rise_m / slope * (1 - DISTANCE_TOLERANCE)
         dr.eval(reached)
         clear: NDArray[np.bool_] = reached.numpy().astype(bool)
         return clear

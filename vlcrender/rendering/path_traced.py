@@ -1,18 +1,18 @@
-"""The same view by Mitsuba's own path integrator: slow, independent of `render` and of the bake, for checking them.
+"""Reference images by Mitsuba's path integrator: slow, independent of `Renderer` and of the lightmap, to check them.
 
-The room is built from Mitsuba's rectangles and discs, every LED is an area emitter, and light is followed from the
-camera by `path`. Two images add up: the LEDs' and windows' light with all its reflections, and the surrounding light,
-which is defined to hold its own reflections and so is looked at and not followed. Furniture alone is read and cut by
-the code that the fast way uses too.
+The room is built from Mitsuba's rectangles and discs, every LED is an area emitter, and paths start at the camera. Two
+images add up: the light of LEDs and glazings with all its reflections, and the ambient light, which is defined to
+include its own reflections and so is taken at the first surface. Furniture alone is read and subdivided by the same
+code as for `Renderer`.
 """
 
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vlcrender.camera.intrinsics import Camera, Pose, mitsuba_to_world, ray_of_pixel
+from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.core.backend import dr, mi
 from vlcrender.errors import InputError
 from vlcrender.light.mitsuba_room import BEHIND_M, glazing_bsdf, room_shape
@@ -25,57 +25,60 @@ Array = NDArray[np.float64]
 
 BATCHES = 8
 LED_STANDOFF_M = 1e-5
-"""LEDs are put this far below what they are mounted on, so that a ray meets the LED first."""
-SHEET_PIXELS = 16
-"""Pixels, linear in between, of a diffuser's image in the distance that LEDs are behind it."""
+"""Distance of LEDs below the surface that they are mounted on, so that a ray meets the LED first."""
+DIFFUSER_PIXELS = 16
+"""Pixels of a diffuser's bitmap, linear in between, along a distance equal to that of the LEDs behind it."""
 MAX_DEPTH = 24
 MAX_GLAZINGS = 4
-"""Panes met one after the other on the way to what is looked at."""
+"""Glazings that a ray may meet before the first diffuse surface."""
 
 
-def reference_cd_m2(
-    scene: Scene, camera: Camera, pose: Pose, samples_per_pixel: int, seed: int = 0
-) -> tuple[Array, Array]:
-    """Luminance averaged over each pixel (and the pupil), and the variance of that estimate, both (height, width).
+class Reference(NamedTuple):
+    """A path-traced image, (height, width): mean luminance of each pixel, and the variance of that estimate."""
 
-    No photometry: no cos^4, no aperture. A pinhole is Mitsuba's own perspective sensor; of other lenses rays are drawn
-    here, evenly over the pixel and the pupil, and followed by Mitsuba. The variance comes from the scatter of BATCHES
-    images. Raises InputError for what it cannot do: a psf, and bare LEDs that are not Lambertian, since Mitsuba's area
-    emitters are Lambertian or send along the normal alone.
+    cd_m2: Array
+    variance: Array
+
+
+def reference_cd_m2(scene: Scene, posed: PosedCamera, samples_per_pixel: int, seed: int = 0) -> Reference:
+    """Luminance averaged over each pixel (and the pupil), without relative illumination and aperture.
+
+    A pinhole is Mitsuba's own perspective sensor; for other lenses rays are drawn here, evenly over the pixel and the
+    pupil, and traced by Mitsuba. The variance comes from the scatter of BATCHES images. Raises InputError for a psf,
+    and for bare LEDs that are not Lambertian: Mitsuba's area emitters are Lambertian or emit along the normal only.
     """
+    camera = posed.camera
     if camera.psf != "none":
         raise InputError(f"camera.psf = {camera.psf!r}: the reference renderer has no diffraction; it has to be 'none'")
     bare = np.array([diffuser is None for diffuser in scene.leds.diffusers])
     if not np.allclose(scene.leds.orders[bare], 1.0):
         raise InputError("half_power_deg: the reference renderer's LEDs are Lambertian; it has to be 60")
-    loaded = mi.load_dict(scene_dict(scene, camera, pose), optimize=False)
-    followed = mi.load_dict({"type": "path", "max_depth": MAX_DEPTH, "rr_depth": 8})
-    looked_at = _FirstSurface(scene.settings.ambient.illuminance_lux)
-    pinhole = camera.projection == "perspective" and camera.distortion is None and camera.focus_distance_m is None
+    loaded = mi.load_dict(scene_dict(scene, posed), optimize=False)
+    all_light = mi.load_dict({"type": "path", "max_depth": MAX_DEPTH, "rr_depth": 8})
+    ambient = _FirstSurface(scene.settings.ambient.illuminance_lux)
+    pinhole = camera.lens_projection.keeps_lines_straight and camera.focus_distance_m is None
     render = _by_sensor if pinhole and camera.skew_px == 0 else _by_rays
     each = -(-samples_per_pixel // BATCHES)
     images = []
     for batch in range(BATCHES):
         number = 2 * (seed * BATCHES + batch)
-        image = render(loaded, followed, camera, pose, each, number) + render(
-            loaded, looked_at, camera, pose, each, number + 1
-        )
+        image = render(loaded, all_light, posed, each, number) + render(loaded, ambient, posed, each, number + 1)
         images.append(image.reshape(camera.height_px, camera.width_px))
     stack = np.stack(images)
-    return stack.mean(axis=0), stack.var(axis=0, ddof=1) / BATCHES
+    return Reference(stack.mean(axis=0), stack.var(axis=0, ddof=1) / BATCHES)
 
 
 class _FirstSurface(mi.SamplingIntegrator):
-    """What an even illuminance makes of the first diffuse surface that a ray meets, panes followed."""
+    """Luminance, in an even illuminance, of the first diffuse surface that a ray meets by way of any glazings."""
 
     def __init__(self, illuminance_lux: float) -> None:
         super().__init__(mi.Properties())
-        self._flat_cd_m2 = illuminance_lux / np.pi
+        self._white_cd_m2 = illuminance_lux / np.pi
 
     def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True) -> Any:
-        """Mitsuba's interface: (luminance, whether anything was met, no further channels)."""
-        luminance, met = _trace(scene, sampler, mi.Ray3f(ray), mi.Bool(active))
-        return self._flat_cd_m2 * luminance, met, []
+        """Mitsuba's interface: (luminance, whether a surface was met, no further channels)."""
+        reflectance, met = _trace(scene, sampler, mi.Ray3f(ray), mi.Bool(active))
+        return self._white_cd_m2 * reflectance, met, []
 
 
 @dr.syntax
@@ -99,12 +102,13 @@ def _trace(scene: Any, sampler: Any, ray: Any, active: Any) -> Any:
     return reflectance, met
 
 
-def _by_sensor(scene: Any, integrator: Any, camera: Camera, pose: Pose, samples: int, seed: int) -> Array:
+def _by_sensor(scene: Any, integrator: Any, posed: PosedCamera, samples: int, seed: int) -> Array:
     return np.asarray(mi.render(scene, integrator=integrator, spp=samples, seed=seed), dtype=np.float64)
 
 
-def _by_rays(scene: Any, integrator: Any, camera: Camera, pose: Pose, samples: int, seed: int) -> Array:
-    """Thin lens: from a point of the pupil to where the ray through its centre meets the plane of focus."""
+def _by_rays(scene: Any, integrator: Any, posed: PosedCamera, samples: int, seed: int) -> Array:
+    """Thin lens: rays from points of the pupil to where the ray through its centre meets the plane of focus."""
+    camera = posed.camera
     count = camera.width_px * camera.height_px
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(seed, count * samples)
@@ -112,21 +116,24 @@ def _by_rays(scene: Any, integrator: Any, camera: Camera, pose: Pose, samples: i
     row = pixel // camera.width_px
     within = sampler.next_2d()
     u, v = mi.Float(pixel - row * camera.width_px) + within.x, mi.Float(row) + within.y
-    x, y, z = ray_of_pixel(camera, u, v, dr)
+    x, y, z = camera.unproject(u, v, dr)
     pupil_m = 0.0 if camera.focus_distance_m is None else camera.aperture_mm / 2000
     off = mi.warp.square_to_uniform_disk_concentric(sampler.next_2d()) * pupil_m
     if isinstance(camera.focus_distance_m, float):
         x, y, z = x - off.x / camera.focus_distance_m, y - off.y / camera.focus_distance_m, z
-    to_world = pose.rotation.T.tolist()
+    to_world = posed.rotation.T.tolist()
     direction = mi.Vector3f(*(r[0] * x + r[1] * y + r[2] * z for r in to_world))
-    origin = mi.Point3f(*(p + r[0] * off.x + r[1] * off.y for p, r in zip(pose.position_m, to_world, strict=True)))
+    origin = mi.Point3f(
+        *(p + r[0] * off.x + r[1] * off.y for p, r in zip(posed.pose.position_m, to_world, strict=True))
+    )
     luminance, _, _ = integrator.sample(scene, sampler, mi.RayDifferential3f(origin, dr.normalize(direction)))
     mean: Array = np.array(luminance, dtype=np.float64).reshape(count, samples).mean(axis=1)
     return mean
 
 
-def sensor_dict(camera: Camera, pose: Pose) -> dict[str, object]:
+def sensor_dict(posed: PosedCamera) -> dict[str, object]:
     """Mitsuba's description of a camera: axes turned, principal point, box pixels in float32."""
+    camera = posed.camera
     u, v = camera.center_px
     return {
         "type": "perspective",
@@ -137,7 +144,7 @@ def sensor_dict(camera: Camera, pose: Pose) -> dict[str, object]:
         # Fractions of the image; positive moves the image left and up.
         "principal_point_offset_x": -(u / camera.width_px - 0.5),
         "principal_point_offset_y": -(v / camera.height_px - 0.5),
-        "to_world": mi.ScalarTransform4f(mitsuba_to_world(pose).tolist()),
+        "to_world": mi.ScalarTransform4f(posed.mitsuba_to_world().tolist()),
         "film": {
             "type": "hdrfilm",
             "width": camera.width_px,
@@ -150,17 +157,17 @@ def sensor_dict(camera: Camera, pose: Pose) -> dict[str, object]:
     }
 
 
-def scene_dict(scene: Scene, camera: Camera, pose: Pose) -> dict[str, object]:
-    """The scene for Mitsuba: LEDs and what is outside panes shine; a pane mirrors and lets through."""
-    tree: dict[str, object] = {"type": "scene", "sensor": sensor_dict(camera, pose)}
+def scene_dict(scene: Scene, posed: PosedCamera) -> dict[str, object]:
+    """The scene for Mitsuba: LEDs and the outdoors behind glazings emit; a glazing reflects and transmits."""
+    tree: dict[str, object] = {"type": "scene", "sensor": sensor_dict(posed)}
     number = 0
     for surface in scene.surfaces:
         for corner, edge_u, edge_v in _without_holes(surface):
-            skin = _diffuse(surface.reflectance)
+            bsdf = _diffuse(surface.reflectance)
             if surface.texture is not None:
-                skin["reflectance"] = _bitmap(surface.texture, corner, edge_u, edge_v)
-            part = _shape("rectangle", _frame(corner, edge_u, edge_v), skin, 0.0)
-            glow = _sheet_cd_m2(scene, surface)
+                bsdf["reflectance"] = _bitmap(surface.texture, corner, edge_u, edge_v)
+            part = _shape("rectangle", _frame(corner, edge_u, edge_v), bsdf, 0.0)
+            glow = _diffuser_cd_m2(scene, surface)
             if glow is not None:
                 part["emitter"] = {"type": "area", "radiance": {"type": "bitmap", "bitmap": glow, "raw": True}}
             tree[f"surface{number}"] = part
@@ -169,7 +176,7 @@ def scene_dict(scene: Scene, camera: Camera, pose: Pose) -> dict[str, object]:
         tree[f"furniture{i}"] = room_shape(mesh, np.zeros(len(mesh.vertices_m)))
     for i, glazing in enumerate(scene.glazings):
         frame = _frame(glazing.corner_m, glazing.edge_u_m, glazing.edge_v_m)
-        tree[f"pane{i}"] = _shape("rectangle", frame, glazing_bsdf(glazing), 0.0)
+        tree[f"glazing{i}"] = _shape("rectangle", frame, glazing_bsdf(glazing), 0.0)
         behind = frame.copy()
         behind[:3, 3] -= BEHIND_M * frame[:3, 2]
         behind[:3, :2] *= 1 + BEHIND_M
@@ -177,7 +184,7 @@ def scene_dict(scene: Scene, camera: Camera, pose: Pose) -> dict[str, object]:
     leds, face = scene.leds, scene.settings.led_reflectance
     for i in range(len(leds)):
         if leds.diffusers[i] is not None:
-            continue  # its sheet shines
+            continue  # its diffuser emits
         radius = leds.radii_m[i]
         frame = np.diag([radius, -radius, -1.0, 1.0])  # faces down
         frame[:3, 3] = leds.centers_m[i] - [0, 0, LED_STANDOFF_M]
@@ -187,7 +194,7 @@ def scene_dict(scene: Scene, camera: Camera, pose: Pose) -> dict[str, object]:
 
 
 def _without_holes(surface: Surface) -> list[tuple[Array, Array, Array]]:
-    """Corner and edges of rectangles that make up a surface: strips along v, cut where a hole is."""
+    """Corner and edges of rectangles that make up a surface: strips along v, cut at the holes."""
     corner, edge_u, edge_v, holes = surface.corner_m, surface.edge_u_m, surface.edge_v_m, surface.holes
     cuts = np.unique([0.0, 1.0, *(cut for a0, _, a1, _ in holes for cut in (a0, a1))])
     parts = []
@@ -214,8 +221,8 @@ def _frame(corner: Array, edge_u: Array, edge_v: Array) -> Array:
     return frame
 
 
-def _sheet_cd_m2(scene: Scene, surface: Surface) -> "mi.Bitmap | None":
-    """What LEDs make of a panel's diffuser, rows along edge_v and columns along edge_u; None for other surfaces."""
+def _diffuser_cd_m2(scene: Scene, surface: Surface) -> "mi.Bitmap | None":
+    """Luminance of a panel's diffuser, rows along edge_v and columns along edge_u; None for other surfaces."""
     low = surface.corner_m
     high = low + surface.edge_u_m + surface.edge_v_m
     lit = [
@@ -227,7 +234,7 @@ def _sheet_cd_m2(scene: Scene, surface: Surface) -> "mi.Bitmap | None":
     ]
     if not lit:
         return None
-    step_m = min(diffuser.distance_m for diffuser, _ in lit) / SHEET_PIXELS
+    step_m = min(diffuser.distance_m for diffuser, _ in lit) / DIFFUSER_PIXELS
     columns, rows = (int(np.ceil(np.linalg.norm(edge) / step_m)) for edge in (surface.edge_u_m, surface.edge_v_m))
     b, a = np.meshgrid((np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij")
     at = low + a[..., None] * surface.edge_u_m + b[..., None] * surface.edge_v_m

@@ -1,4 +1,4 @@
-"""False images: LEDs seen by way of a window pane, each the image that the camera's mirror image has of it."""
+"""Specular reflections of LEDs in glazings: each is the LED's image in the camera's mirror image."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -6,14 +6,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vlcrender.camera.intrinsics import Camera, Pose, ray_world
-from vlcrender.camera.lens import blur, relative_illumination
+from vlcrender.camera.intrinsics import Pose
+from vlcrender.camera.posed_camera import PosedCamera
+from vlcrender.camera.psf import blur, kernel_radius_px
 from vlcrender.camera.roi import Roi
+from vlcrender.camera.vignetting import relative_illumination
 from vlcrender.rendering.expected_image import SpecularReflection
-from vlcrender.rendering.led_blur import radius_px
-from vlcrender.rendering.led_coverage import coverage_of_led, leds_that_may_be_seen
+from vlcrender.rendering.led_coverage import candidate_leds, coverage_of_led
 from vlcrender.rendering.led_radiance import face_of_led, luminance_pattern
-from vlcrender.rendering.occlusion import Occlusion
+from vlcrender.rendering.occlusion import LitRegion, Mirror, Occlusion
 from vlcrender.scene.fresnel import glazing_reflectance
 from vlcrender.scene.loader import Scene
 from vlcrender.scene.surfaces import Glazing
@@ -23,19 +24,20 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class MirroredPose(Pose):
-    """The camera's mirror image in a pane: what it sees directly is what the camera sees by way of the pane."""
+    """A camera's mirror image in a glazing: it sees directly what the camera sees by way of the glazing."""
 
     mirror: tuple[tuple[float, ...], ...] = ()
+    """The reflection, rows of a (3, 3) matrix."""
 
     @property
     def rotation(self) -> Array:
-        """R_cam_world after the mirror: it takes the mirrored world to the camera."""
+        """R_cam_world after the reflection: takes the mirrored world to camera axes."""
         product: Array = super().rotation @ np.array(self.mirror)
         return product
 
 
 def mirrored_pose(pose: Pose, glazing: Glazing) -> MirroredPose:
-    """A camera's mirror image in a pane."""
+    """The mirror image of a pose in a glazing."""
     mirror = np.eye(3) - 2 * np.outer(glazing.normal, glazing.normal)
     behind = glazing.mirrored(np.array(pose.position_m))
     return MirroredPose(
@@ -48,41 +50,35 @@ def mirrored_pose(pose: Pose, glazing: Glazing) -> MirroredPose:
 
 
 def specular_reflections(
-    scene: Scene,
-    occlusion: Occlusion,
-    camera: Camera,
-    pose: Pose,
-    number: int,
-    frames: Sequence[Roi],
-    e_per_s_per_cd_m2: float,
+    scene: Scene, occlusion: Occlusion, posed: PosedCamera, number: int, rois: Sequence[Roi], led_rate: float
 ) -> list[SpecularReflection]:
-    """LEDs in the pane of this number, as far as it reaches and nothing stands in the way to it or from it.
+    """Reflections of all LEDs in the glazing of this number, less what is occluded on either side of it; not blurred.
 
-    `e_per_s_per_cd_m2`: what 1 cd/m2 of an LED is worth on the axis. In parts, one for each frame that a false image
-    reaches into; not blurred.
+    led_rate: electrons a second of 1 cd/m2 of an LED on the axis (`ElectronRates.led`). A reflection that extends into
+    several regions is given in parts, one for each.
     """
-    leds, glazing = scene.leds, scene.glazings[number]
-    mirrored = mirrored_pose(pose, glazing)
+    leds, glazing, camera = scene.leds, scene.glazings[number], posed.camera
+    mirrored = posed.at(mirrored_pose(posed.pose, glazing))
     found = []
-    for i in leds_that_may_be_seen(camera, mirrored, leds.centers_m, leds.reaches_m).tolist():
-        image = coverage_of_led(camera, mirrored, *face_of_led(leds, i))
+    for i in candidate_leds(mirrored, leds.centers_m, leds.reaches_m).tolist():
+        image = coverage_of_led(mirrored, face_of_led(leds, i))
         if image is None:
             continue
-        roi = Roi(image.row, image.column, *image.coverage.shape)
-        if not any(frame.overlaps(roi) for frame in frames):
+        roi = image.roi
+        if not any(region.overlaps(roi) for region in rois):
             continue
-        lit = image.coverage > 0
-        (clear,) = occlusion.clear_shares(camera, pose, [(float(leds.centers_m[i, 2]), roi, lit)], (number, mirrored))
+        lit = LitRegion(float(leds.centers_m[i, 2]), roi, image.coverage > 0)
+        (clear,) = occlusion.clear_shares(posed, [lit], Mirror(number, mirrored.pose))
         u, v = roi.centers_px()
-        x, y, z = ray_world(camera, mirrored, u, v)
-        east, north, up = glazing.normal.tolist()
-        cosine = np.abs(x * east + y * north + z * up) / np.sqrt(x * x + y * y + z * z)
+        x, y, z = mirrored.ray_world(u, v)
+        normal_x, normal_y, normal_z = glazing.normal.tolist()
+        cosine = np.abs(x * normal_x + y * normal_y + z * normal_z) / np.sqrt(x * x + y * y + z * z)
         weight = relative_illumination(camera, u, v) * glazing_reflectance(cosine, glazing.refractive_index, np.sqrt)
-        pattern = luminance_pattern(leds, i, camera, mirrored, roi)
-        light = e_per_s_per_cd_m2 * leds.luminances_cd_m2[i] * image.coverage * clear * weight * pattern
-        for frame in frames:
-            if frame.overlaps(roi):
-                both = frame.intersection(roi)
+        pattern = luminance_pattern(leds, i, mirrored, roi)
+        light = led_rate * leds.luminances_cd_m2[i] * image.coverage * clear * weight * pattern
+        for region in rois:
+            if region.overlaps(roi):
+                both = region.intersection(roi)
                 part = light[roi.slices(both)]
                 if part.any():
                     found.append(SpecularReflection(int(leds.ids[i]), both.row, both.column, part.astype(np.float32)))
@@ -90,17 +86,18 @@ def specular_reflections(
 
 
 def blurred(
-    images: Iterable[SpecularReflection], kernel: Array | None, frames: Sequence[Roi], sensor: Roi
+    reflections: Iterable[SpecularReflection], kernel: Array | None, rois: Sequence[Roi], sensor: Roi
 ) -> list[SpecularReflection]:
-    """False images after the lens's blur, in parts, one for each frame that they reach into."""
+    """Reflections after the lens's blur, in parts, one for each region that they extend into."""
     parts = []
-    for image in images:
-        roi = image.roi.padded(radius_px(kernel))
+    for reflection in reflections:
+        roi = reflection.roi.padded(kernel_radius_px(kernel))
         if sensor.overlaps(roi):
-            light = blur(image.electrons_per_s, kernel)
-            for frame in frames:
-                both = sensor.intersection(roi)
-                if frame.overlaps(both):
-                    both = frame.intersection(both)
-                    parts.append(SpecularReflection(image.led_id, both.row, both.column, light[roi.slices(both)]))
+            light = blur(reflection.electrons_per_s, kernel)
+            on_sensor = sensor.intersection(roi)
+            for region in rois:
+                if region.overlaps(on_sensor):
+                    both = region.intersection(on_sensor)
+                    part = light[roi.slices(both)]
+                    parts.append(SpecularReflection(reflection.led_id, both.row, both.column, part))
     return parts

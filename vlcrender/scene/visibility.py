@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from vlcrender.camera.intrinsics import Camera, Pose, image_of_points, project, rays_world, transform
+from vlcrender.camera.intrinsics import Camera, Pose, transform
+from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.core.random_keys import stream
 from vlcrender.scene.loader import Scene
 
@@ -32,18 +33,17 @@ class Visibility:
         return self.seen / self.poses
 
 
-def leds_in_view(camera: Camera, pose: Pose, scene: Scene, margin_px: float = 0.0) -> NDArray[np.int64]:
+def leds_in_view(posed: PosedCamera, scene: Scene, margin_px: float = 0.0) -> NDArray[np.int64]:
     """Indices of the LEDs whose whole face (a square's circle) is on the sensor, `margin_px` or more inside."""
-    leds = scene.leds
-    centers_cam = transform(pose.rotation, leds.centers_m - np.array(pose.position_m))
-    candidates = np.flatnonzero(_on_sensor(camera, centers_cam))
+    leds, camera = scene.leds, posed.camera
+    candidates = np.flatnonzero(_on_sensor(camera, posed.camera_coordinates(leds.centers_m)))
     angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     rim = np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=1)
     # The circumscribed 24-gon: what holds it holds the circle.
     points = leds.centers_m[candidates, None, :] + rim * (leds.reaches_m[candidates, None, None] / np.cos(np.pi / 24))
-    pixels, _ = project(camera, pose, points)
+    pixels = posed.project(points)
     inside = (pixels >= margin_px) & (pixels <= np.array([camera.width_px, camera.height_px]) - margin_px)
-    seen = inside.all(axis=(-1, -2)) & (pose.position_m[2] < leds.centers_m[candidates, 2])
+    seen = inside.all(axis=(-1, -2)) & (posed.pose.position_m[2] < leds.centers_m[candidates, 2])
     visible: NDArray[np.int64] = candidates[seen]
     return visible
 
@@ -57,7 +57,7 @@ def level_visibility(camera: Camera, scene: Scene, height_m: float, yaw_deg: flo
     positions = positions.reshape(-1, 3)
     pose = Pose((0.0, 0.0, 0.0), yaw_deg=yaw_deg)
     size = np.array([camera.width_px, camera.height_px])
-    corners = rays_world(camera, pose, size * np.array([[0, 0], [1, 0], [0, 1], [1, 1]]))
+    corners = PosedCamera(camera, pose).rays_world(size * np.array([[0, 0], [1, 0], [0, 1], [1, 1]]))
     with np.errstate(divide="ignore"):
         slopes = np.where(corners[:, 2:] > 0, corners[:, :2] / corners[:, 2:], np.inf)
     tree = cKDTree(positions[:, :2])
@@ -93,7 +93,7 @@ def tilted_visibility(camera: Camera, scene: Scene, height_m: float) -> Visibili
 
 def _on_sensor(camera: Camera, p_cam: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Whether points in camera axes (n, 3) are imaged on the sensor, shape (n,)."""
-    pixels = image_of_points(camera, p_cam)  # NaN, which is on no side of a border, where the lens does not image
+    pixels = camera.image_of_points(p_cam)  # NaN, which is on no side of a border, where the lens does not image
     tolerance = 1e-6  # a point on the border counts, whichever way its last digit rounds
     size = np.array([camera.width_px, camera.height_px])
     seen = ((pixels >= -tolerance) & (pixels <= size + tolerance)).all(axis=1)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlcrender.core.backend import dr, exact_math, mi
-from vlcrender.core.philox import PHILOX, places, seed_of
+from vlcrender.core.philox import PHILOX, kernel_seed, pixel_indices
 
 MAX_TURNS = 1000
 """A turn takes a draw with a chance of 0.7 or more, so that none ever gets here; no kernel may run for ever."""
@@ -30,7 +30,7 @@ def poisson(means: NDArray[np.float32], key: str, row: int = 0, column: int = 0)
         raise ValueError(f"means from {low} to {high} electrons; 0 to {MAX_MEAN:.0f} are allowed")
     with exact_math():
         flat = np.ascontiguousarray(means, dtype=np.float32).ravel()
-        count: Any = mi.UInt32(draw(mi.Float(flat), seed_of(key), *places(means.shape, row, column)))
+        count: Any = mi.UInt32(draw(mi.Float(flat), kernel_seed(key), *pixel_indices(means.shape, row, column)))
         dr.eval(count)
     counts: NDArray[np.uint32] = count.numpy().reshape(means.shape)
     return counts

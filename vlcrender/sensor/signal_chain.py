@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlcrender.core.backend import dr, exact_math, mi
-from vlcrender.core.philox import normals, places, seed_of
+from vlcrender.core.philox import kernel_seed, normals, pixel_indices
+from vlcrender.core.random_keys import random_key
 from vlcrender.sensor.poisson import MAX_MEAN, draw, poisson
 from vlcrender.sensor.sensor import Electrons, Sensor, clip_full_well
 
@@ -48,7 +49,7 @@ def expose(
     """
     expected_e = np.minimum(expected_e, np.float32(MAX_MEAN))
     if sensor.noise == "full":
-        return _full_chain(sensor, expected_e, key, f"{sensor.serial}/{camera}", (row, column), exposure_s)
+        return _full_chain(sensor, expected_e, key, random_key(sensor.serial, camera), (row, column), exposure_s)
     electrons: Electrons = poisson(expected_e, key, row, column) if sensor.noise == "shot" else expected_e
     return sensor.quantise(clip_full_well(electrons, sensor.full_well_e))
 
@@ -70,18 +71,18 @@ def _full_chain(
         return dr.opaque(mi.Float, value)
 
     with exact_math():
-        column, row = places(expected_e.shape, *start)
-        response, offset = normals(seed_of(f"{individual}/pixels"), column, row)
+        column, row = pixel_indices(expected_e.shape, *start)
+        response, offset = normals(kernel_seed(individual, "pixels"), column, row)
         mean = mi.Float(np.ascontiguousarray(expected_e).ravel())
         mean = mean * dr.maximum(1.0 + number(sensor.prnu) * response, 0.0)  # 2
         mean = dr.minimum(mean + number(sensor.dark_electrons(exposure_s)), MAX_MEAN)  # 3
-        electrons = draw(mean, seed_of(key), column, row)  # 4
+        electrons = draw(mean, kernel_seed(key), column, row)  # 4
         electrons = electrons + number(sensor.dsnu_e) * offset  # 5
         electrons = dr.minimum(electrons, number(sensor.full_well_e))  # 6
         # 7 and 8: read and converter noise are normal and both are added beyond the clip, so that one draw is both.
-        noise, _ = normals(seed_of(f"{key}/read"), column, row)
-        of_row, _ = normals(seed_of(f"{individual}/rows"), mi.UInt32(0), row)
-        of_column, _ = normals(seed_of(f"{individual}/columns"), column, mi.UInt32(0))
+        noise, _ = normals(kernel_seed(key, "read"), column, row)
+        of_row, _ = normals(kernel_seed(individual, "rows"), mi.UInt32(0), row)
+        of_column, _ = normals(kernel_seed(individual, "columns"), column, mi.UInt32(0))
         electrons = electrons + number(sensor.dark_noise_e) * noise
         electrons = electrons + number(sensor.row_offset_e) * of_row + number(sensor.column_offset_e) * of_column
         level = dr.round(electrons / number(sensor.gain_at_iso_e_per_dn)) + number(sensor.black_level_dn)  # 8 and 9
