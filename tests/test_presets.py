@@ -1,13 +1,17 @@
 """Presets and what a recipe may say of a sensor; each refusal is one line that names key and value."""
 
 from pathlib import Path
+from typing import get_args
 
 import pytest
 from conftest import ROOT
+from pydantic import BaseModel
 
 from vlcrender.config.presets import preset, presets, with_presets
+from vlcrender.config.toml_model import RENAMED_KEYS
 from vlcrender.dataset.recipe import Recipe, load_plan
 from vlcrender.errors import InputError
+from vlcrender.scene.schema import SceneSettings
 
 QUICKSTART = ROOT / "datasets/quickstart.toml"
 
@@ -30,7 +34,7 @@ def test_every_preset_is_a_sensor(name: str) -> None:
 
 @pytest.mark.parametrize("name", presets("sensors"))
 def test_every_number_of_a_preset_says_where_it_is_from(name: str) -> None:
-    text = (ROOT / f"vlcrender/presets/sensors/{name}.toml").read_text()
+    text = (ROOT / f"vlcrender/config/preset_files/sensors/{name}.toml").read_text()
     for line in text.splitlines():
         if "=" in line and not line.startswith("#") and name != "ideal":
             assert "#" in line or "noise = " in line or "quantum_efficiency" in line, line
@@ -112,6 +116,41 @@ REFUSED = {
     "processed windows": (["processed={}", "regions.kind=leds"], ["processed", "regions"]),
     "quality": (["processed.quality=101"], ["processed.quality = 101"]),
 }
+
+
+RENAMED = {
+    "windows.margin_px=3": "key windows was renamed: write regions",
+    "windows={}": "key windows was renamed: write regions",
+    "exposure.longest_s=1.0": "key exposure.longest_s was renamed: write exposure.max_s",
+}
+
+
+@pytest.mark.parametrize("assignment", RENAMED)
+def test_a_renamed_key_is_refused_with_its_present_name(assignment: str) -> None:
+    with pytest.raises(InputError) as refusal:
+        recipe(assignment)
+    assert str(refusal.value) == f"{QUICKSTART} with --set: {RENAMED[assignment]}"
+
+
+def test_every_renamed_key_has_a_present_one() -> None:
+    """The present names are keys of the models, the former ones are not."""
+    for former, present in RENAMED_KEYS.items():
+        keys = [any(_is_key(name.split("."), model) for model in (Recipe, SceneSettings)) for name in (former, present)]
+        assert keys == [False, True], (former, present)
+
+
+def _is_key(path: list[str], model: type[BaseModel]) -> bool:
+    if path[0] not in model.model_fields:
+        return False
+    models = _models(model.model_fields[path[0]].annotation)
+    return len(path) == 1 or any(_is_key(path[1:], inner) for inner in models)
+
+
+def _models(annotation: object) -> list[type[BaseModel]]:
+    """Models in an annotation: of tables, arrays of tables and unions."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [model for argument in get_args(annotation) for model in _models(argument)]
 
 
 @pytest.mark.parametrize("case", REFUSED)

@@ -21,7 +21,7 @@ QUICKSTART = ROOT / "datasets/quickstart.toml"
 TABLES: dict[str, tuple[str, ...]] = {
     "sensor": (*Sensor.model_fields, "preset"),
     "accelerometer": ("kind", "error_deg", "bias_m_s2", "bits", "range_g", "samples", "temperature_c", "preset"),
-    "exposure": ("kind", "share_of_saturation", "level_db", "longest_s"),
+    "exposure": ("kind", "share_of_saturation", "level_db", "max_s"),
     "processed": ("curve", "gamma", "format", "quality"),
 }
 WORDS = (
@@ -49,7 +49,7 @@ PLAUSIBLE: dict[str, Any] = {
     "sensor.dark_current_e_s": 5.0,
     "sensor.preset": "industrial",
     "accelerometer.preset": "bmi270",
-    "exposure": {"kind": "peak", "share_of_saturation": 0.5, "longest_s": 1},
+    "exposure": {"kind": "peak", "share_of_saturation": 0.5, "max_s": 1},
     "processed.format": "png",
 }
 """Values that are taken, so that not all is refused."""

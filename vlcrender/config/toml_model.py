@@ -10,6 +10,7 @@ from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic.fields import FieldInfo
+from pydantic_core import PydanticCustomError
 
 from vlcrender.errors import InputError
 
@@ -21,6 +22,18 @@ class Settings(BaseModel):
 
 
 S = TypeVar("S", bound=Settings)
+
+RENAMED_KEYS = {
+    "exposure.longest_s": "exposure.max_s",
+    "window": "glazing",
+    "windows": "regions",
+}
+"""Former key -> present key of a recipe or scene, dotted paths without indices of arrays; a former key is refused."""
+
+
+def key_error(key: str, message: str) -> PydanticCustomError:
+    """The exception that a model's validator raises for one `key` of its table; `message` follows the key."""
+    return PydanticCustomError("key_error", "{message}", {"key": key, "message": message})
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -66,12 +79,15 @@ def _value(text: str) -> Any:
 
 
 def check(tree: Mapping[str, Any], model: type[S], source: str) -> S:
-    """Check a tree against a model. `source` names it in the InputError raised for the first thing wrong."""
+    """Check a tree against a model. Raises InputError, one line that starts with `source`, for the first problem."""
+    for former, present in RENAMED_KEYS.items():
+        if _has_key(tree, former.split(".")):
+            raise InputError(f"{source}: key {former} was renamed: write {present}")
     try:
         # JSON in strict mode: 1 passes for 1.0 and a list for a tuple, but "1" and true do not pass for 1.
         return model.model_validate_json(json.dumps(tree, default=str), strict=True)
     except ValidationError as error:
-        # a key in another unit is both unknown and missing: the unknown one says more
+        # A key in another unit is both unknown and missing: the unknown one says more.
         problems = sorted(error.errors(include_url=False), key=lambda problem: problem["type"] != "extra_forbidden")
         more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
         raise InputError(f"{source}: {_one_line(problems[0], model)}{more}") from None
@@ -79,11 +95,24 @@ def check(tree: Mapping[str, Any], model: type[S], source: str) -> S:
         raise InputError(f"{source}: {error}") from None
 
 
+def _has_key(tree: Any, path: list[str]) -> bool:
+    """Whether a tree has a key at a path; a path passes through arrays of tables."""
+    if isinstance(tree, (list, tuple)):
+        return any(_has_key(item, path) for item in tree)
+    if not isinstance(tree, Mapping) or path[0] not in tree:
+        return False
+    return len(path) == 1 or _has_key(tree[path[0]], path[1:])
+
+
 def _one_line(problem: Any, model: type[Settings]) -> str:
     location = [part for part in problem["loc"] if not _is_tag(part, model)]
-    key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in location).lstrip(".")
     kind, message, value = str(problem["type"]), str(problem["msg"]), problem["input"]
+    if kind == "key_error":
+        location.append(problem["ctx"]["key"])
+    key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in location).lstrip(".")
     message = message.removeprefix("Value error, ").replace("\n", " ")
+    if kind == "key_error":
+        return f"{key}: {message}" if message != "is missing" else f"key {key} is missing"
     if kind == "extra_forbidden":
         allowed = _keys_at(model, list(problem["loc"])[:-1])
         unknown = str(location[-1])
