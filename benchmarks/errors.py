@@ -50,8 +50,8 @@ def main() -> None:
     )
     worst, pixels = 0.0, 0
     for pose in POSES:
-        for i in leds_that_may_be_seen(camera, pose, scene.leds.centers_m, scene.leds.radii_m):
-            image = coverage_of_led(camera, pose, scene.leds.centers_m[i], Disc(float(scene.leds.radii_m[i])))
+        for i in leds_that_may_be_seen(camera, pose, scene.leds.centers_m, scene.leds.half_widths_m):
+            image = coverage_of_led(camera, pose, scene.leds.centers_m[i], Disc(float(scene.leds.half_widths_m[i])))
             if image is None or image.visible_fraction < 1:
                 continue
             rows, columns = image.coverage.shape
@@ -63,7 +63,9 @@ def main() -> None:
                     "height_px": FINER * rows,
                 }
             )
-            fine_image = coverage_of_led(shifted, pose, scene.leds.centers_m[i], Disc(float(scene.leds.radii_m[i])))
+            fine_image = coverage_of_led(
+                shifted, pose, scene.leds.centers_m[i], Disc(float(scene.leds.half_widths_m[i]))
+            )
             assert fine_image is not None
             whole = np.zeros((FINER * rows, FINER * columns))
             r, c = fine_image.row, fine_image.column

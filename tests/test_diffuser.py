@@ -164,10 +164,10 @@ def test_diffusers_and_frames_are_as_in_the_reference(frame: bool) -> None:
 @pytest.mark.parametrize(
     ("panel", "message"),
     [
-        ({"frame": {**FRAME, "width_m": 0.1}}, r"columns at 0\.15 m.*its frame leaves 0\.3 m"),
+        ({"frame": {**FRAME, "width_m": 0.1}}, r"columns 0\.15 m apart.*its frame leaves 0\.3 m"),
         ({"frame": {**FRAME, "depth_m": 2.5}}, "is not inside the room"),
-        ({"diffuser": {**DIFFUSER, "distance_m": 0.02}}, r"distance_m = 0\.02: has to be from 0\.024 m"),
-        ({"diffuser": {**DIFFUSER, "distance_m": 0.07}}, r"distance_m = 0\.07.*to 0\.06 m, the panel's height"),
+        ({"diffuser": {**DIFFUSER, "distance_m": 0.02}}, r"distance_m = 0\.02: is not from 0\.024 m"),
+        ({"diffuser": {**DIFFUSER, "distance_m": 0.07}}, r"distance_m = 0\.07.*to 0\.06 m \(the panel's height\)"),
         ({"diffuser": {**DIFFUSER, "transmittance": 1.1}}, r"diffuser\.transmittance = 1\.1"),
     ],
 )

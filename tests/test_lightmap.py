@@ -25,7 +25,8 @@ def scene_of(folder: Path | None = None, **changes: object) -> Scene:
 
 
 def lamp(**values: object) -> dict[str, object]:
-    return {"id": 1, "position_m": [3.5, 3.5, 3.5], "radius_m": 0.01, "luminance_cd_m2": 10000.0, **values}
+    size = {} if values.get("shape") == "square" else {"radius_m": 0.01}
+    return {"id": 1, "position_m": [3.5, 3.5, 3.5], **size, "luminance_cd_m2": 10000.0, **values}
 
 
 def empty_room(mesh: Mesh) -> object:
@@ -51,7 +52,7 @@ def test_below_a_disc() -> None:
 
 def test_below_a_square() -> None:
     """On the axis of a square: four corner rectangles with the textbook's form factor, X = half side / height."""
-    scene = scene_of(led=[lamp(radius_m=0.1, shape="square")])
+    scene = scene_of(led=[lamp(side_m=0.2, shape="square")])
     x = 0.1 / 3.5
     factor = 4 / (2 * np.pi) * 2 * x / np.sqrt(1 + x**2) * np.arctan(x / np.sqrt(1 + x**2))
     # the small-source form leaves out 4/3 X^2 = 1.1e-3

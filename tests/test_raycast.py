@@ -130,10 +130,9 @@ def test_a_lambertian_order_dims_the_led_aside() -> None:
 
 def test_a_square_led_has_the_light_of_its_area() -> None:
     pose = Pose((3.0, 3.5, 0.5))
-    disc, square = (
-        patch_of(room(led=[{**LAMP, "shape": shape}]), pose).electrons_per_s.sum(dtype=float)
-        for shape in ("disc", "square")
-    )
+    side = 2 * LAMP["radius_m"]
+    square_led = {key: value for key, value in LAMP.items() if key != "radius_m"} | {"shape": "square", "side_m": side}
+    disc, square = (patch_of(room(led=[led]), pose).electrons_per_s.sum(dtype=float) for led in (LAMP, square_led))
     assert square / disc == pytest.approx(4 / np.pi, rel=1e-3)
 
 

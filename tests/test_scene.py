@@ -91,6 +91,12 @@ BAD_TABLE1 = [
     ("radius_m = 0.01", "radius_m = nan", r"led\[0\]\.radius_m"),
     ("radius_m = 0.01", "radius_m = true", r"led\[0\]\.radius_m = true"),
     ("radius_m = 0.01", "radius_m = 0.01\ncolour = 3", r"unknown key led\[0\]\.colour; allowed: half_power_deg, id"),
+    ("radius_m = 0.01", 'shape = "square"\nradius_m = 0.01', r"led\[0\]\.radius_m: .*a square has side_m"),
+    ("radius_m = 0.01", "side_m = 0.02", r"led\[0\]\.side_m: .*a disc has radius_m"),
+    ("radius_m = 0.01", "radius_m = 0.01\nside_m = 0.02", r"led\[0\]\.side_m: .*a disc has radius_m"),
+    ("radius_m = 0.01", 'shape = "square"', r"key led\[0\]\.side_m is missing"),
+    ("radius_m = 0.01", 'shape = "square"\nside_m = 0.0', r"led\[0\]\.side_m = 0\.0: .*greater than 0"),
+    ("[[led]]", '[[window]]\nwall = "x=0"\n[[led]]', r"key window was renamed: write glazing"),
     ("position_m = [0.5, 1.5, 3.5]", "position_m = [5, 15, 35]", r"led\[0\]: LED 1 .*not inside the room"),
     ("position_m = [0.5, 1.5, 3.5]", "position_m = [0.005, 1.5, 3.5]", r"LED 1 .*not inside the room"),
     ("position_m = [0.5, 1.5, 3.5]", "position_m = [0.5, 1.5]", r"led\[0\]\.position_m"),
@@ -123,6 +129,7 @@ BAD_OFFICE = [
     ("columns = 7\nrows = 7", "columns = 8\nrows = 7", r"panels\[0\].*not inside the room"),
     ("pitch_m = [1.0, 1.0]", "pitch_m = [0.5, 1.0]", r"panels\[0\]\.pitch_m: .*overlap"),
     ("pitch_m = [0.13, 0.13]", "pitch_m = [0.15, 0.13]", r"panels\[0\]\.leds: 5 columns .*the panel is 0\.6 m"),
+    ("radius_m = 0.01", 'shape = "square"\nradius_m = 0.01', r"panels\[0\]\.leds\.radius_m: .*a square has side_m"),
     ("[4000.0, 16000.0]", "[16000.0, 4000.0]", r"the lower value comes first"),
     ("columns = 7", "columns = 0", r"panels\[0\]\.columns = 0"),
     ("first_id = 0", "frist_id = 0", r"did you mean first_id"),
@@ -179,15 +186,26 @@ def test_furniture_that_is_no_mesh_in_the_room_is_refused(tmp_path: Path, name: 
 
 def test_a_square_led_counts_as_seen_only_with_its_corners() -> None:
     """Half side 0.01 m at 3 m is 50 px, its corner 71 px from the centre; yaw of 45 deg turns it to the border."""
-    led = {"id": 1, "position_m": [3.0, 3.0, 3.5], "radius_m": 0.01, "luminance_cd_m2": 1e4}
+    led = {"id": 1, "position_m": [3.0, 3.0, 3.5], "luminance_cd_m2": 1e4}
     # the centre is 60 px inside the left border
     pose = Pose((3.0 + 1940 * 3 / 15000 * np.sqrt(0.5), 3.0 + 1940 * 3 / 15000 * np.sqrt(0.5), 0.5), yaw_deg=45.0)
     seen = {}
-    for shape in ("disc", "square"):
-        tree = {**tomllib.loads(TABLE1), "led": [{**led, "shape": shape}]}
+    for shape, size in (("disc", {"radius_m": 0.01}), ("square", {"side_m": 0.02})):
+        tree = {**tomllib.loads(TABLE1), "led": [{**led, "shape": shape, **size}]}
         scene = build_scene(check(tree, SceneSettings, "test"), "test")
         seen[shape] = len(leds_in_view(Camera(), pose, scene))
     assert seen == {"disc": 1, "square": 0}
+
+
+def test_an_led_of_one_half_width_is_twice_that_wide_as_disc_and_as_square() -> None:
+    """A disc of 0.01 m radius has pi 1e-4 m2, a square of 0.02 m has 4e-4 m2; its corner is sqrt(2) 0.01 m away."""
+    base = tomllib.loads(TABLE1)["led"]
+    square = {key: value for key, value in base[1].items() if key != "radius_m"} | {"shape": "square", "side_m": 0.02}
+    tree = {**tomllib.loads(TABLE1), "led": [base[0], square]}
+    leds = build_scene(check(tree, SceneSettings, "test"), "test").leds
+    assert leds.half_widths_m.tolist() == [0.01, 0.01]
+    assert leds.areas_m2 == pytest.approx([np.pi * 1e-4, 4e-4])
+    assert leds.reaches_m == pytest.approx([0.01, np.sqrt(2) * 0.01])
 
 
 def test_a_room_without_leds_is_refused(tmp_path: Path) -> None:

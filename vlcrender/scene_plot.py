@@ -77,7 +77,7 @@ def _draw_plan(axes: Axes, scene: Scene, camera: Camera, pose: Pose) -> EllipseC
         )
     )
     leds = scene.leds
-    widths = np.maximum(2 * leds.radii_m, 0.004 * x_m)
+    widths = np.maximum(2 * leds.half_widths_m, 0.004 * x_m)
     discs = EllipseCollection(
         widths,
         widths,

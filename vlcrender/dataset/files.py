@@ -151,7 +151,7 @@ def led_map(leds: Leds) -> tuple[LedMapEntry, ...]:
             radius_m=float(r),
             shape="square" if square else "disc",
         )
-        for i, c, r, square in zip(leds.ids, leds.centers_m, leds.radii_m, leds.squares, strict=True)
+        for i, c, r, square in zip(leds.ids, leds.centers_m, leds.half_widths_m, leds.squares, strict=True)
     )
 
 

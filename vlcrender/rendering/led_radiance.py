@@ -90,7 +90,7 @@ def led_images(
 
 def face_of_led(leds: Leds, i: int) -> tuple[Array, Disc | Rectangle]:
     """Centre (3,) and shape of what is seen to shine: the LED's face, or what it lights of a sheet."""
-    diffuser, radius = leds.diffusers[i], float(leds.radii_m[i])
+    diffuser, radius = leds.diffusers[i], float(leds.half_widths_m[i])
     if diffuser is not None:
         x0, y0, x1, y1 = diffuser.lit_m
         center: Array = np.array([(x0 + x1) / 2, (y0 + y1) / 2, leds.centers_m[i, 2]])

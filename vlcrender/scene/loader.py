@@ -33,13 +33,14 @@ class Leds:
     ids: NDArray[np.int64]
     centers_m: NDArray[np.float64]
     """Of the face; where an LED is behind a diffuser, straight below it on the sheet, where it is brightest."""
-    radii_m: NDArray[np.float64]
+    half_widths_m: NDArray[np.float64]
+    """Radius of a disc, half the side of a square."""
     luminances_cd_m2: NDArray[np.float64]
     orders: NDArray[np.float64]
     """Lambertian order m: luminance at an angle theta from the normal is luminance * cos^(m-1)(theta)."""
 
     squares: NDArray[np.bool_]
-    """Where True the LED is a square of half side `radii_m`, sides along x and y."""
+    """True for a square with sides along x and y, False for a disc."""
 
     diffusers: tuple[Diffuser | None, ...]
     """What each lights of a diffuser, which is seen in place of its face."""
@@ -51,12 +52,12 @@ class Leds:
     @property
     def areas_m2(self) -> NDArray[np.float64]:
         """Area of each face."""
-        return np.where(self.squares, 4.0, np.pi) * self.radii_m**2
+        return np.where(self.squares, 4.0, np.pi) * self.half_widths_m**2
 
     @property
     def reaches_m(self) -> NDArray[np.float64]:
         """From each centre to the farthest point seen to shine: a square's corner, a disc's rim, lit corner."""
-        reaches = np.where(self.squares, np.sqrt(2.0), 1.0) * self.radii_m
+        reaches = np.where(self.squares, np.sqrt(2.0), 1.0) * self.half_widths_m
         for i, diffuser in enumerate(self.diffusers):
             if diffuser is not None:
                 x0, y0, x1, y1 = diffuser.lit_m
@@ -114,7 +115,7 @@ def build_scene(settings: SceneSettings, source: str, folder: Path = Path()) -> 
 def _leds(settings: SceneSettings, source: str) -> Leds:
     ids: list[int] = []
     centers: list[NDArray[np.float64]] = []
-    radii: list[float] = []
+    half_widths: list[float] = []
     luminances: list[float] = []
     half_powers: list[float] = []
     shapes: list[str] = []
@@ -123,7 +124,7 @@ def _leds(settings: SceneSettings, source: str) -> Leds:
     for index, entry in enumerate(settings.led):
         ids.append(entry.id)
         centers.append(np.array(entry.position_m))
-        radii.append(entry.radius_m)
+        half_widths.append(entry.half_width_m)
         luminances.append(entry.luminance_cd_m2)
         half_powers.append(entry.half_power_deg)
         shapes.append(entry.shape)
@@ -140,7 +141,7 @@ def _leds(settings: SceneSettings, source: str) -> Leds:
         low, high = array.luminance_cd_m2
         ids += range(array.first_id, array.first_id + len(positions))
         centers += list(positions)
-        radii += [array.radius_m] * len(positions)
+        half_widths += [array.half_width_m] * len(positions)
         luminances += list(stream(array.luminance_seed, 0, "led-luminance").uniform(low, high, len(positions)))
         half_powers += [array.half_power_deg] * len(positions)
         shapes += [array.shape] * len(positions)
@@ -154,7 +155,7 @@ def _leds(settings: SceneSettings, source: str) -> Leds:
     leds = Leds(
         np.array(ids, dtype=np.int64)[order],
         np.array(centers)[order],
-        np.array(radii)[order],
+        np.array(half_widths)[order],
         np.array(luminances)[order],
         -np.log(2) / np.log(np.cos(np.radians(half_powers)))[order],
         np.array([shape == "square" for shape in shapes])[order],
@@ -181,19 +182,19 @@ def _leds(settings: SceneSettings, source: str) -> Leds:
 def _check_led_array(array: PanelLeds, grid: PanelGrid, where: str) -> None:
     rim = 0.0 if grid.frame is None else grid.frame.width_m
     for axis, name, count in ((0, "columns", array.columns), (1, "rows", array.rows)):
-        extent = (count - 1) * array.pitch_m[axis] + 2 * array.radius_m
+        extent = (count - 1) * array.pitch_m[axis] + 2 * array.half_width_m
         if extent > grid.size_m[axis] - 2 * rim + TOUCH_M:
             within = "" if grid.frame is None else f", and its frame leaves {grid.size_m[axis] - 2 * rim:.4g} m"
             raise InputError(
-                f"{where}.leds: {count} {name} at {array.pitch_m[axis]} m and radius {array.radius_m} m span "
-                f"{extent:.4g} m; the panel is {grid.size_m[axis]} m{within}"
+                f"{where}.leds: {count} {name} {array.pitch_m[axis]} m apart and {2 * array.half_width_m:.4g} m wide "
+                f"span {extent:.4g} m; the panel is {grid.size_m[axis]} m{within}"
             )
     if grid.diffuser is not None:
-        least, most = MIN_DISTANCE_RADII * array.radius_m, grid.size_m[2]
+        least, most = MIN_DISTANCE_RADII * array.half_width_m, grid.size_m[2]
         if not least - TOUCH_M <= grid.diffuser.distance_m <= most + TOUCH_M:
             raise InputError(
-                f"{where}.diffuser.distance_m = {grid.diffuser.distance_m}: has to be from {least:.4g} m, "
-                f"{MIN_DISTANCE_RADII:g} radii of the LEDs, to {most:.4g} m, the panel's height"
+                f"{where}.diffuser.distance_m = {grid.diffuser.distance_m}: is not from {least:.4g} m "
+                f"({MIN_DISTANCE_RADII:g} radii or half sides of the LEDs) to {most:.4g} m (the panel's height)"
             )
     if array.luminance_cd_m2[0] > array.luminance_cd_m2[1]:
         raise InputError(f"{where}.leds.luminance_cd_m2 = {list(array.luminance_cd_m2)}: the lower value comes first")
@@ -203,23 +204,24 @@ def _check_leds(leds: Leds, origins: list[str], room_m: NDArray[np.float64], sou
     repeated = np.flatnonzero(np.diff(leds.ids) == 0)
     if len(repeated):
         raise InputError(f"{source}: {origins[repeated[0] + 1]}: LED id {leds.ids[repeated[0]]} is used twice")
-    reach = np.stack([leds.radii_m, leds.radii_m, np.zeros(len(leds))], axis=1)
+    reach = np.stack([leds.half_widths_m, leds.half_widths_m, np.zeros(len(leds))], axis=1)
     outside = ((leds.centers_m - reach < -TOUCH_M) | (leds.centers_m + reach > room_m + TOUCH_M)).any(axis=1)
     if outside.any():
         i = int(np.flatnonzero(outside)[0])
         center = [round(float(v), 4) for v in leds.centers_m[i]]
         raise InputError(
-            f"{source}: {origins[i]}: LED {leds.ids[i]} at {center} m with radius {leds.radii_m[i]} m "
+            f"{source}: {origins[i]}: LED {leds.ids[i]} at {center} m, {2 * leds.half_widths_m[i]:.4g} m wide, "
             f"is not inside the room of {room_m.tolist()} m"
         )
     for i in range(len(leds) - 1):
         between = leds.centers_m[i + 1 :] - leds.centers_m[i]
         both_square = leds.squares[i + 1 :] & leds.squares[i]
         apart = np.where(both_square, np.abs(between).max(axis=1), np.linalg.norm(between, axis=1))
-        close = np.flatnonzero(apart < leds.radii_m[i + 1 :] + leds.radii_m[i] - TOUCH_M)
+        close = np.flatnonzero(apart < leds.half_widths_m[i + 1 :] + leds.half_widths_m[i] - TOUCH_M)
         if len(close):
             other = i + 1 + close[0]
             raise InputError(
                 f"{source}: {origins[other]}: LEDs {leds.ids[i]} and {leds.ids[other]} overlap: centres "
-                f"{apart[close[0]]:.4g} m apart, radii {leds.radii_m[i]} and {leds.radii_m[other]} m"
+                f"{apart[close[0]]:.4g} m apart, widths {2 * leds.half_widths_m[i]:.4g} and "
+                f"{2 * leds.half_widths_m[other]:.4g} m"
             )

@@ -1,10 +1,10 @@
 """A scene file's keys, units and limits."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from vlcrender.config.toml_model import Settings
+from vlcrender.config.toml_model import Settings, key_error
 
 Length = Annotated[float, Field(gt=0, le=1000)]
 Reflectance = Annotated[float, Field(ge=0, le=1)]
@@ -62,32 +62,63 @@ class Ambient(Settings):
 HalfPower = Annotated[float, Field(gt=5, lt=89)]
 
 
-class LedEntry(Settings):
+class LedFace(Settings):
+    """Shape and size of an LED's face: a disc has `radius_m`, a square has `side_m`."""
+
+    shape: Literal["disc", "square"] = "disc"
+    """`"disc"`, or `"square"` with sides along x and y."""
+    radius_m: Length | None = None
+    """Radius of a disc, metres. A square has `side_m` instead."""
+    side_m: Length | None = None
+    """Whole side of a square, metres. A disc has `radius_m` instead."""
+    half_power_deg: HalfPower = 60.0
+    """Angle from the normal at which luminous intensity is half of I_0, degrees: I = I_0 cos^m(angle) with
+    m = -ln 2 / ln cos(half_power_deg); 60 is Lambertian, m = 1."""
+
+    @model_validator(mode="after")
+    def _size_key_fits_the_shape(self) -> Self:
+        if self.shape == "disc":
+            if self.side_m is not None:
+                raise key_error("side_m", 'is for squares; a disc has radius_m, or write shape = "square"')
+            if self.radius_m is None:
+                raise key_error("radius_m", "is missing")
+        else:
+            if self.radius_m is not None:
+                raise key_error(
+                    "radius_m", "is for discs; a square has side_m, its whole side (twice the old radius_m)"
+                )
+            if self.side_m is None:
+                raise key_error("side_m", "is missing")
+        return self
+
+    @property
+    def half_width_m(self) -> float:
+        """Radius of a disc, half the side of a square, metres."""
+        if self.shape == "disc":
+            assert self.radius_m is not None  # _size_key_fits_the_shape
+            return self.radius_m
+        assert self.side_m is not None
+        return self.side_m / 2
+
+
+class LedEntry(LedFace):
     """One LED: flat, facing down."""
 
     id: Identity
     position_m: Point
-    shape: Literal["disc", "square"] = "disc"
-    radius_m: Length
-    """Of a disc; of a square, with sides along x and y, half a side."""
     luminance_cd_m2: Luminance
     """Seen from straight below; the same from everywhere where half_power_deg is 60."""
-    half_power_deg: HalfPower = 60.0
-    """Where the luminous intensity has fallen to half: I = I_0 cos^m, m = -ln 2 / ln cos(half_power)."""
 
 
-class PanelLeds(Settings):
+class PanelLeds(LedFace):
     """The two-dimensional array of LEDs on the underside of a panel, centred on it."""
 
     columns: Count
     rows: Count
     pitch_m: tuple[Length, Length]
-    shape: Literal["disc", "square"] = "disc"
-    radius_m: Length
     luminance_cd_m2: tuple[Luminance, Luminance]
     """Of the bare LED, also behind a diffuser; drawn evenly between the two, once and for all, by `luminance_seed`."""
     luminance_seed: Identity = 0
-    half_power_deg: HalfPower = 60.0
     first_id: Identity
     """LED (row, column) of panel (row, column): ids go up along columns first, then rows, then panels likewise."""
 
