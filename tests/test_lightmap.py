@@ -1,13 +1,18 @@
 """The room's light against closed forms: single sources, white furnace, energy balance, form factors, shadows."""
 
 import dataclasses
+import errno
+import pwd
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from conftest import ROOT
+from platformdirs import user_cache_dir
 
 from vlcrender.config.toml_model import check, read_toml
+from vlcrender.light import bake_cache
 from vlcrender.light.lightmap import bake, led_illuminance_lux, path_traced_lux, room_mesh
 from vlcrender.light.mitsuba_room import mitsuba_scene
 from vlcrender.scene.fresnel import glazing_reflectance
@@ -179,7 +184,7 @@ def test_a_window_lights_the_room_as_its_form_factor_says(tmp_path: Path) -> Non
     face = (0.52 / 2.52) ** 2
     through = np.pi * 2000 * expected * (1 - 2 * face / (1 + face))
     ambient = scene.settings.ambient.illuminance_lux
-    assert abs(light.surround_lux[point] - ambient - through) < 5 * light.sigma_lux[point] + 2e-3 * through
+    assert abs(light.ambient_lux[point] - ambient - through) < 5 * light.sigma_lux[point] + 2e-3 * through
 
 
 MIRROR = {"wall": "x=0", "corner_m": [3.0, 0.5], "size_m": [1.0, 2.5], "luminance_cd_m2": 0.0}
@@ -229,6 +234,73 @@ def test_the_bake_is_kept_and_taken_again(tmp_path: Path) -> None:
     # another scene has its own
     bake(scene_of(led=[lamp(luminance_cd_m2=5000.0)], bake={"texel_m": 1.0, "paths": 64}), tmp_path)
     assert len(list(tmp_path.glob("*.npz"))) == 2
+
+
+@pytest.fixture
+def no_bakes_in_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bake_cache, "_in_memory", {})
+
+
+def without_home(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A user without $HOME and without an entry in the password database, as in some containers."""
+
+    def no_entry(uid: int) -> None:
+        raise KeyError(uid)
+
+    for name in ("VLCRENDER_CACHE", "XDG_CACHE_HOME", "HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(pwd, "getpwuid", no_entry)
+
+
+@pytest.mark.usefixtures("no_bakes_in_memory")
+@pytest.mark.parametrize("case", ["a file in the folder's place", "no home"])
+def test_a_bake_that_cannot_be_written_is_kept_in_memory_with_one_warning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, case: str
+) -> None:
+    scene = scene_of(led=[lamp()], bake={"texel_m": 1.0, "paths": 8})
+    written = bake(scene, tmp_path / "writable")
+    assert not caplog.records
+    if case == "no home":
+        without_home(monkeypatch)
+        assert bake_cache.cache_folder() is None
+    else:
+        (tmp_path / "file").write_text("")
+        monkeypatch.setenv("VLCRENDER_CACHE", str(tmp_path / "file"))
+    stages: list[str] = []
+    first = bake(scene, progress=lambda stage, share: stages.append(stage))
+    assert stages
+    assert first.led_lux.tobytes() == written.led_lux.tobytes()
+    (record,) = caplog.records
+    assert record.levelname == "WARNING"
+    assert "cannot keep the bake" in record.getMessage()
+    assert "\n" not in record.getMessage()
+    stages.clear()
+    assert bake(scene, progress=lambda stage, share: stages.append(stage)).led_lux.tobytes() == first.led_lux.tobytes()
+    assert not stages
+    assert len(caplog.records) == 1
+
+
+@pytest.mark.usefixtures("no_bakes_in_memory")
+def test_a_full_disk_leaves_no_part_of_a_bake(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def full(*arguments: object, **arrays: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(np, "savez_compressed", full)
+    bake(scene_of(led=[lamp()], bake={"texel_m": 1.0, "paths": 8}), tmp_path)
+    assert not list(tmp_path.iterdir())
+    assert "No space left on device" in caplog.text
+
+
+def test_the_cache_folder_is_the_chosen_one_else_the_users(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("VLCRENDER_CACHE", str(tmp_path / "own"))
+    assert bake_cache.cache_folder() == tmp_path / "own"
+    monkeypatch.delenv("VLCRENDER_CACHE")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert bake_cache.cache_folder() == Path(user_cache_dir("vlcrender", appauthor=False))
+    if sys.platform == "linux":
+        assert bake_cache.cache_folder() == tmp_path / "vlcrender"
 
 
 def test_the_mesh_leaves_out_what_panels_cover(office: Scene) -> None:

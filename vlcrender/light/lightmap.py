@@ -11,17 +11,16 @@ a hash of the scene and of all that went into it.
 """
 
 import hashlib
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vlcrender.core.backend import dr, exact_math, mi
+from vlcrender.light.bake_cache import BakedIlluminance, cache_folder, load, store
 from vlcrender.light.mitsuba_room import mitsuba_scene
 from vlcrender.scene.fresnel import glazing_reflectance
 from vlcrender.scene.furniture import furniture_meshes
@@ -47,14 +46,14 @@ OFFSET_M = 1e-4
 class Lightmap:
     """Illuminance in lux at the corners of `mesh` and then on the faces of the scene's LEDs, (corners + LEDs,) each.
 
-    `led_lux` is light that left an LED, `surround_lux` all other; `sigma_lux` is the Monte Carlo standard error of
+    `led_lux` is light that left an LED, `ambient_lux` all other; `sigma_lux` is the Monte Carlo standard error of
     their sum. `albedo` is that of the same places.
     """
 
     mesh: Mesh
     albedo: Array
     led_lux: Array
-    surround_lux: Array
+    ambient_lux: Array
     sigma_lux: Array
 
     def led_cd_m2(self) -> Array:
@@ -63,7 +62,7 @@ class Lightmap:
 
     def ambient_cd_m2(self) -> Array:
         """Luminance of the surfaces by all other light."""
-        return self.albedo * self.surround_lux / np.pi
+        return self.albedo * self.ambient_lux / np.pi
 
 
 def room_mesh(scene: Scene) -> Mesh:
@@ -73,25 +72,19 @@ def room_mesh(scene: Scene) -> Mesh:
 
 
 def bake(scene: Scene, cache: Path | None = None, progress: Progress = lambda stage, share: None) -> Lightmap:
-    """Compute the room's light, or take it from the cache folder (`default_cache()` where None).
+    """Compute the room's light, or take it from the cache folder (`cache_folder()` where None).
 
     `progress` is told (stage, share done). Raises InputError for furniture that cannot be used.
     """
     mesh = room_mesh(scene)
     albedo = np.concatenate([mesh.albedo, np.full(len(scene.leds), scene.settings.led_reflectance)])
-    file = (cache or default_cache()) / f"{_key(scene, mesh)}.npz"
-    stored = _load(file, len(albedo))
-    if stored is None:
-        stored = _compute(scene, mesh, progress)
-        _store(file, stored)
-    led, surround, sigma = stored
-    return Lightmap(mesh, albedo, led, surround + scene.settings.ambient.illuminance_lux, sigma)
-
-
-def default_cache() -> Path:
-    """$VLCRENDER_CACHE, else the user's cache folder."""
-    chosen = os.environ.get("VLCRENDER_CACHE")
-    return Path(chosen) if chosen else Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "vlcrender"
+    folder, key = cache or cache_folder(), _key(scene, mesh)
+    baked = load(key, len(albedo), folder)
+    if baked is None:
+        baked = _compute(scene, mesh, progress)
+        store(key, baked, folder)
+    ambient = baked.daylight_lux + scene.settings.ambient.illuminance_lux
+    return Lightmap(mesh, albedo, baked.led_lux, ambient, baked.sigma_lux)
 
 
 def led_illuminance_lux(
@@ -225,7 +218,7 @@ def _points(points_m: Array) -> "mi.Point3f":
     return mi.Point3f(*points_m.T.astype(np.float32))
 
 
-def _compute(scene: Scene, mesh: Mesh, progress: Progress) -> tuple[Array, Array, Array]:
+def _compute(scene: Scene, mesh: Mesh, progress: Progress) -> BakedIlluminance:
     leds = scene.leds
     points = np.concatenate([mesh.probes_m, leds.centers_m])
     normals = np.concatenate([mesh.normals, np.tile([0.0, 0.0, -1.0], (len(leds), 1))])
@@ -237,14 +230,14 @@ def _compute(scene: Scene, mesh: Mesh, progress: Progress) -> tuple[Array, Array
     paths = scene.settings.bake.paths
     lit = mitsuba_scene(mesh, mesh.albedo * direct[: len(dark)] / np.pi, scene.glazings, panes_glow=False)
     bounced, sigma = path_traced_lux(lit, points, normals, paths, lambda share: progress("reflected light", share))
-    surround = np.zeros(len(points))
+    daylight = np.zeros(len(points))
     if any(glazing.luminance_cd_m2 > 0 for glazing in scene.glazings):
         by_day = mitsuba_scene(mesh, dark, scene.glazings, panes_glow=True)
-        surround, more = path_traced_lux(
+        daylight, more = path_traced_lux(
             by_day, points, normals, paths, lambda share: progress("light from windows", share)
         )
         sigma = np.hypot(sigma, more)
-    return direct + bounced, surround, sigma
+    return BakedIlluminance(direct + bounced, daylight, sigma)
 
 
 def _key(scene: Scene, mesh: Mesh) -> str:
@@ -265,20 +258,3 @@ def _key(scene: Scene, mesh: Mesh) -> str:
 def _glazing_key(glazing: Glazing) -> tuple[object, ...]:
     edges = (glazing.corner_m.tolist(), glazing.edge_u_m.tolist(), glazing.edge_v_m.tolist())
     return (*edges, glazing.luminance_cd_m2, glazing.refractive_index)
-
-
-def _load(file: Path, corners: int) -> tuple[Array, Array, Array] | None:
-    try:
-        with np.load(file) as stored:
-            led, surround, sigma = stored["led_lux"], stored["surround_lux"], stored["sigma_lux"]
-    except (OSError, ValueError, KeyError, EOFError, BadZipFile):
-        return None  # not there, or cut short by a crash: computed again
-    return (led, surround, sigma) if led.shape == (corners,) else None
-
-
-def _store(file: Path, light: tuple[Array, Array, Array]) -> None:
-    file.parent.mkdir(parents=True, exist_ok=True)
-    partial = file.with_suffix(f".{os.getpid()}.partial")
-    with partial.open("wb") as out:
-        np.savez_compressed(out, led_lux=light[0], surround_lux=light[1], sigma_lux=light[2])
-    os.replace(partial, file)

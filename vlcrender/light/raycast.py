@@ -81,16 +81,16 @@ class Room:
             if surface.texture is not None:
                 self._textured[mesh.faces[mesh.owners == number]] = True
 
-    def values(self, light: Lightmap, led_rate: float, surround_rate: float) -> "mi.Float":
+    def values(self, light: Lightmap, led_rate: float, ambient_rate: float) -> "mi.Float":
         """What corners are worth in `look`: light from LEDs times one factor plus other light times another.
 
         Of textured surfaces that is what they would be worth if they reflected all.
         """
         corners = len(light.mesh.vertices_m)
-        surfaces = led_rate * light.led_cd_m2()[:corners] + surround_rate * light.ambient_cd_m2()[:corners]
-        lux = led_rate * light.led_lux[:corners] + surround_rate * light.surround_lux[:corners]
+        surfaces = led_rate * light.led_cd_m2()[:corners] + ambient_rate * light.ambient_cd_m2()[:corners]
+        lux = led_rate * light.led_lux[:corners] + ambient_rate * light.ambient_lux[:corners]
         surfaces = np.where(self._textured, lux / np.pi, surfaces)
-        glazings = np.repeat([surround_rate * glazing.luminance_cd_m2 for glazing in self._panes], 4)
+        glazings = np.repeat([ambient_rate * glazing.luminance_cd_m2 for glazing in self._panes], 4)
         return mi.Float(np.concatenate([surfaces, glazings]).astype(np.float32))
 
     def trace(
