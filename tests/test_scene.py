@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.config.toml_model import check
 from vlcrender.errors import InputError
-from vlcrender.light.lightmap import room_mesh
 from vlcrender.scene.loader import Scene, build_scene, load_scene
 from vlcrender.scene.schema import SceneSettings
 from vlcrender.scene.visibility import leds_in_view, level_visibility
@@ -159,28 +158,6 @@ BAD_ADDITIONS: list[tuple[dict[str, object], str]] = [
 def test_windows_furniture_and_bakes_that_cannot_be_are_refused(changes: dict[str, object], message: str) -> None:
     with pytest.raises(InputError, match=message) as refusal:
         build_scene(check({**tomllib.loads(TABLE1), **changes}, SceneSettings, "test"), "test")
-    assert "\n" not in str(refusal.value)
-
-
-FURNITURE_FILES = {
-    "noise.ply": b"\x00\x01 not a mesh",
-    "empty.obj": b"",
-    "far.obj": b"v 0 0 0\nv 90 0 0\nv 0 90 0\nf 1 2 3\n",
-    "nan.obj": b"v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n",
-    "broken.xml": b"<scene version='3.0.0'><shape",
-    "sphere.xml": b"<scene version='3.0.0'><shape type='sphere'/></scene>",
-    "lamp.xml": b"<scene version='3.0.0'><shape type='rectangle'><emitter type='area'/></shape></scene>",
-    "nothing.xml": b"<scene version='3.0.0'></scene>",
-}
-
-
-@pytest.mark.parametrize("name", FURNITURE_FILES)
-def test_furniture_that_is_no_mesh_in_the_room_is_refused(tmp_path: Path, name: str) -> None:
-    (tmp_path / name).write_bytes(FURNITURE_FILES[name])
-    tree = {**tomllib.loads(TABLE1), "furniture": [{"file": name}]}
-    scene = build_scene(check(tree, SceneSettings, "test"), "test", tmp_path)
-    with pytest.raises(InputError, match=rf"furniture\[0\]\.file = '{name}'") as refusal:
-        room_mesh(scene)
     assert "\n" not in str(refusal.value)
 
 

@@ -32,7 +32,7 @@ from vlcrender.scene.surfaces import Glazing
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
-CACHE_VERSION = 3
+CACHE_VERSION = 4
 BATCHES = 8
 MAX_DEPTH = 64
 """Bounces followed; roulette ends nearly all paths long before."""
