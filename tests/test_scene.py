@@ -2,11 +2,13 @@
 
 import tomllib
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from pydantic import BaseModel
 
 from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.config.toml_model import check
@@ -220,3 +222,15 @@ def test_every_shipped_scene_can_be_laid_out(path: Path) -> None:
     scene = load_scene(path)
     assert len(scene.leds) == len(scene.leds.diffusers)
     assert all(0 < surface.reflectance < 1 for surface in scene.surfaces)
+
+
+def models_in(annotation: object) -> set[type[BaseModel]]:
+    """All models in an annotation, those of their own keys included."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return {annotation}.union(*(models_in(field.annotation) for field in annotation.model_fields.values()))
+    return set().union(*(models_in(argument) for argument in get_args(annotation)))
+
+
+@pytest.mark.parametrize("model", sorted(models_in(SceneSettings), key=lambda model: model.__name__))
+def test_every_key_of_a_scene_is_described(model: type[BaseModel]) -> None:
+    assert {name for name, field in model.model_fields.items() if not field.description} == set()
