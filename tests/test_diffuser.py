@@ -9,7 +9,7 @@ from vlcrender.camera.roi import Roi
 from vlcrender.errors import InputError
 from vlcrender.rendering.background import differs_from_neighbour
 from vlcrender.rendering.renderer import Renderer
-from vlcrender.scene.diffuser import DIM_SHARE, Diffuser
+from vlcrender.scene.diffuser import MIN_RELATIVE_LUMINANCE, Diffuser
 from vlcrender.scene.loader import Scene
 from vlcrender.sensor.radiometry import Silicon, electron_rate_per_cd_m2
 
@@ -61,13 +61,13 @@ def test_on_a_wide_sheet_all_light_passes_but_what_is_dim(order: float) -> None:
     """
     diffuser = Diffuser((0.0, 0.0), 0.04, 0.6, 1e-4, order, (-9.0, -9.0, 9.0, 9.0))
     whole = 0.6 * 1e-4 * 2 / (order + 1)
-    cosine = DIM_SHARE ** (1 / (order + 3))
+    cosine = MIN_RELATIVE_LUMINANCE ** (1 / (order + 3))
     corner = 1 / np.sqrt(1 + 2 * (1 / cosine**2 - 1))
     light = diffuser.quadrants()[1].sum()
     assert whole * (1 - cosine ** (order + 1)) < light < whole * (1 - corner ** (order + 1))
-    # at the circle's rim the sheet has DIM_SHARE of the foot's luminance
-    edge = diffuser.luminance(np.array([0.0, diffuser.reach_m]), np.zeros(2))
-    assert edge[1] / edge[0] == pytest.approx(DIM_SHARE, rel=1e-9)
+    # at the circle's rim the sheet has MIN_RELATIVE_LUMINANCE of the foot's luminance
+    edge = diffuser.luminance(np.array([0.0, diffuser.lit_radius_m]), np.zeros(2))
+    assert edge[1] / edge[0] == pytest.approx(MIN_RELATIVE_LUMINANCE, rel=1e-9)
 
 
 @pytest.mark.parametrize("diffuser", [SHEET, Diffuser((0.0, 0.0), 0.04, 0.6, 1e-4, 1.0, (-9.0, -9.0, 9.0, 9.0))])

@@ -35,7 +35,7 @@ def lamp(**values: object) -> dict[str, object]:
 
 
 def empty_room(mesh: Mesh) -> object:
-    return mitsuba_scene(mesh, np.zeros(len(mesh.vertices_m)), (), panes_glow=False)
+    return mitsuba_scene(mesh, np.zeros(len(mesh.vertices_m)), (), daylight=False)
 
 
 def lux_on_floor(leds: Leds, x: float, y: float, scene: Scene) -> float:
@@ -101,7 +101,7 @@ def test_white_furnace(albedo: float) -> None:
     scene = scene_of(led=[lamp()])
     mesh = mesh_of_surfaces(scene.surfaces, 1.0)
     mesh = dataclasses.replace(mesh, albedo=np.full(len(mesh.vertices_m), albedo))
-    glowing = mitsuba_scene(mesh, np.ones(len(mesh.vertices_m)), (), panes_glow=False)
+    glowing = mitsuba_scene(mesh, np.ones(len(mesh.vertices_m)), (), daylight=False)
     lux, sigma = path_traced_lux(glowing, mesh.probes_m, mesh.normals, 2048, lambda share: None)
     expected = np.pi / (1 - albedo)
     n = len(lux)
@@ -222,7 +222,7 @@ def test_the_bake_is_kept_and_taken_again(tmp_path: Path) -> None:
     scene = scene_of(led=[lamp()], bake={"texel_m": 1.0, "paths": 64})
     stages: list[str] = []
     first = bake(scene, tmp_path, lambda stage, share: stages.append(stage))
-    assert "reflected light" in stages
+    assert "reflected light of LEDs" in stages
     stages.clear()
     again = bake(scene, tmp_path, lambda stage, share: stages.append(stage))
     assert not stages

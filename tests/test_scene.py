@@ -131,7 +131,7 @@ BAD_OFFICE = [
     ("pitch_m = [1.0, 1.0]", "pitch_m = [0.5, 1.0]", r"panels\[0\]\.pitch_m: .*overlap"),
     ("pitch_m = [0.13, 0.13]", "pitch_m = [0.15, 0.13]", r"panels\[0\]\.leds: 5 columns .*the panel is 0\.6 m"),
     ("radius_m = 0.01", 'shape = "square"\nradius_m = 0.01', r"panels\[0\]\.leds\.radius_m: .*a square has side_m"),
-    ("[4000.0, 16000.0]", "[16000.0, 4000.0]", r"the lower value comes first"),
+    ("[4000.0, 16000.0]", "[16000.0, 4000.0]", r"put the lower value first"),
     ("columns = 7", "columns = 0", r"panels\[0\]\.columns = 0"),
     ("first_id = 0", "frist_id = 0", r"did you mean first_id"),
 ]

@@ -1,4 +1,4 @@
-"""Cache of baked illuminance: one file a bake in the user's cache folder, this process's memory where that fails."""
+"""Cache of baked illuminance: one file per bake in the user's cache folder, or this process's memory if that fails."""
 
 import logging
 import os
@@ -16,19 +16,18 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class BakedIlluminance:
-    """Illuminance in lux that a bake computed, at the vertices of a room's mesh and then on its LEDs, (n,) each.
-
-    `led_lux` is light that left an LED, `daylight_lux` is light from outside through glazing, `sigma_lux` is the Monte
-    Carlo standard error of their sum.
-    """
+    """Results of a bake, (n,) each: at the vertices of a room's mesh, then on the faces of its LEDs."""
 
     led_lux: Array
+    """Illuminance by light of LEDs, direct and reflected."""
     daylight_lux: Array
+    """Illuminance by light from outside that the glazing transmits, direct and reflected."""
     sigma_lux: Array
+    """Monte Carlo standard error of the sum of both."""
 
 
 _in_memory: dict[str, BakedIlluminance] = {}
-"""By key, bakes of this process that could not be written."""
+"""Bakes of this process that could not be written, by key."""
 
 
 def cache_folder() -> Path | None:
@@ -43,7 +42,7 @@ def cache_folder() -> Path | None:
 
 
 def load(key: str, count: int, folder: Path | None) -> BakedIlluminance | None:
-    """The bake kept under `key` with `count` values an array; None where there is none, or its file is damaged."""
+    """The bake kept under `key`, with arrays of `count` values; None if there is none or its file is damaged."""
     if key in _in_memory:
         return _in_memory[key]
     if folder is None:
@@ -52,12 +51,12 @@ def load(key: str, count: int, folder: Path | None) -> BakedIlluminance | None:
         with np.load(_file(folder, key)) as stored:
             baked = BakedIlluminance(stored["led_lux"], stored["daylight_lux"], stored["sigma_lux"])
     except (OSError, ValueError, KeyError, EOFError, BadZipFile):
-        return None  # not there, or cut short by a crash
+        return None  # missing, or cut short by a crash
     return baked if baked.led_lux.shape == (count,) else None
 
 
 def store(key: str, baked: BakedIlluminance, folder: Path | None) -> None:
-    """Keep a bake under `key`. Where the folder cannot be written, log one warning and keep it in memory."""
+    """Keep a bake under `key`. If the folder cannot be written, log one warning and keep the bake in memory."""
     try:
         if folder is None:
             raise OSError("no home folder")

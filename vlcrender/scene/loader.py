@@ -1,6 +1,6 @@
-"""The room: surfaces, panels and LEDs. TOML in, checked geometry in world coordinates out.
+"""Scenes: a TOML file into checked geometry in world coordinates.
 
-World: metres, right-handed, z up, origin at a floor corner.
+World frame: metres, right-handed, z up, origin at a floor corner.
 """
 
 from dataclasses import dataclass, replace
@@ -28,35 +28,38 @@ from vlcrender.scene.surfaces import (
 
 @dataclass(frozen=True)
 class Leds:
-    """All LEDs of a scene, sorted by id: discs or squares that face down (normal 0, 0, -1)."""
+    """All n LEDs of a scene, sorted by id: discs and squares that face down (normal 0, 0, -1)."""
 
     ids: NDArray[np.int64]
+    """Identities, (n,)."""
     centers_m: NDArray[np.float64]
-    """Of the face; where an LED is behind a diffuser, straight below it on the sheet, where it is brightest."""
+    """Centre of each face, (n, 3), world. Of an LED behind a diffuser: the point of the diffuser straight below it."""
     half_widths_m: NDArray[np.float64]
-    """Radius of a disc, half the side of a square."""
+    """Radius of a disc, half the side of a square, (n,)."""
     luminances_cd_m2: NDArray[np.float64]
+    """Luminance along the normal, (n,)."""
     orders: NDArray[np.float64]
-    """Lambertian order m: luminance at an angle theta from the normal is luminance * cos^(m-1)(theta)."""
-
+    """Lambertian order m, (n,): luminance at an angle theta from the normal is luminance * cos^(m-1)(theta)."""
     squares: NDArray[np.bool_]
-    """True for a square with sides along x and y, False for a disc."""
-
+    """True for a square with sides along x and y, False for a disc, (n,)."""
     diffusers: tuple[Diffuser | None, ...]
-    """What each lights of a diffuser, which is seen in place of its face."""
+    """The part of a diffuser that each LED lights, which a camera images in place of the LED's face. None: bare LED."""
 
     def __len__(self) -> int:
-        """Count the LEDs."""
+        """Number of LEDs."""
         return len(self.ids)
 
     @property
     def areas_m2(self) -> NDArray[np.float64]:
-        """Area of each face."""
+        """Area of each face, (n,)."""
         return np.where(self.squares, 4.0, np.pi) * self.half_widths_m**2
 
     @property
     def reaches_m(self) -> NDArray[np.float64]:
-        """From each centre to the farthest point seen to shine: a square's corner, a disc's rim, lit corner."""
+        """Distance from each centre to the farthest luminous point, (n,).
+
+        The rim of a disc, a corner of a square or of the lit part of a diffuser.
+        """
         reaches = np.where(self.squares, np.sqrt(2.0), 1.0) * self.half_widths_m
         for i, diffuser in enumerate(self.diffusers):
             if diffuser is not None:
@@ -68,36 +71,40 @@ class Leds:
 
 @dataclass(frozen=True)
 class Scene:
-    """A room ready to be rendered. `settings` is what it was made from."""
+    """A room ready to be rendered."""
 
     settings: SceneSettings
+    """The checked scene file."""
     surfaces: tuple[Surface, ...]
+    """Diffuse surfaces of the room and its panels: floor, ceiling, four walls, panels. Furniture is not among them."""
     glazings: tuple[Glazing, ...]
+    """Glazing in the walls."""
     leds: Leds
+    """All LEDs."""
     folder: Path
-    """Where furniture and textures are looked up."""
+    """The folder of furniture and textures."""
 
     @property
     def name(self) -> str:
-        """The scene's name."""
+        """Name of the scene."""
         return self.settings.name
 
     @property
     def room_m(self) -> NDArray[np.float64]:
-        """Extent of the room along x, y, z."""
+        """Extent of the room along x, y and z, (3,)."""
         return np.array(self.settings.room.size_m)
 
 
 def load_scene(path: Path) -> Scene:
-    """Read and check a scene file. Raises InputError naming file, key and value."""
+    """The scene of a TOML file. Raises InputError that names file, key and value."""
     return build_scene(check(read_toml(path), SceneSettings, str(path)), str(path), path.parent)
 
 
 def build_scene(settings: SceneSettings, source: str, folder: Path = Path()) -> Scene:
-    """Lay out surfaces and LEDs; files of furniture and textures are below `folder`.
+    """The scene of checked settings. Files of furniture and textures are looked up in `folder`.
 
-    Raises InputError, which starts with `source`, where something is outside the room, overlaps, is missing or, of a
-    texture, cannot be used.
+    Raises InputError that starts with `source` for geometry outside the room, for overlaps, for missing files and for
+    textures that cannot be read.
     """
     leds = _leds(settings, source)
     glazings = glazings_of(settings, source)
@@ -106,9 +113,7 @@ def build_scene(settings: SceneSettings, source: str, folder: Path = Path()) -> 
         surfaces += panel_surfaces(grid, np.array(settings.room.size_m), f"{source}: panels[{index}]")
     for index, piece in enumerate(settings.furniture):
         if not (folder / piece.file).is_file():
-            raise InputError(
-                f"{source}: furniture[{index}].file = {piece.file!r}: no such file from the scene's folder"
-            )
+            raise InputError(f"{source}: furniture[{index}].file = {piece.file!r}: no such file in the scene's folder")
     return Scene(settings, tuple(surfaces), glazings, leds, folder)
 
 
@@ -120,7 +125,7 @@ def _leds(settings: SceneSettings, source: str) -> Leds:
     half_powers: list[float] = []
     shapes: list[str] = []
     origins: list[str] = []
-    behind: list[tuple[PanelDiffuser, tuple[float, float, float, float]] | None] = []
+    panel_diffusers: list[tuple[PanelDiffuser, tuple[float, float, float, float]] | None] = []
     for index, entry in enumerate(settings.led):
         ids.append(entry.id)
         centers.append(np.array(entry.position_m))
@@ -129,7 +134,7 @@ def _leds(settings: SceneSettings, source: str) -> Leds:
         half_powers.append(entry.half_power_deg)
         shapes.append(entry.shape)
         origins.append(f"led[{index}]")
-        behind.append(None)
+        panel_diffusers.append(None)
     for index, grid in enumerate(settings.panels):
         array = grid.leds
         _check_led_array(array, grid, f"{source}: panels[{index}]")
@@ -148,7 +153,7 @@ def _leds(settings: SceneSettings, source: str) -> Leds:
         origins += [f"panels[{index}].leds"] * len(positions)
         for center in panel_centers_m(grid).tolist():
             diffuser = None if grid.diffuser is None else (grid.diffuser, panel_opening_m(grid, center[0], center[1]))
-            behind += [diffuser] * len(offsets)
+            panel_diffusers += [diffuser] * len(offsets)
     if not ids:
         raise InputError(f"{source}: has no LED; add [[led]] or [[panels]]")
     order = np.argsort(ids, kind="stable")
@@ -163,16 +168,16 @@ def _leds(settings: SceneSettings, source: str) -> Leds:
     )
     diffusers = [
         None
-        if of_led is None
+        if panel_diffuser is None
         else Diffuser(
             (float(leds.centers_m[i, 0]), float(leds.centers_m[i, 1])),
-            of_led[0].distance_m,
-            of_led[0].transmittance,
+            panel_diffuser[0].distance_m,
+            panel_diffuser[0].transmittance,
             float(leds.areas_m2[i]),
             float(leds.orders[i]),
-            of_led[1],
+            panel_diffuser[1],
         )
-        for i, of_led in enumerate(behind[number] for number in order)
+        for i, panel_diffuser in enumerate(panel_diffusers[number] for number in order)
     ]
     leds = replace(leds, diffusers=tuple(diffusers))
     _check_leds(leds, [origins[i] for i in order], np.array(settings.room.size_m), source)
@@ -190,22 +195,24 @@ def _check_led_array(array: PanelLeds, grid: PanelGrid, where: str) -> None:
                 f"span {extent:.4g} m; the panel is {grid.size_m[axis]} m{within}"
             )
     if grid.diffuser is not None:
-        least, most = MIN_DISTANCE_RADII * array.half_width_m, grid.size_m[2]
-        if not least - TOUCH_M <= grid.diffuser.distance_m <= most + TOUCH_M:
+        lowest, highest = MIN_DISTANCE_RADII * array.half_width_m, grid.size_m[2]
+        if not lowest - TOUCH_M <= grid.diffuser.distance_m <= highest + TOUCH_M:
             raise InputError(
-                f"{where}.diffuser.distance_m = {grid.diffuser.distance_m}: is not from {least:.4g} m "
-                f"({MIN_DISTANCE_RADII:g} radii or half sides of the LEDs) to {most:.4g} m (the panel's height)"
+                f"{where}.diffuser.distance_m = {grid.diffuser.distance_m}: is not from {lowest:.4g} m "
+                f"({MIN_DISTANCE_RADII:g} radii or half sides of the LEDs) to {highest:.4g} m (the panel's height)"
             )
     if array.luminance_cd_m2[0] > array.luminance_cd_m2[1]:
-        raise InputError(f"{where}.leds.luminance_cd_m2 = {list(array.luminance_cd_m2)}: the lower value comes first")
+        raise InputError(f"{where}.leds.luminance_cd_m2 = {list(array.luminance_cd_m2)}: put the lower value first")
 
 
 def _check_leds(leds: Leds, origins: list[str], room_m: NDArray[np.float64], source: str) -> None:
     repeated = np.flatnonzero(np.diff(leds.ids) == 0)
     if len(repeated):
         raise InputError(f"{source}: {origins[repeated[0] + 1]}: LED id {leds.ids[repeated[0]]} is used twice")
-    reach = np.stack([leds.half_widths_m, leds.half_widths_m, np.zeros(len(leds))], axis=1)
-    outside = ((leds.centers_m - reach < -TOUCH_M) | (leds.centers_m + reach > room_m + TOUCH_M)).any(axis=1)
+    half_extents = np.stack([leds.half_widths_m, leds.half_widths_m, np.zeros(len(leds))], axis=1)
+    outside = ((leds.centers_m - half_extents < -TOUCH_M) | (leds.centers_m + half_extents > room_m + TOUCH_M)).any(
+        axis=1
+    )
     if outside.any():
         i = int(np.flatnonzero(outside)[0])
         center = [round(float(v), 4) for v in leds.centers_m[i]]
