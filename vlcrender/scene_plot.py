@@ -1,4 +1,4 @@
-"""A picture of a room: its plan and what a camera in it sees, with the share of poses that see enough LEDs."""
+"""Picture of a scene: a floor plan, and the image of a camera on the floor."""
 
 from pathlib import Path
 from typing import Any
@@ -19,14 +19,18 @@ from vlcrender.scene.visibility import leds_in_view
 from vlcrender.sensor.radiometry import Silicon, electron_rate_per_cd_m2
 
 EXPOSURE_S = 160e-6
+"""Exposure time of the image."""
 REFERENCE_SCALE = 8
+"""Size of the reference's pixels, in pixels of the camera."""
 REFERENCE_SAMPLES = 128
+"""Samples per pixel of the reference."""
 WHITE_E = 4000.0
+"""Electrons that are drawn white."""
 
 
 def show_pose(scene: Scene, camera: Camera) -> Pose:
-    """A level pose on the floor that sees as many LEDs as can be, of those under the middle of LEDs near each other."""
-    best, most = None, -1
+    """The level pose on the floor with the most LEDs in view, among poses below the middle of neighbouring LEDs."""
+    best, max_count = None, -1
     centers = scene.leds.centers_m
     middle = scene.room_m[:2] / 2
     order = np.argsort(np.linalg.norm(centers[:, :2] - middle, axis=1), kind="stable")[:50]
@@ -36,16 +40,16 @@ def show_pose(scene: Scene, camera: Camera) -> Pose:
             x, y = near[:, :2].mean(axis=0)
             pose = Pose((float(x), float(y), 0.05), yaw_deg=yaw)
             count = len(leds_in_view(camera, pose, scene))
-            if count > most:
-                best, most = pose, count
+            if count > max_count:
+                best, max_count = pose, count
     assert best is not None  # a scene has at least one LED
     return best
 
 
 def draw(scene: Scene, camera: Camera, path: Path, reference: bool = False) -> None:
-    """Write a PNG with the plan and the view from `show_pose`.
+    """Write a PNG with the floor plan and the image from `show_pose`.
 
-    With `reference` the view is path-traced by Mitsuba, slowly and in larger pixels.
+    reference: let Mitsuba path-trace the image, slowly and in pixels REFERENCE_SCALE times as large.
     """
     pose = show_pose(scene, camera)
     electrons: NDArray[Any]
@@ -102,7 +106,7 @@ def _draw_plan(axes: Axes, scene: Scene, camera: Camera, pose: Pose) -> EllipseC
         ylabel="y, m (down, as in the image)",
     )
     axes.set_aspect("equal")
-    axes.set_title(f"{scene.name}: {x_m:g} x {y_m:g} x {z_m:g} m seen from below, {len(leds)} LEDs; blue: the view")
+    axes.set_title(f"{scene.name}: {x_m:g} x {y_m:g} x {z_m:g} m seen from below, {len(leds)} LEDs; blue: the image")
     return discs
 
 
@@ -148,6 +152,6 @@ def _draw_view(axes: Axes, scene: Scene, camera: Camera, pose: Pose, electrons: 
     x, y, z = pose.position_m
     axes.set(xlabel="u, px", ylabel="v, px")
     axes.set_title(
-        f"seen level from ({x:.2f}, {y:.2f}, {z:.2f}) m, yaw {pose.yaw_deg:g} deg, "
+        f"level camera at ({x:.2f}, {y:.2f}, {z:.2f}) m, yaw {pose.yaw_deg:g} deg, "
         f"{EXPOSURE_S * 1e6:g} us at f/{camera.f_number:g}; gamma 2.2"
     )
