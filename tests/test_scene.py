@@ -1,4 +1,4 @@
-"""Scenes: the shipped ones hold what they claim, and what cannot be is refused by name."""
+"""Scenes: properties of the shipped ones; error messages for impossible ones."""
 
 import tomllib
 from pathlib import Path
@@ -54,14 +54,14 @@ def test_surfaces_face_into_the_room(office: Scene) -> None:
         assert normal @ (office.room_m / 2 - middle) > 0, surface.name
 
 
-def test_led_ids_go_along_x_first_within_a_panel(office: Scene) -> None:
+def test_led_ids_count_along_x_first_within_a_panel(office: Scene) -> None:
     first = office.leds.centers_m[:6]
     assert np.allclose(np.diff(first[:5, 0]), 0.13)
     assert np.allclose(first[:5, 1], first[0, 1])
     assert first[5] == pytest.approx([first[0, 0], first[0, 1] + 0.13, 3.45])
 
 
-def test_table1_as_printed_sees_four_leds_from_36_of_122500_level_poses(table1: Scene) -> None:
+def test_four_leds_of_table1_are_in_view_of_36_of_122500_level_poses(table1: Scene) -> None:
     """Counted independently: |x_led - x| f / h within the half sensor, h = 3.5 m, f = 15 000 px."""
     steps = (np.arange(350) + 0.5) * 0.02
     for yaw, half_x, half_y in ((0.0, 2000, 1500), (90.0, 1500, 2000)):
@@ -142,12 +142,15 @@ def test_a_bad_panel_is_refused_in_one_line(tmp_path: Path, old: str, new: str, 
     assert_refused(tmp_path, OFFICE, old, new, message)
 
 
-WINDOW = {"wall": "x=0", "corner_m": [1.0, 1.0], "size_m": [1.0, 1.0], "luminance_cd_m2": 100.0}
+GLAZING = {"wall": "x=0", "corner_m": [1.0, 1.0], "size_m": [1.0, 1.0], "luminance_cd_m2": 100.0}
 BAD_ADDITIONS: list[tuple[dict[str, object], str]] = [
-    ({"glazing": [{**WINDOW, "size_m": [7.0, 1.0]}]}, r"glazing\[0\]: .*does not fit"),
-    ({"glazing": [WINDOW, {**WINDOW, "corner_m": [1.5, 1.5]}]}, r"glazing\[1\]: overlaps another glazing in wall x=0"),
-    ({"glazing": [{**WINDOW, "wall": "north"}]}, r"glazing\[0\]\.wall = \"north\": .*'x=0'"),
-    ({"glazing": [{**WINDOW, "refractive_index": 0.5}]}, r"refractive_index = 0\.5"),
+    ({"glazing": [{**GLAZING, "size_m": [7.0, 1.0]}]}, r"glazing\[0\]: .*does not fit"),
+    (
+        {"glazing": [GLAZING, {**GLAZING, "corner_m": [1.5, 1.5]}]},
+        r"glazing\[1\]: overlaps another glazing in wall x=0",
+    ),
+    ({"glazing": [{**GLAZING, "wall": "north"}]}, r"glazing\[0\]\.wall = \"north\": .*'x=0'"),
+    ({"glazing": [{**GLAZING, "refractive_index": 0.5}]}, r"refractive_index = 0\.5"),
     ({"furniture": [{"file": "nowhere.ply"}]}, r"furniture\[0\]\.file = 'nowhere.ply': no such file"),
     ({"furniture": [{"file": "chair.blend"}]}, r"furniture\[0\]\.file = \"chair.blend\""),
     ({"bake": {"texel_m": 0.0}}, r"bake\.texel_m = 0\.0"),
@@ -157,13 +160,13 @@ BAD_ADDITIONS: list[tuple[dict[str, object], str]] = [
 
 
 @pytest.mark.parametrize(("changes", "message"), BAD_ADDITIONS)
-def test_windows_furniture_and_bakes_that_cannot_be_are_refused(changes: dict[str, object], message: str) -> None:
+def test_impossible_glazing_furniture_and_bakes_are_refused(changes: dict[str, object], message: str) -> None:
     with pytest.raises(InputError, match=message) as refusal:
         build_scene(check({**tomllib.loads(TABLE1), **changes}, SceneSettings, "test"), "test")
     assert "\n" not in str(refusal.value)
 
 
-def test_a_square_led_counts_as_seen_only_with_its_corners() -> None:
+def test_a_square_led_is_in_view_with_all_its_corners_only() -> None:
     """Half side 0.01 m at 3 m is 50 px, its corner 71 px from the centre; yaw of 45 deg turns it to the border."""
     led = {"id": 1, "position_m": [3.0, 3.0, 3.5], "luminance_cd_m2": 1e4}
     # the centre is 60 px inside the left border
@@ -176,7 +179,7 @@ def test_a_square_led_counts_as_seen_only_with_its_corners() -> None:
     assert seen == {"disc": 1, "square": 0}
 
 
-def test_an_led_of_one_half_width_is_twice_that_wide_as_disc_and_as_square() -> None:
+def test_half_widths_are_radii_of_discs_and_half_sides_of_squares() -> None:
     """A disc of 0.01 m radius has pi 1e-4 m2, a square of 0.02 m has 4e-4 m2; its corner is sqrt(2) 0.01 m away."""
     base = tomllib.loads(TABLE1)["led"]
     square = {key: value for key, value in base[1].items() if key != "radius_m"} | {"shape": "square", "side_m": 0.02}
@@ -196,8 +199,8 @@ def test_a_room_without_leds_is_refused(tmp_path: Path) -> None:
 
 @settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
-def test_no_damage_to_a_scene_file_is_a_traceback(tmp_path: Path, data: st.DataObject) -> None:
-    """Cut, overwrite or splice the file anywhere: a scene or one line, nothing else."""
+def test_a_damaged_scene_file_gives_a_scene_or_one_line(tmp_path: Path, data: st.DataObject) -> None:
+    """Cut, overwrite or splice the file anywhere."""
     raw = TABLE1.encode()
     start = data.draw(st.integers(0, len(raw)))
     stop = data.draw(st.integers(start, min(len(raw), start + 40)))
@@ -218,7 +221,7 @@ def test_the_shipped_files_are_toml_with_units_in_their_keys() -> None:
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "scenes").glob("*.toml")), ids=lambda path: path.stem)
-def test_every_shipped_scene_can_be_laid_out(path: Path) -> None:
+def test_every_shipped_scene_loads(path: Path) -> None:
     scene = load_scene(path)
     assert len(scene.leds) == len(scene.leds.diffusers)
     assert all(0 < surface.reflectance < 1 for surface in scene.surfaces)
