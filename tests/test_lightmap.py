@@ -16,7 +16,8 @@ from vlcrender.light import bake_cache
 from vlcrender.light.lightmap import bake, led_illuminance_lux, path_traced_lux, room_mesh
 from vlcrender.light.mitsuba_room import mitsuba_scene
 from vlcrender.scene.fresnel import glazing_reflectance
-from vlcrender.scene.loader import Leds, Scene, build_scene, load_scene
+from vlcrender.scene.leds import Leds
+from vlcrender.scene.loader import Scene, build_scene, load_scene
 from vlcrender.scene.mesh import Mesh, join, mesh_of_surfaces
 from vlcrender.scene.schema import SceneSettings
 from vlcrender.scene.sources import point_sources

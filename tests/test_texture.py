@@ -180,7 +180,7 @@ def test_a_textured_room_absorbs_the_flux_of_the_leds(tmp_path: Path) -> None:
     floor = mesh_of_surfaces(scene.surfaces[:1], 0.1)
     texture = scene.surfaces[0].texture
     assert texture is not None
-    # 3 m are not whole tiles: the mean over the floor, which a vertex's area weighs exactly but for triangles at the ends
+    # 3 m are not whole tiles: the mean over the floor, which the vertices' areas weigh exactly but at the ends
     whole = texture.means(np.zeros((1, 3)), np.array([[3.0, 3.0, 0.0]]))[0]
     assert (floor.albedo * floor.areas_m2()).sum() / 9 == pytest.approx(whole, abs=1e-3)
 

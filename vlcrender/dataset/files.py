@@ -22,7 +22,7 @@ from vlcrender.camera.rig import Mounted
 from vlcrender.camera.roi import Roi
 from vlcrender.config.toml_model import Settings, check
 from vlcrender.errors import InputError
-from vlcrender.scene.loader import Leds
+from vlcrender.scene.leds import Leds
 
 FRAMES, EXPECTED, PREVIEWS, PROCESSED = "frames", "expected", "previews", "processed"
 """Folders with a file of each frame; the last three where asked for."""

@@ -15,7 +15,7 @@ from vlcrender.camera.lens import SplitKernel, blur, blur_kernel, split_for, spl
 from vlcrender.camera.roi import Roi
 from vlcrender.rendering.led_coverage import leds_that_may_be_seen
 from vlcrender.rendering.led_edges import LedEdges
-from vlcrender.scene.loader import Leds
+from vlcrender.scene.leds import Leds
 
 BLUR_MARGIN_PX = 500
 """How far beside the sensor LEDs may be whose blur reaches it."""

@@ -20,7 +20,7 @@ from vlcrender.rendering.led_blur import LedBlur
 from vlcrender.rendering.led_coverage import coverage_of_led, leds_that_may_be_seen, places_on_plane
 from vlcrender.rendering.led_edges import LedEdges, edges_of_led
 from vlcrender.rendering.occlusion import Occlusion
-from vlcrender.scene.loader import Leds
+from vlcrender.scene.leds import Leds
 
 OVERSCAN_DEG = 75.0
 """How far off the optical axis, across or down, windows may lie that reach beyond the sensor."""

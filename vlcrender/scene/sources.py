@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vlcrender.scene.loader import Leds
+from vlcrender.scene.leds import Leds
 
 Array = NDArray[np.float64]
 
