@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from test_path_traced import BOX, scene_of
 
+from vlcrender.core.warn_once import warn_once
 from vlcrender.errors import InputError
-from vlcrender.scene import furniture
 from vlcrender.scene.furniture import MAX_TRIANGLES, furniture_meshes
 from vlcrender.scene.mesh import Mesh
 
@@ -120,7 +120,7 @@ BODIES = {
 @pytest.fixture
 def warnings(caplog: pytest.LogCaptureFixture) -> pytest.LogCaptureFixture:
     """Warnings that are logged from here on, those logged before among them."""
-    furniture._warn.cache_clear()
+    warn_once.cache_clear()
     caplog.set_level(logging.WARNING)
     return caplog
 

@@ -12,6 +12,7 @@ from conftest import ROOT
 from platformdirs import user_cache_dir
 
 from vlcrender.config.toml_model import check, read_toml
+from vlcrender.core.warn_once import warn_once
 from vlcrender.light import bake_cache
 from vlcrender.light.lightmap import bake, led_illuminance_lux, path_traced_lux, room_mesh
 from vlcrender.light.mitsuba_room import mitsuba_scene
@@ -240,6 +241,7 @@ def test_a_bake_is_kept_and_loaded_again(tmp_path: Path) -> None:
 @pytest.fixture
 def no_bakes_in_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bake_cache, "_in_memory", {})
+    warn_once.cache_clear()
 
 
 def without_home(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -273,7 +275,7 @@ def test_a_bake_that_cannot_be_written_is_kept_in_memory_with_one_warning(
     assert first.led_lux.tobytes() == written.led_lux.tobytes()
     (record,) = caplog.records
     assert record.levelname == "WARNING"
-    assert "cannot keep the bake" in record.getMessage()
+    assert "cannot keep bakes" in record.getMessage()
     assert "\n" not in record.getMessage()
     stages.clear()
     assert bake(scene, progress=lambda stage, share: stages.append(stage)).led_lux.tobytes() == first.led_lux.tobytes()

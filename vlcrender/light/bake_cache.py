@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from platformdirs import user_cache_dir
 
+from vlcrender.core.warn_once import warn_once
+
 Array = NDArray[np.float64]
 logger = logging.getLogger(__name__)
 
@@ -56,7 +58,7 @@ def load(key: str, count: int, folder: Path | None) -> BakedIlluminance | None:
 
 
 def store(key: str, baked: BakedIlluminance, folder: Path | None) -> None:
-    """Keep a bake under `key`. If the folder cannot be written, log one warning and keep the bake in memory."""
+    """Keep a bake under `key`. If the folder cannot be written, warn once and keep the bake in memory."""
     try:
         if folder is None:
             raise OSError("no home folder")
@@ -65,10 +67,9 @@ def store(key: str, baked: BakedIlluminance, folder: Path | None) -> None:
         _in_memory[key] = baked
         place = "the user's cache folder" if folder is None else str(folder)
         reason = error.strerror or error
-        logger.warning(
-            "%s: cannot keep the bake (%s); other processes bake again; set VLCRENDER_CACHE to a writable folder",
-            place,
-            reason,
+        warn_once(
+            logger,
+            f"{place}: cannot keep bakes ({reason}); each process bakes anew; set VLCRENDER_CACHE to a writable folder",
         )
 
 

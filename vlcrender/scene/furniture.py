@@ -7,10 +7,8 @@ which of them are wrong is not known before all are compared, and every modeller
 """
 
 import logging
-import multiprocessing
 import re
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +17,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from vlcrender.core.backend import dr, mi
+from vlcrender.core.warn_once import warn_once
 from vlcrender.errors import InputError
 from vlcrender.scene.loader import Scene
 from vlcrender.scene.mesh import Mesh, join, probes_inward
@@ -197,9 +196,11 @@ def _face_outwards(mesh: trimesh.Trimesh, where: str) -> None:
         mesh.invert()
     turned = int((before != np.array(mesh.faces)).any(axis=1).sum())
     if turned:
-        _warn(f"{where}: is inside out; {turned} of {len(before)} triangles were turned to face outwards")
+        warn_once(logger, f"{where}: is inside out; {turned} of {len(before)} triangles were turned to face outwards")
     if _has_boundary(mesh.faces):
-        _warn(f"{where}: is not closed; seen from behind, a triangle shows the light that falls on its front")
+        warn_once(
+            logger, f"{where}: is not closed; seen from behind, a triangle shows the light that falls on its front"
+        )
 
 
 def _has_boundary(faces: Indices) -> bool:
@@ -208,13 +209,6 @@ def _has_boundary(faces: Indices) -> bool:
     forward = edges[:, 0] < edges[:, 1]
     _, edge = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True)
     return bool(np.bincount(edge.ravel(), np.where(forward, 1, -1)).any())
-
-
-@cache
-def _warn(message: str) -> None:
-    """Log a warning once, and not in worker processes, whose parent has logged it."""
-    if multiprocessing.parent_process() is None:
-        logger.warning("%s", message)
 
 
 def _subdivided(vertices: Array, faces: Indices, texel_m: float, where: str) -> tuple[Array, Indices]:
