@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from test_path_traced import BOX, scene_of
 
 from vlcrender.core.warn_once import warn_once
@@ -42,6 +44,8 @@ REFUSED: dict[str, tuple[str | bytes, str]] = {
     "noise.obj": (b"\xff\xfe v 0 0", "is no OBJ mesh that can be read|has no triangle"),
     "empty.obj": ("", "has no triangle"),
     "points.obj": (OBJ, "has no triangle"),
+    "flat.obj": ("v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n", "is no OBJ mesh that can be read"),
+    "text.xml": (b"<scene version='3.0.0'><shape type='cube' id='\xe4'/></scene>", "Mitsuba cannot load it"),
     "line.obj": ("v 0 0 0\nv 0.5 0 0\nv 1 0 0\nf 1 2 3\n", "has no triangle with an area"),
     "far.obj": ("v 0 0 0\nv 90 0 0\nv 0 90 0\nf 1 2 3\n", r"outside the room of \[3\.0, 3\.0, 2\.5\] m"),
     "nan.obj": ("v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "has vertices that are not finite"),
@@ -173,6 +177,23 @@ def test_one_box_is_the_same_mesh_by_every_format(
     assert np.ptp(mesh.vertices_m, axis=0) == pytest.approx([0.5, 0.4, 0.1], abs=1e-6)
     assert mesh.albedo == pytest.approx(0.25, abs=1e-6)
     assert not warnings.records
+
+
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.sampled_from(["a.ply", "a.obj"]), st.data())
+def test_a_damaged_mesh_file_gives_a_mesh_or_one_line(tmp_path: Path, name: str, data: st.DataObject) -> None:
+    """Cut, overwrite or splice the file anywhere."""
+    raw = {"a.ply": PLY_BOX, "a.obj": UV_BOX}[name].encode()
+    start = data.draw(st.integers(0, len(raw)))
+    stop = data.draw(st.integers(start, min(len(raw), start + 20)))
+    filling = data.draw(
+        st.one_of(st.binary(max_size=8), st.sampled_from([b"-", b"0", b"nan", b"1e999", b"4294967295"]))
+    )
+    try:
+        outcome = str(len(mesh_of(tmp_path, name, raw[:start] + filling + raw[stop:], 0.1).faces))
+    except InputError as refusal:
+        outcome = str(refusal)
+    assert "\n" not in outcome
 
 
 def test_a_rectangle_and_a_serialized_mesh_of_mitsuba_are_taken(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ from typing import Any
 
 
 def glazing_reflectance(cosine: Any, index: Any, sqrt: Any) -> Any:
-    """Reflectance of a thin pane, 2 F / (1 + F) with Fresnel's F for unpolarised light at each of its two faces.
+    """Reflectance of thin glazing, 2 F / (1 + F) with Fresnel's F for unpolarised light at each of its two faces.
 
     cosine: cosine of the angle of incidence. index: refractive index. sqrt: square root of their type of array, NumPy's
     or Dr.Jit's.

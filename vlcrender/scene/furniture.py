@@ -74,15 +74,16 @@ def _read_mesh(path: Path, where: str) -> tuple[Array, Indices]:
     if kind == "obj" and OBJ_ZERO_INDEX.search(path.read_bytes()):
         raise InputError(f"{where}: has a face index 0; vertices of an OBJ file count from 1")
     try:
-        with path.open("rb") as file:
+        with path.open("rb") as file, np.errstate(all="ignore"):
             mesh = trimesh.load_mesh(file, file_type=kind, process=False, **options)
-        vertices, faces = np.array(mesh.vertices, dtype=np.float64), np.array(mesh.faces, dtype=np.int64)
+        vertices = np.array(mesh.vertices, dtype=np.float64).reshape(len(mesh.vertices), 3)
+        faces = np.array(mesh.faces, dtype=np.int64).reshape(len(mesh.faces), 3)
     except IndexError as error:
         raise InputError(f"{where}: has a face index out of range: {_one_line(error)}") from None
     except Exception as error:  # whatever its parser trips over, the file is no mesh
         raise InputError(f"{where}: is no {kind.upper()} mesh that can be read: {_one_line(error)}") from None
     _check_indices(faces, len(vertices), where)
-    return vertices.reshape(-1, 3), faces.reshape(-1, 3)
+    return vertices, faces
 
 
 def _check_indices(faces: Indices, count: int, where: str) -> None:
@@ -96,7 +97,7 @@ def _xml_shapes(path: Path, where: str) -> list[_Shape]:
     try:
         _check_mesh_files(path, where)
         shapes = list(mi.load_file(str(path), optimize=False).shapes())
-    except RuntimeError as error:
+    except (RuntimeError, UnicodeDecodeError) as error:
         raise InputError(f"{where}: Mitsuba cannot load it: {_one_line(error)}") from None
     if not shapes:
         raise InputError(f"{where}: holds no shape")
@@ -213,8 +214,8 @@ def _has_boundary(faces: Indices) -> bool:
 
 def _subdivided(vertices: Array, faces: Indices, texel_m: float, where: str) -> tuple[Array, Indices]:
     """Triangles (k, 3, 3) with no edge longer than a texel, and the number of the face each comes from, (k,)."""
-    corners = vertices[faces]
-    edges = np.sort(np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2), axis=1)
+    triangles = vertices[faces]
+    edges = np.sort(np.linalg.norm(np.roll(triangles, -1, axis=1) - triangles, axis=2), axis=1)
     halvings = np.ceil(np.log2(np.maximum(edges / texel_m, 1.0)))
     expected = (2 ** (halvings[:, 0] + halvings[:, 2])).sum()  # parts of the shortest and of the longest edge
     if expected > MAX_TRIANGLES:

@@ -187,7 +187,7 @@ class PanelGrid(Settings):
 
 
 class GlazingEntry(Settings):
-    """A thin pane of glass in a wall. It reflects by Fresnel's equations and transmits daylight from outside."""
+    """Glazing in a wall: thin glass. It reflects by Fresnel's equations and transmits daylight from outside."""
 
     wall: Literal["x=0", "x=max", "y=0", "y=max"]
     """The wall with the glazing: `"x=0"`, `"x=max"`, `"y=0"` or `"y=max"`."""
