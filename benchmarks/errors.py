@@ -52,8 +52,8 @@ def main() -> None:
     )
     worst, pixels = 0.0, 0
     for posed in (PosedCamera(camera, pose) for pose in POSES):
-        for i in candidate_leds(posed, scene.leds.centers_m, scene.leds.radii_m):
-            face = LedFace(scene.leds.centers_m[i], Disc(float(scene.leds.radii_m[i])))
+        for i in candidate_leds(posed, scene.leds.centers_m, scene.leds.half_widths_m):
+            face = LedFace(scene.leds.centers_m[i], Disc(float(scene.leds.half_widths_m[i])))
             image = coverage_of_led(posed, face)
             if image is None or image.visible_fraction < 1:
                 continue

@@ -60,7 +60,9 @@ def main() -> None:
     glazing = {"wall": "x=0", "corner_m": [1.0, 0.9], "size_m": [5.0, 2.2], "luminance_cd_m2": 40.0}
     glazed = Renderer(office(glazing=[glazing]))
     panels = read_toml(ROOT / "scenes/office.toml")["panels"]
-    squares = [{**panels[0], "leds": {**panels[0]["leds"], "shape": "square", "half_power_deg": 30.0}}]
+    leds = {key: value for key, value in panels[0]["leds"].items() if key != "radius_m"}
+    leds |= {"shape": "square", "side_m": 2 * panels[0]["leds"]["radius_m"], "half_power_deg": 30.0}
+    squares = [{**panels[0], "leds": leds}]
     OUT.mkdir(exist_ok=True)
     mesh = OUT / "board.obj"
     mesh.write_text(BOARD_OBJ)

@@ -11,11 +11,11 @@ from vlcrender.errors import InputError
 from vlcrender.rendering.background import differs_from_neighbour
 from vlcrender.rendering.electron_rates import ElectronRates
 from vlcrender.rendering.renderer import Renderer
-from vlcrender.scene.diffuser import DIM_SHARE, Diffuser
+from vlcrender.scene.diffuser import MIN_RELATIVE_LUMINANCE, Diffuser
 from vlcrender.scene.loader import Scene
 from vlcrender.sensor.radiometry import Silicon, electron_rate_per_cd_m2
 
-SHEET = Diffuser((0.03, -0.01), 0.04, 0.6, np.pi * 0.005**2, 1.0, (-0.1, -0.05, 0.2, 0.15))
+DIFFUSER_OFF_CENTRE = Diffuser((0.03, -0.01), 0.04, 0.6, np.pi * 0.005**2, 1.0, (-0.1, -0.05, 0.2, 0.15))
 DIFFUSER = {"distance_m": 0.03, "transmittance": 0.6}
 FRAME = {"width_m": 0.02, "depth_m": 0.04, "reflectance": 0.4}
 
@@ -51,30 +51,32 @@ def lit_by_order_1(diffuser: Diffuser) -> float:
     return diffuser.transmittance * diffuser.area_m2 / np.pi * total
 
 
-def test_the_light_of_a_sheet_is_what_falls_on_it_and_passes() -> None:
-    assert SHEET.quadrants()[1].sum() == pytest.approx(lit_by_order_1(SHEET), rel=1e-9)
+def test_the_light_of_a_diffuser_is_the_transmitted_share_of_its_illumination() -> None:
+    assert DIFFUSER_OFF_CENTRE.quadrants()[1].sum() == pytest.approx(lit_by_order_1(DIFFUSER_OFF_CENTRE), rel=1e-9)
 
 
 @pytest.mark.parametrize("order", [0.5, 1.0, 5.0])
-def test_on_a_wide_sheet_all_light_passes_but_what_is_dim(order: float) -> None:
-    """Within a circle where cos(theta) = c falls 1 - c^(m+1) of the flux 2 pi I / (m + 1), of luminance that over pi.
+def test_a_wide_diffuser_transmits_all_light_but_its_dim_rim(order: float) -> None:
+    """A circle of cos(theta) = c receives 1 - c^(m+1) of the flux 2 pi I / (m + 1); its luminance is that over pi.
 
-    What is lit is a square, between the circles inside and around it.
+    The lit part is a square, between its inscribed and its circumscribed circle.
     """
     diffuser = Diffuser((0.0, 0.0), 0.04, 0.6, 1e-4, order, (-9.0, -9.0, 9.0, 9.0))
     whole = 0.6 * 1e-4 * 2 / (order + 1)
-    cosine = DIM_SHARE ** (1 / (order + 3))
+    cosine = MIN_RELATIVE_LUMINANCE ** (1 / (order + 3))
     corner = 1 / np.sqrt(1 + 2 * (1 / cosine**2 - 1))
     light = diffuser.quadrants()[1].sum()
     assert whole * (1 - cosine ** (order + 1)) < light < whole * (1 - corner ** (order + 1))
-    # at the circle's rim the sheet has DIM_SHARE of the foot's luminance
-    edge = diffuser.luminance(np.array([0.0, diffuser.reach_m]), np.zeros(2))
-    assert edge[1] / edge[0] == pytest.approx(DIM_SHARE, rel=1e-9)
+    # at the circle's rim the diffuser has MIN_RELATIVE_LUMINANCE of the foot's luminance
+    edge = diffuser.luminance(np.array([0.0, diffuser.lit_radius_m]), np.zeros(2))
+    assert edge[1] / edge[0] == pytest.approx(MIN_RELATIVE_LUMINANCE, rel=1e-9)
 
 
-@pytest.mark.parametrize("diffuser", [SHEET, Diffuser((0.0, 0.0), 0.04, 0.6, 1e-4, 1.0, (-9.0, -9.0, 9.0, 9.0))])
-def test_four_points_light_as_the_sheet_does(diffuser: Diffuser) -> None:
-    """Against a fine grid, anywhere below within 70 deg, as `point_sources` says."""
+@pytest.mark.parametrize(
+    "diffuser", [DIFFUSER_OFF_CENTRE, Diffuser((0.0, 0.0), 0.04, 0.6, 1e-4, 1.0, (-9.0, -9.0, 9.0, 9.0))]
+)
+def test_four_points_illuminate_as_the_diffuser_does(diffuser: Diffuser) -> None:
+    """Against a fine grid, within 70 deg of straight down, to the errors that `point_sources` documents."""
     at, light = diffuser.quadrants()
     x0, y0, x1, y1 = diffuser.lit_m
     n = 400
@@ -85,7 +87,7 @@ def test_four_points_light_as_the_sheet_does(diffuser: Diffuser) -> None:
         d2 = (sx - place[0]) ** 2 + (sy - place[1]) ** 2 + place[2] ** 2
         return float((weight * (place[2] ** 2 / d2) / d2).sum())
 
-    for distance_m, error in ((0.4, 0.07), (1.2, 0.006)):  # 10 and 30 times the LED's behind the sheet
+    for distance_m, error in ((0.4, 0.07), (1.2, 0.006)):  # 10 and 30 times the LED's from the diffuser
         for angle in np.radians([0, 30, 50, 70]):
             for turn in np.radians([0, 90, 200]):
                 sine = np.sin(angle)
@@ -95,7 +97,7 @@ def test_four_points_light_as_the_sheet_does(diffuser: Diffuser) -> None:
                 assert points == pytest.approx(lux(x, y, fine, place), rel=error)
 
 
-def test_a_sheet_is_seen_with_the_luminance_and_the_flux_of_the_model() -> None:
+def test_the_image_of_a_diffuser_has_the_luminance_and_the_flux_of_the_model() -> None:
     scene = panelled(diffuser=True, frame=False)
     camera = Camera(width_px=500, height_px=400, pixel_pitch_um=16.0)
     pose = Pose((1.5, 1.5, 0.4))
@@ -119,10 +121,10 @@ def test_a_sheet_is_seen_with_the_luminance_and_the_flux_of_the_model() -> None:
 
 
 @pytest.mark.parametrize(("slope", "share"), [(1.75, 1.0), (2.0, 0.5), (2.25, 0.0)])
-def test_a_rim_hides_leds_from_aside(slope: float, share: float) -> None:
-    """LED 1 is 8 cm from the rim's inside, which stands 4 cm down: half of it is seen at a slope of 2.
+def test_a_rim_hides_leds_from_the_side(slope: float, share: float) -> None:
+    """LED 1 is 8 cm from the rim's inside, which stands 4 cm down: half of it is visible at a slope of 2.
 
-    Its radius of 8 mm is seen whole up to 72 / 40 = 1.8 and not at all from 88 / 40 = 2.2 on.
+    With its radius of 8 mm it is visible whole up to 72 / 40 = 1.8 and not at all from 88 / 40 = 2.2 on.
     """
     scene = panelled(diffuser=False, frame=True, bake={"texel_m": 0.5, "paths": 8})
     led = scene.leds.centers_m[0]
@@ -136,14 +138,14 @@ def test_a_rim_hides_leds_from_aside(slope: float, share: float) -> None:
 
 
 @pytest.mark.parametrize("frame", [False, True], ids=["diffuser", "frame and diffuser"])
-def test_diffusers_and_frames_are_as_in_the_reference(frame: bool) -> None:
+def test_diffusers_and_frames_agree_with_the_reference(frame: bool) -> None:
     scene = panelled(diffuser=True, frame=frame)
     camera = Camera(**{**SMALL_VIEW, "pixel_pitch_um": 160.0})
     pose = Pose((1.1, 1.2, 0.6), 12.0, 8.0, 20.0)
     ours, reference, variance, lit = both_ways(scene, camera, pose, 128)
     assert lit.mean() > 0.03
 
-    # The sheet, where a pixel and its neighbours are nothing else: noise (t of 7 degrees of freedom, some hundred
+    # The diffuser, where a pixel and its neighbours show nothing else: noise (t of 7 degrees of freedom, some hundred
     # pixels), and 1 %: the reference's image is linear between points d / 16 apart, 4 / 8 / 16^2 = 0.2 % at the foot; a
     # pixel of 1.6 cm is half of d and averaged from 2 x 2 places: (1/2)^4 / 4320 of the fourth derivative, 4 * 6 * 8 *
     # 10 at the foot, 0.3 %; and the light that the frame's inside, which is baked too dark, reflects: 0.4 % measured.
@@ -166,14 +168,14 @@ def test_diffusers_and_frames_are_as_in_the_reference(frame: bool) -> None:
 @pytest.mark.parametrize(
     ("panel", "message"),
     [
-        ({"frame": {**FRAME, "width_m": 0.1}}, r"columns at 0\.15 m.*its frame leaves 0\.3 m"),
+        ({"frame": {**FRAME, "width_m": 0.1}}, r"columns 0\.15 m apart.*its frame leaves 0\.3 m"),
         ({"frame": {**FRAME, "depth_m": 2.5}}, "is not inside the room"),
-        ({"diffuser": {**DIFFUSER, "distance_m": 0.02}}, r"distance_m = 0\.02: has to be from 0\.024 m"),
-        ({"diffuser": {**DIFFUSER, "distance_m": 0.07}}, r"distance_m = 0\.07.*to 0\.06 m, the panel's height"),
+        ({"diffuser": {**DIFFUSER, "distance_m": 0.02}}, r"distance_m = 0\.02: is not from 0\.024 m"),
+        ({"diffuser": {**DIFFUSER, "distance_m": 0.07}}, r"distance_m = 0\.07.*to 0\.06 m \(the panel's height\)"),
         ({"diffuser": {**DIFFUSER, "transmittance": 1.1}}, r"diffuser\.transmittance = 1\.1"),
     ],
 )
-def test_frames_and_diffusers_that_cannot_be_are_refused(panel: dict[str, object], message: str) -> None:
+def test_impossible_frames_and_diffusers_are_refused(panel: dict[str, object], message: str) -> None:
     base = panelled(diffuser=False, frame=False).settings.panels[0].model_dump()
     with pytest.raises(InputError, match=message) as refusal:
         scene_of(panels=[{**base, **panel}])

@@ -1,17 +1,24 @@
-"""The room's light against closed forms: single sources, white furnace, energy balance, form factors, shadows."""
+"""Lightmap against closed forms: single sources, white furnace, energy balance, form factors, shadows; its cache."""
 
 import dataclasses
+import errno
+import pwd
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from conftest import ROOT
+from platformdirs import user_cache_dir
 
 from vlcrender.config.toml_model import check, read_toml
+from vlcrender.core.warn_once import warn_once
+from vlcrender.light import bake_cache
 from vlcrender.light.lightmap import bake, led_illuminance_lux, path_traced_lux, room_mesh
 from vlcrender.light.mitsuba_room import mitsuba_scene
 from vlcrender.scene.fresnel import glazing_reflectance
-from vlcrender.scene.loader import Leds, Scene, build_scene, load_scene
+from vlcrender.scene.leds import Leds
+from vlcrender.scene.loader import Scene, build_scene, load_scene
 from vlcrender.scene.mesh import Mesh, join, mesh_of_surfaces
 from vlcrender.scene.schema import SceneSettings
 from vlcrender.scene.sources import point_sources
@@ -25,19 +32,20 @@ def scene_of(folder: Path | None = None, **changes: object) -> Scene:
 
 
 def lamp(**values: object) -> dict[str, object]:
-    return {"id": 1, "position_m": [3.5, 3.5, 3.5], "radius_m": 0.01, "luminance_cd_m2": 10000.0, **values}
+    size = {} if values.get("shape") == "square" else {"radius_m": 0.01}
+    return {"id": 1, "position_m": [3.5, 3.5, 3.5], **size, "luminance_cd_m2": 10000.0, **values}
 
 
-def empty_room(mesh: Mesh) -> object:
-    return mitsuba_scene(mesh, np.zeros(len(mesh.vertices_m)), (), panes_glow=False)
+def dark_room(mesh: Mesh) -> object:
+    return mitsuba_scene(mesh, np.zeros(len(mesh.vertices_m)), (), daylight=False)
 
 
 def lux_on_floor(leds: Leds, x: float, y: float, scene: Scene) -> float:
     mesh = room_mesh(scene)
     return float(
-        led_illuminance_lux(
-            empty_room(mesh), np.array([[x, y, 0.0]]), np.array([[0.0, 0.0, 1.0]]), point_sources(leds)
-        )[0]
+        led_illuminance_lux(dark_room(mesh), np.array([[x, y, 0.0]]), np.array([[0.0, 0.0, 1.0]]), point_sources(leds))[
+            0
+        ]
     )
 
 
@@ -51,14 +59,14 @@ def test_below_a_disc() -> None:
 
 def test_below_a_square() -> None:
     """On the axis of a square: four corner rectangles with the textbook's form factor, X = half side / height."""
-    scene = scene_of(led=[lamp(radius_m=0.1, shape="square")])
+    scene = scene_of(led=[lamp(side_m=0.2, shape="square")])
     x = 0.1 / 3.5
     factor = 4 / (2 * np.pi) * 2 * x / np.sqrt(1 + x**2) * np.arctan(x / np.sqrt(1 + x**2))
     # the small-source form leaves out 4/3 X^2 = 1.1e-3
     assert lux_on_floor(scene.leds, 3.5, 3.5, scene) == pytest.approx(np.pi * 10000 * factor, rel=1.5e-3)
 
 
-def test_beside_the_axis_illuminance_falls_with_cos4() -> None:
+def test_illuminance_off_the_axis_falls_with_cos4() -> None:
     scene = scene_of(led=[lamp()])
     straight = lux_on_floor(scene.leds, 3.5, 3.5, scene)
     beside = lux_on_floor(scene.leds, 3.5 + 3.5 * np.tan(np.radians(30)), 3.5, scene)
@@ -73,29 +81,29 @@ def test_intensity_falls_to_half_at_the_half_power_angle(half_power_deg: float) 
     direction = np.array([np.sin(angle), 0.0, -np.cos(angle)])
     points = np.array([[3.5, 3.5, 3.5 - 1.0], [3.5, 3.5, 3.5] + direction])
     normals = np.array([[0.0, 0.0, 1.0], -direction])
-    straight, aside = led_illuminance_lux(empty_room(room_mesh(scene)), points, normals, point_sources(scene.leds))
+    straight, aside = led_illuminance_lux(dark_room(room_mesh(scene)), points, normals, point_sources(scene.leds))
     assert aside / straight == pytest.approx(0.5, rel=1e-6)
 
 
 @pytest.mark.parametrize("half_power_deg", [30.0, 60.0])
 def test_all_light_of_the_leds_falls_on_the_room(half_power_deg: float) -> None:
-    """Flux of an LED of order m: 2 pi I_0 / (m + 1). The corners' trapezoidal sum misses little at 0.1 m."""
+    """Flux of an LED of order m: 2 pi I_0 / (m + 1). The vertices' trapezoidal sum, at 0.1 m."""
     scene = scene_of(led=[lamp(half_power_deg=half_power_deg)])
     mesh = mesh_of_surfaces(scene.surfaces, 0.1)
-    lux = led_illuminance_lux(empty_room(mesh), mesh.probes_m, mesh.normals, point_sources(scene.leds))
+    lux = led_illuminance_lux(dark_room(mesh), mesh.probes_m, mesh.normals, point_sources(scene.leds))
     order = scene.leds.orders[0]
     flux = 2 * np.pi * 10000 * np.pi * 0.01**2 / (order + 1)
-    # second-order rule on 0.1 m texels of a pattern some 3.5 m wide: (0.1 / 3.5)^2 = 8e-4, and the corners' inset
+    # second-order rule on 0.1 m texels of a pattern some 3.5 m wide: (0.1 / 3.5)^2 = 8e-4, and the probes' inset
     assert (lux * mesh.areas_m2()).sum() == pytest.approx(flux, rel=5e-3)
 
 
 @pytest.mark.parametrize("albedo", [0.0, 0.5, 0.8])
 def test_white_furnace(albedo: float) -> None:
-    """Where all surfaces glow alike and reflect alike, luminance is glow / (1 - albedo) everywhere."""
+    """With equal emission and albedo on all surfaces, luminance is emission / (1 - albedo) everywhere."""
     scene = scene_of(led=[lamp()])
     mesh = mesh_of_surfaces(scene.surfaces, 1.0)
     mesh = dataclasses.replace(mesh, albedo=np.full(len(mesh.vertices_m), albedo))
-    glowing = mitsuba_scene(mesh, np.ones(len(mesh.vertices_m)), (), panes_glow=False)
+    glowing = mitsuba_scene(mesh, np.ones(len(mesh.vertices_m)), (), daylight=False)
     lux, sigma = path_traced_lux(glowing, mesh.probes_m, mesh.normals, 2048, lambda share: None)
     expected = np.pi / (1 - albedo)
     n = len(lux)
@@ -106,11 +114,11 @@ def test_white_furnace(albedo: float) -> None:
 
 
 def test_energy_balance(tmp_path: Path) -> None:
-    """What the LEDs send is what the surfaces absorb."""
+    """The surfaces absorb the flux that the LEDs emit."""
     scene = scene_of(led=[lamp(position_m=[3.5, 3.5, 3.0])], bake={"texel_m": 0.2, "paths": 512})
     light = bake(scene, tmp_path)
-    corners = len(light.mesh.vertices_m)
-    absorbed = ((1 - light.mesh.albedo) * light.led_lux[:corners] * light.mesh.areas_m2()).sum()
+    count = len(light.mesh.vertices_m)
+    absorbed = ((1 - light.mesh.albedo) * light.led_lux[:count] * light.mesh.areas_m2()).sum()
     flux = np.pi * 10000 * np.pi * 0.01**2
     # the quadrature's half per cent, as for direct light; Monte Carlo adds 512 * 2000 paths: 0.1 %
     assert absorbed == pytest.approx(flux, rel=0.01)
@@ -127,23 +135,23 @@ def test_light_reflected_by_the_floor_onto_the_ceiling_agrees_with_a_form_factor
     d2 = (x - 3.5) ** 2 + (y - 3.5) ** 2 + 3.5**2
     floor = intensity * (3.5 / np.sqrt(d2)) ** 2 / d2
     ceiling = np.flatnonzero(np.isclose(light.mesh.vertices_m[:, 2], 3.5) & (light.mesh.normals[:, 2] == -1))
-    for corner in ceiling[:: len(ceiling) // 7]:
-        px, py, _ = light.mesh.probes_m[corner]
+    for vertex in ceiling[:: len(ceiling) // 7]:
+        px, py, _ = light.mesh.probes_m[vertex]
         back2 = (x - px) ** 2 + (y - py) ** 2 + 3.5**2
         expected = (0.5 * floor / np.pi * (3.5**2 / back2) / back2).sum() * step**2
-        # 5 sigma of the bake, and 1 % for the floor's linear interpolation between corners 0.25 m apart
-        assert abs(light.led_lux[corner] - expected) < 5 * light.sigma_lux[corner] + 0.01 * expected
+        # 5 sigma of the bake, and 1 % for the floor's linear interpolation between vertices 0.25 m apart
+        assert abs(light.led_lux[vertex] - expected) < 5 * light.sigma_lux[vertex] + 0.01 * expected
 
 
 def test_furniture_casts_a_shadow_and_reflects(tmp_path: Path) -> None:
     """A table between LED and floor: dark below, light around as before, and its top is lit."""
-    corners = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]])
-    text = "".join(f"v {x} {y} {z}\n" for x, y, z in corners) + "f 1 2 3\nf 1 3 4\n"
+    vertices = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]])
+    text = "".join(f"v {x} {y} {z}\n" for x, y, z in vertices) + "f 1 2 3\nf 1 3 4\n"
     (tmp_path / "table.obj").write_text(text)
     piece = {"file": "table.obj", "position_m": [3.5, 3.5, 0.75], "reflectance": 0.3}
     scene = scene_of(tmp_path, led=[lamp()], furniture=[piece])
     mesh = room_mesh(scene)
-    blockers = empty_room(mesh)
+    blockers = dark_room(mesh)
     # the shadow on the floor ends at 0.5 * 3.5 / 2.75 = 0.636 m from the middle
     points = np.array([[3.5, 3.5, 0.0], [3.5 + 0.62, 3.5, 0.0], [3.5 + 0.66, 3.5, 0.0], [3.5, 3.6, 0.75]])
     lux = led_illuminance_lux(blockers, points, np.tile([0.0, 0.0, 1.0], (4, 1)), point_sources(scene.leds))
@@ -156,7 +164,7 @@ def test_furniture_casts_a_shadow_and_reflects(tmp_path: Path) -> None:
     assert set(mesh.albedo[mesh.faces[top]].ravel().round(6)) == {0.3}
 
 
-def test_a_window_lights_the_room_as_its_form_factor_says(tmp_path: Path) -> None:
+def test_daylight_through_glazing_agrees_with_form_factors(tmp_path: Path) -> None:
     """E at a point opposite the middle of a rectangle, 4 corner form factors; the room is black."""
     black = {"floor": 0.0, "ceiling": 0.0, "walls": 0.0}
     glazing = {"wall": "x=0", "corner_m": [2.5, 1.0], "size_m": [2.0, 1.5], "luminance_cd_m2": 2000.0}
@@ -178,59 +186,127 @@ def test_a_window_lights_the_room_as_its_form_factor_says(tmp_path: Path) -> Non
     face = (0.52 / 2.52) ** 2
     through = np.pi * 2000 * expected * (1 - 2 * face / (1 + face))
     ambient = scene.settings.ambient.illuminance_lux
-    assert abs(light.surround_lux[point] - ambient - through) < 5 * light.sigma_lux[point] + 2e-3 * through
+    assert abs(light.ambient_lux[point] - ambient - through) < 5 * light.sigma_lux[point] + 2e-3 * through
 
 
 MIRROR = {"wall": "x=0", "corner_m": [3.0, 0.5], "size_m": [1.0, 2.5], "luminance_cd_m2": 0.0}
 
 
 @pytest.mark.parametrize(("y", "mirrored"), [(3.5, True), (3.1, True), (1.9, False), (5.1, False)])
-def test_a_pane_mirrors_an_led_onto_what_its_mirror_image_sees_through_it(y: float, mirrored: bool) -> None:
-    """LED at x = 2, its image at x = -2; the point at x = 2 sees it half way, at (y + 3.5) / 2, in the pane or not."""
+def test_glazing_reflects_an_led_onto_points_that_its_mirror_image_sees_through_it(y: float, mirrored: bool) -> None:
+    """LED at x = 2, its image at x = -2; its ray to the point at x = 2 crosses the wall at (y + 3.5) / 2."""
     scene = scene_of(led=[lamp(position_m=[2.0, 3.5, 3.5])], glazing=[MIRROR])
-    blockers, sources = empty_room(room_mesh(scene)), point_sources(scene.leds)
+    blockers, sources = dark_room(room_mesh(scene)), point_sources(scene.leds)
     point, up = np.array([[2.0, y, 0.0]]), np.array([[0.0, 0.0, 1.0]])
     straight = led_illuminance_lux(blockers, point, up, sources)[0]
-    by_pane = led_illuminance_lux(blockers, point, up, sources, scene.glazings)[0] - straight
+    by_glazing = led_illuminance_lux(blockers, point, up, sources, scene.glazings)[0] - straight
     d2 = 4.0**2 + (y - 3.5) ** 2 + 3.5**2
     lux = 10000 * np.pi * 0.01**2 * (3.5**2 / d2) / d2 * glazing_reflectance(4.0 / np.sqrt(d2), 1.52, np.sqrt)
-    # shadow rays start 0.1 mm off: no matter where the ray is not within that of the pane's border
-    assert by_pane == pytest.approx(lux if mirrored else 0.0, rel=1e-9, abs=1e-12)
+    # shadow rays start 0.1 mm off, which matters within 0.1 mm of the glazing's border only
+    assert by_glazing == pytest.approx(lux if mirrored else 0.0, rel=1e-9, abs=1e-12)
 
 
 @pytest.mark.parametrize("x", [0.5, 1.5])
-def test_a_board_takes_the_mirrored_light_before_and_behind_the_pane(tmp_path: Path, x: float) -> None:
-    """The way is 3.5 m down over 4 m across: at z = 1.3 from the point (2, 3.5, 0) to the pane, at 2.2 from it on."""
+def test_a_board_blocks_reflected_light_before_and_after_the_glazing(tmp_path: Path, x: float) -> None:
+    """The path is 3.5 m down over 4 m across: at x = 1.5, z is 0.44 m before the glazing and 3.06 m after it."""
     for z, covers in ((3.5 * (2 - x) / 4, True), (3.5 * (2 + x) / 4, True), (0.1, False)):
-        corners = [(x - 0.1, 3.4), (x + 0.1, 3.4), (x + 0.1, 3.6), (x - 0.1, 3.6)]
-        (tmp_path / "b.obj").write_text("".join(f"v {a} {b} {z}\n" for a, b in corners) + "f 1 2 3\nf 1 3 4\n")
+        vertices = [(x - 0.1, 3.4), (x + 0.1, 3.4), (x + 0.1, 3.6), (x - 0.1, 3.6)]
+        (tmp_path / "b.obj").write_text("".join(f"v {a} {b} {z}\n" for a, b in vertices) + "f 1 2 3\nf 1 3 4\n")
         led, furniture = lamp(position_m=[2.0, 3.5, 3.5]), {"file": "b.obj"}
         scene = scene_of(tmp_path, led=[led], glazing=[MIRROR], furniture=[furniture])
-        blockers, sources = empty_room(room_mesh(scene)), point_sources(scene.leds)
+        blockers, sources = dark_room(room_mesh(scene)), point_sources(scene.leds)
         arguments = blockers, np.array([[2.0, 3.5, 0.0]]), np.array([[0.0, 0.0, 1.0]]), sources
-        by_pane = led_illuminance_lux(*arguments, scene.glazings)[0] - led_illuminance_lux(*arguments)[0]
-        assert (by_pane == 0) == covers
+        by_glazing = led_illuminance_lux(*arguments, scene.glazings)[0] - led_illuminance_lux(*arguments)[0]
+        assert (by_glazing == 0) == covers
 
 
-def test_the_bake_is_kept_and_taken_again(tmp_path: Path) -> None:
+def test_a_bake_is_kept_and_loaded_again(tmp_path: Path) -> None:
     scene = scene_of(led=[lamp()], bake={"texel_m": 1.0, "paths": 64})
     stages: list[str] = []
     first = bake(scene, tmp_path, lambda stage, share: stages.append(stage))
-    assert "reflected light" in stages
+    assert "reflected light of LEDs" in stages
     stages.clear()
     again = bake(scene, tmp_path, lambda stage, share: stages.append(stage))
     assert not stages
     assert again.led_lux.tobytes() == first.led_lux.tobytes()
-    # cut short by a crash: made again, the same
+    # a file cut short by a crash: baked again, the same
     (kept,) = tmp_path.glob("*.npz")
     kept.write_bytes(kept.read_bytes()[:100])
     assert bake(scene, tmp_path).led_lux.tobytes() == first.led_lux.tobytes()
-    # another scene has its own
+    # another scene has a bake of its own
     bake(scene_of(led=[lamp(luminance_cd_m2=5000.0)], bake={"texel_m": 1.0, "paths": 64}), tmp_path)
     assert len(list(tmp_path.glob("*.npz"))) == 2
 
 
-def test_the_mesh_leaves_out_what_panels_cover(office: Scene) -> None:
+@pytest.fixture
+def no_bakes_in_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bake_cache, "_in_memory", {})
+    warn_once.cache_clear()
+
+
+def without_home(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A user without $HOME and without an entry in the password database, as in some containers."""
+
+    def no_entry(uid: int) -> None:
+        raise KeyError(uid)
+
+    for name in ("VLCRENDER_CACHE", "XDG_CACHE_HOME", "HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(pwd, "getpwuid", no_entry)
+
+
+@pytest.mark.usefixtures("no_bakes_in_memory")
+@pytest.mark.parametrize("case", ["a file in the folder's place", "no home"])
+def test_a_bake_that_cannot_be_written_is_kept_in_memory_with_one_warning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, case: str
+) -> None:
+    scene = scene_of(led=[lamp()], bake={"texel_m": 1.0, "paths": 8})
+    written = bake(scene, tmp_path / "writable")
+    assert not caplog.records
+    if case == "no home":
+        without_home(monkeypatch)
+        assert bake_cache.cache_folder() is None
+    else:
+        (tmp_path / "file").write_text("")
+        monkeypatch.setenv("VLCRENDER_CACHE", str(tmp_path / "file"))
+    stages: list[str] = []
+    first = bake(scene, progress=lambda stage, share: stages.append(stage))
+    assert stages
+    assert first.led_lux.tobytes() == written.led_lux.tobytes()
+    (record,) = caplog.records
+    assert record.levelname == "WARNING"
+    assert "cannot keep bakes" in record.getMessage()
+    assert "\n" not in record.getMessage()
+    stages.clear()
+    assert bake(scene, progress=lambda stage, share: stages.append(stage)).led_lux.tobytes() == first.led_lux.tobytes()
+    assert not stages
+    assert len(caplog.records) == 1
+
+
+@pytest.mark.usefixtures("no_bakes_in_memory")
+def test_a_full_disk_leaves_no_part_of_a_bake(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def full(*arguments: object, **arrays: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(np, "savez_compressed", full)
+    bake(scene_of(led=[lamp()], bake={"texel_m": 1.0, "paths": 8}), tmp_path)
+    assert not list(tmp_path.iterdir())
+    assert "No space left on device" in caplog.text
+
+
+def test_the_cache_folder_is_the_chosen_one_else_the_users(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("VLCRENDER_CACHE", str(tmp_path / "own"))
+    assert bake_cache.cache_folder() == tmp_path / "own"
+    monkeypatch.delenv("VLCRENDER_CACHE")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert bake_cache.cache_folder() == Path(user_cache_dir("vlcrender", appauthor=False))
+    if sys.platform == "linux":
+        assert bake_cache.cache_folder() == tmp_path / "vlcrender"
+
+
+def test_the_mesh_has_holes_under_panels(office: Scene) -> None:
     mesh = mesh_of_surfaces(office.surfaces, 0.25)
     area = mesh.areas_m2().sum()
     # floor, walls, ceiling, and the panels' sides; their undersides fill the holes they cut into the ceiling

@@ -1,13 +1,17 @@
-"""Presets and what a recipe may say of a sensor; each refusal is one line that names key and value."""
+"""Presets, renamed keys, and limits of a recipe's sensor: error messages are one line with key and value."""
 
 from pathlib import Path
+from typing import get_args
 
 import pytest
 from conftest import ROOT
+from pydantic import BaseModel
 
 from vlcrender.config.presets import preset, presets, with_presets
+from vlcrender.config.toml_model import RENAMED_KEYS
 from vlcrender.dataset.recipe import Recipe, load_plan
 from vlcrender.errors import InputError
+from vlcrender.scene.schema import SceneSettings
 
 QUICKSTART = ROOT / "datasets/quickstart.toml"
 
@@ -17,30 +21,30 @@ def recipe(*assignments: str) -> Recipe:
 
 
 @pytest.mark.parametrize("name", presets("sensors"))
-def test_every_preset_is_a_sensor(name: str) -> None:
+def test_every_preset_is_a_valid_sensor(name: str) -> None:
     made = recipe(f"sensor.preset={name}")
     given = preset("sensors", name)
     assert set(given) == {"camera", "sensor"}
     assert made.camera.pixel_pitch_um == given["camera"]["pixel_pitch_um"]
     assert made.sensor.model_dump(include=set(given["sensor"])) == given["sensor"]
-    # A full well uses the converter: it ends above 90 % of it, and not more than a tenth beyond.
+    # The full well is at 90 to 110 % of the ADC's range.
     level = made.sensor.full_well_e / made.sensor.gain_at_iso_e_per_dn + made.sensor.black_level_dn
     assert name == "ideal" or 0.9 < level / made.sensor.largest_dn < 1.1
 
 
 @pytest.mark.parametrize("name", presets("sensors"))
-def test_every_number_of_a_preset_says_where_it_is_from(name: str) -> None:
+def test_every_number_of_a_preset_names_its_source(name: str) -> None:
     text = (ROOT / f"vlcrender/config/preset_files/sensors/{name}.toml").read_text()
     for line in text.splitlines():
         if "=" in line and not line.startswith("#") and name != "ideal":
             assert "#" in line or "noise = " in line or "quantum_efficiency" in line, line
 
 
-def test_the_issue_asks_for_these() -> None:
+def test_the_presets_include_ideal_industrial_and_phone() -> None:
     assert {"ideal", "industrial", "phone-1.2um"} < set(presets("sensors"))
 
 
-def test_what_a_recipe_says_wins_over_the_preset_it_names(tmp_path: Path) -> None:
+def test_keys_of_a_recipe_override_its_preset(tmp_path: Path) -> None:
     tree = {"sensor": {"preset": "phone-1.2um", "bits": 12}, "camera": {"f_number": 1.8}, "name": "x"}
     made = with_presets(tree, [], "here")
     assert made["sensor"]["bits"] == 12
@@ -50,7 +54,7 @@ def test_what_a_recipe_says_wins_over_the_preset_it_names(tmp_path: Path) -> Non
     assert tree["sensor"]["preset"] == "phone-1.2um", "the tree given is left as it is"
 
 
-def test_an_assigned_preset_wins_over_the_recipe_and_other_assignments_over_it() -> None:
+def test_an_assigned_preset_overrides_the_recipe_and_other_assignments_override_it() -> None:
     made = recipe("sensor.read_noise_e=9", "sensor.preset=industrial", "camera.pixel_pitch_um=3.0")
     assert made.sensor.read_noise_e == 9.0
     assert made.sensor.full_well_e == 9458.0
@@ -109,13 +113,48 @@ REFUSED = {
     ),
     "level": (["exposure.kind=noise-level", "exposure.level_db=nan"], ["exposure.level_db"]),
     "repeats": (["repeats=0"], ["repeats = 0"]),
-    "processed windows": (["processed={}", "regions.kind=leds"], ["processed", "regions"]),
+    "processed regions": (["processed={}", "regions.kind=leds"], ["processed", "regions"]),
     "quality": (["processed.quality=101"], ["processed.quality = 101"]),
 }
 
 
+RENAMED = {
+    "windows.margin_px=3": "key windows was renamed: write regions",
+    "windows={}": "key windows was renamed: write regions",
+    "exposure.longest_s=1.0": "key exposure.longest_s was renamed: write exposure.max_s",
+}
+
+
+@pytest.mark.parametrize("assignment", RENAMED)
+def test_a_renamed_key_is_refused_with_its_present_name(assignment: str) -> None:
+    with pytest.raises(InputError) as refusal:
+        recipe(assignment)
+    assert str(refusal.value) == f"{QUICKSTART} with --set: {RENAMED[assignment]}"
+
+
+def test_every_present_name_of_a_renamed_key_is_a_key() -> None:
+    """The present names are keys of the models, the former ones are not."""
+    for former, present in RENAMED_KEYS.items():
+        keys = [any(_is_key(name.split("."), model) for model in (Recipe, SceneSettings)) for name in (former, present)]
+        assert keys == [False, True], (former, present)
+
+
+def _is_key(path: list[str], model: type[BaseModel]) -> bool:
+    if path[0] not in model.model_fields:
+        return False
+    models = _models(model.model_fields[path[0]].annotation)
+    return len(path) == 1 or any(_is_key(path[1:], inner) for inner in models)
+
+
+def _models(annotation: object) -> list[type[BaseModel]]:
+    """Models in an annotation: of tables, arrays of tables and unions."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [model for argument in get_args(annotation) for model in _models(argument)]
+
+
 @pytest.mark.parametrize("case", REFUSED)
-def test_refused_by_name(case: str) -> None:
+def test_a_bad_value_is_refused_in_one_line(case: str) -> None:
     assignments, mentions = REFUSED[case]
     with pytest.raises(InputError) as refusal:
         recipe(*assignments)

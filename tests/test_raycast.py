@@ -1,4 +1,4 @@
-"""What hides LEDs and what mirrors them: geometry and Fresnel's law against hand calculations."""
+"""Occlusion and specular reflection of LEDs: geometry and Fresnel's equations against hand calculations."""
 
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from vlcrender.sensor.radiometry import Silicon, electron_rate_per_cd_m2
 
 TABLE1 = read_toml(ROOT / "scenes/table1.toml")
 LAMP = {"id": 1, "position_m": [3.0, 3.5, 3.5], "radius_m": 0.03, "luminance_cd_m2": 10000.0}
-PANE = {"wall": "x=0", "corner_m": [0.5, 0.5], "size_m": [6.0, 2.5], "luminance_cd_m2": 0.0}
+GLAZING = {"wall": "x=0", "corner_m": [0.5, 0.5], "size_m": [6.0, 2.5], "luminance_cd_m2": 0.0}
 WIDE = Camera(width_px=1000, height_px=800, pixel_pitch_um=20.0)
 
 
@@ -32,7 +32,7 @@ def patch_of(scene: Scene, pose: Pose) -> LedPatch:
     return Renderer(scene).expected_image(PosedCamera(WIDE, pose)).patches[0]
 
 
-def test_a_pane_reflects_by_fresnels_law() -> None:
+def test_glazing_reflects_by_fresnels_equations() -> None:
     # straight on: F = (0.52 / 2.52)^2 = 4.258 % at each face, 2 F / (1 + F) = 8.168 %
     assert glazing_reflectance(1.0, 1.52, np.sqrt) == pytest.approx(0.08168, abs=1e-5)
     # grazing: everything; no glass: nothing
@@ -44,9 +44,9 @@ def test_a_pane_reflects_by_fresnels_law() -> None:
     assert glazing_reflectance(np.cos(brewster), 1.52, np.sqrt) == pytest.approx(2 * face / (1 + face), rel=1e-9)
 
 
-def test_the_mirror_image_of_an_led_is_where_geometry_puts_it() -> None:
-    """In a pane in the wall x = 0 the LED at x = 3 is seen as one at x = -3, dimmed by the pane."""
-    renderer = Renderer(room(glazing=[PANE]))
+def test_a_specular_reflection_is_at_the_image_of_the_mirrored_led() -> None:
+    """Glazing in the wall x = 0 reflects the LED at x = 3 as one at x = -3, dimmed by its reflectance."""
+    renderer = Renderer(room(glazing=[GLAZING]))
     # towards the wall and up: the mirror image is 5 m away across and 2.5 m up
     pose = Pose((2.0, 3.4, 1.0), tilt_y_deg=-60.0)
     view = renderer.expected_image(PosedCamera(WIDE, pose))
@@ -68,16 +68,16 @@ def test_the_mirror_image_of_an_led_is_where_geometry_puts_it() -> None:
     assert reflection.electrons_per_s.max() == pytest.approx(whole, rel=0.01)
 
 
-def test_no_led_is_mirrored_where_the_pane_is_not() -> None:
-    low = {**PANE, "corner_m": [0.5, 0.1], "size_m": [6.0, 0.5]}
+def test_no_led_is_reflected_beside_the_glazing() -> None:
+    low = {**GLAZING, "corner_m": [0.5, 0.1], "size_m": [6.0, 0.5]}
     renderer = Renderer(room(glazing=[low]))
     view = renderer.expected_image(PosedCamera(WIDE, Pose((2.0, 3.4, 1.0), tilt_y_deg=-60.0)))
     assert not view.parts[0].reflections
 
 
-def test_a_reflection_flickers_with_its_led() -> None:
+def test_a_specular_reflection_is_modulated_with_its_led() -> None:
     part = (
-        Renderer(room(glazing=[PANE]))
+        Renderer(room(glazing=[GLAZING]))
         .expected_image(PosedCamera(WIDE, Pose((2.0, 3.4, 1.0), tilt_y_deg=-60.0)))
         .parts[0]
     )
@@ -85,10 +85,10 @@ def test_a_reflection_flickers_with_its_led() -> None:
 
 
 @pytest.mark.parametrize(("edge_x", "share"), [(2.9, 0.0), (3.0, 0.5), (3.1, 1.0)])
-def test_a_board_hides_as_much_of_an_led_as_it_covers(tmp_path: Path, edge_x: float, share: float) -> None:
-    """Camera straight below the LED; a board just below it whose edge is at edge_x leaves what is left of the edge."""
-    corners = [(edge_x, 3.0), (edge_x + 1, 3.0), (edge_x + 1, 4.0), (edge_x, 4.0)]
-    text = "".join(f"v {x} {y} 0\n" for x, y in corners) + "f 1 3 2\nf 1 4 3\n"
+def test_a_board_hides_the_share_of_an_led_that_it_covers(tmp_path: Path, edge_x: float, share: float) -> None:
+    """Camera straight below the LED; a board just below it covers x > edge_x."""
+    vertices = [(edge_x, 3.0), (edge_x + 1, 3.0), (edge_x + 1, 4.0), (edge_x, 4.0)]
+    text = "".join(f"v {x} {y} 0\n" for x, y in vertices) + "f 1 3 2\nf 1 4 3\n"
     (tmp_path / "board.obj").write_text(text)
     piece = {"file": "board.obj", "position_m": [0.0, 0.0, 3.49]}
     camera = Camera(width_px=400, height_px=300, pixel_pitch_um=12.0)
@@ -102,27 +102,27 @@ def test_a_board_hides_as_much_of_an_led_as_it_covers(tmp_path: Path, edge_x: fl
 
 
 @pytest.mark.parametrize(("edge_x", "share"), [(-0.06, 0.0), (0.0, 0.5), (0.06, 1.0)])
-def test_a_board_between_pane_and_led_hides_as_much_of_the_false_image(
+def test_a_board_between_glazing_and_led_hides_its_share_of_the_specular_reflection(
     tmp_path: Path, edge_x: float, share: float
 ) -> None:
-    """A board just below the LED, out of the direct ray's way but in the mirrored one's: it covers x > 3 + edge_x.
+    """A board just below the LED, beside the direct rays, blocks reflected ones: it covers x > 3 + edge_x.
 
-    The mirrored ray comes from the wall x = 0, 2.5 m up over 5 m across, and passes 1 cm below the LED's plane 2 cm
+    The reflected ray comes from the wall x = 0, 2.5 m up over 5 m across, and passes 1 cm below the LED's plane 2 cm
     nearer to the wall than where it meets it.
     """
-    corners = [(3.0 + edge_x, 3.0), (4.0, 3.0), (4.0, 4.0), (3.0 + edge_x, 4.0)]
-    text = "".join(f"v {x} {y} 0\n" for x, y in corners) + "f 1 3 2\nf 1 4 3\n"
+    vertices = [(3.0 + edge_x, 3.0), (4.0, 3.0), (4.0, 4.0), (3.0 + edge_x, 4.0)]
+    text = "".join(f"v {x} {y} 0\n" for x, y in vertices) + "f 1 3 2\nf 1 4 3\n"
     (tmp_path / "board.obj").write_text(text)
     piece = {"file": "board.obj", "position_m": [-0.02, 0.0, 3.49]}
     pose = Pose((2.0, 3.4, 1.0), tilt_y_deg=-60.0)
-    scenes = room(tmp_path, glazing=[PANE], furniture=[piece]), room(glazing=[PANE])
+    scenes = room(tmp_path, glazing=[GLAZING], furniture=[piece]), room(glazing=[GLAZING])
     hidden, free = (Renderer(scene).expected_image(PosedCamera(WIDE, pose)).parts[0].reflections for scene in scenes)
     light = sum(r.electrons_per_s.sum(dtype=float) for r in hidden)
     # 64 rays a pixel of an image 9 px wide, and a disc seen under perspective: a few parts of a thousand
     assert light / free[0].electrons_per_s.sum(dtype=float) == pytest.approx(share, abs=0.02)
 
 
-def test_a_lambertian_order_dims_the_led_aside() -> None:
+def test_an_led_of_higher_order_is_dimmer_off_its_normal() -> None:
     """L = L_0 cos^(m - 1): at 30 deg and a half-power angle of 30 deg, m = 4.82, so cos^3.82 = 0.577."""
     pose = Pose((3.0 - 3.0 * np.tan(np.radians(30)), 3.5, 0.5), tilt_y_deg=30.0)
     plain, narrow = (
@@ -133,17 +133,16 @@ def test_a_lambertian_order_dims_the_led_aside() -> None:
     assert narrow / plain == pytest.approx(np.cos(np.radians(30)) ** (order - 1), rel=0.02)
 
 
-def test_a_square_led_has_the_light_of_its_area() -> None:
+def test_a_square_led_has_light_in_proportion_to_its_area() -> None:
     pose = Pose((3.0, 3.5, 0.5))
-    disc, square = (
-        patch_of(room(led=[{**LAMP, "shape": shape}]), pose).electrons_per_s.sum(dtype=float)
-        for shape in ("disc", "square")
-    )
+    side = 2 * LAMP["radius_m"]
+    square_led = {key: value for key, value in LAMP.items() if key != "radius_m"} | {"shape": "square", "side_m": side}
+    disc, square = (patch_of(room(led=[led]), pose).electrons_per_s.sum(dtype=float) for led in (LAMP, square_led))
     assert square / disc == pytest.approx(4 / np.pi, rel=1e-3)
 
 
 def test_a_panel_hung_low_hides_an_led_above_it() -> None:
-    """No furniture in it: an LED on the ceiling, a panel 0.5 m below it between LED and camera."""
+    """A scene without furniture: an LED on the ceiling, a panel 0.5 m below it between LED and camera."""
     leds = {"columns": 1, "rows": 1, "pitch_m": [0.1, 0.1], "radius_m": 0.01, "first_id": 10}
     panel = {
         "columns": 1,

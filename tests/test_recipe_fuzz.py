@@ -1,4 +1,4 @@
-"""Whatever a recipe says of sensor, accelerometer, exposure and pictures is taken or refused; never a crash."""
+"""Fuzzing of a recipe's sensor, accelerometer, exposure and pictures: a recipe or an InputError, never a crash."""
 
 import string
 import tempfile
@@ -21,7 +21,7 @@ QUICKSTART = ROOT / "datasets/quickstart.toml"
 TABLES: dict[str, tuple[str, ...]] = {
     "sensor": (*Sensor.model_fields, "preset"),
     "accelerometer": ("kind", "error_deg", "bias_m_s2", "bits", "range_g", "samples", "temperature_c", "preset"),
-    "exposure": ("kind", "share_of_saturation", "level_db", "longest_s"),
+    "exposure": ("kind", "share_of_saturation", "level_db", "max_s"),
     "processed": ("curve", "gamma", "format", "quality"),
 }
 WORDS = (
@@ -49,15 +49,15 @@ PLAUSIBLE: dict[str, Any] = {
     "sensor.dark_current_e_s": 5.0,
     "sensor.preset": "industrial",
     "accelerometer.preset": "bmi270",
-    "exposure": {"kind": "peak", "share_of_saturation": 0.5, "longest_s": 1},
+    "exposure": {"kind": "peak", "share_of_saturation": 0.5, "max_s": 1},
     "processed.format": "png",
 }
-"""Values that are taken, so that not all is refused."""
+"""Valid values, so that some recipes are valid."""
 KEYS = st.sampled_from([f"{table}.{key}" for table, keys in TABLES.items() for key in keys] + [*TABLES, "exposure_s"])
 
 
 def toml(value: Any) -> str:
-    """A value as TOML has it. Python's nan and inf are TOML's; its text is not."""
+    """A value in TOML syntax. Python and TOML write nan and inf alike, but not text."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, str):
@@ -69,8 +69,8 @@ def toml(value: Any) -> str:
     return repr(value)
 
 
-def taken_or_refused(path: Path, assignments: list[str]) -> None:
-    """A recipe that is taken means the same in a worker, tells finite numbers of itself, and can be made smaller."""
+def valid_or_refused(path: Path, assignments: list[str]) -> None:
+    """A valid recipe is the same in a worker, has finite parameters, and can be scaled."""
     try:
         plan = load_plan(path, assignments)
     except InputError:
@@ -101,8 +101,8 @@ def smaller(plan: Plan) -> None:
 @example([], [("exposure_s", "[" * 5000)])
 @example([], [("sensor.noise", '"none"\nsensor.bits = 10')])
 @example([], [("sensor", "{}"), ("sensor.preset", '"phone-1.2um"'), ("sensor.preset.x", "1")])
-def test_any_assignment_is_taken_or_refused(sound: list[tuple[str, str]], odd: list[tuple[str, str]]) -> None:
-    taken_or_refused(QUICKSTART, [f"{key}={value}" for key, value in sound + odd])
+def test_any_assignment_is_valid_or_refused(sound: list[tuple[str, str]], odd: list[tuple[str, str]]) -> None:
+    valid_or_refused(QUICKSTART, [f"{key}={value}" for key, value in sound + odd])
 
 
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -113,8 +113,8 @@ def test_any_assignment_is_taken_or_refused(sound: list[tuple[str, str]], odd: l
     ),
     st.data(),
 )
-def test_any_table_is_taken_or_refused(odd: dict[str, dict[str, Any]], data: st.DataObject) -> None:
-    """Some of the keys that a table has, and at times one that it has not."""
+def test_any_table_is_valid_or_refused(odd: dict[str, dict[str, Any]], data: st.DataObject) -> None:
+    """Some of a table's keys, and sometimes an unknown one."""
     tables = {
         name: data.draw(st.dictionaries(st.sampled_from(TABLES[name]), VALUES, max_size=4)) | more
         for name, more in odd.items()
@@ -123,15 +123,15 @@ def test_any_table_is_taken_or_refused(odd: dict[str, dict[str, Any]], data: st.
         f"\n[{name}]\n" + "".join(f"{toml(k)} = {toml(v)}\n" for k, v in table.items())
         for name, table in tables.items()
     )
-    refused_or_taken_file(text)
+    valid_or_refused_file(text)
 
 
 @pytest.mark.parametrize("value", ["9" * 5000, "0x" + "f" * 5000, "[" * 5000])
 def test_values_beyond_all_bounds_are_refused(value: str) -> None:
-    refused_or_taken_file(f"\n[processed]\nquality = {value}\n")
+    valid_or_refused_file(f"\n[processed]\nquality = {value}\n")
 
 
-def refused_or_taken_file(tables: str) -> None:
+def valid_or_refused_file(tables: str) -> None:
     tree = read_toml(QUICKSTART)
     head = {
         k: v for k, v in tree.items() if not isinstance(v, dict) and not ("[exposure]" in tables and k == "exposure_s")
@@ -141,4 +141,4 @@ def refused_or_taken_file(tables: str) -> None:
         path = Path(folder) / "recipe.toml"
         lines = [f"{key} = {toml(value)}\n" for key, value in head.items()]
         path.write_text("".join(lines) + f"poses = {toml(tree['poses'])}\n" + tables, encoding="utf-8")
-        taken_or_refused(path, [])
+        valid_or_refused(path, [])

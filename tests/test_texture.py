@@ -1,4 +1,4 @@
-"""Textures: what a pixel sees of one against brute force, where it lies, the balance of light, refusals."""
+"""Textures: means over pixels against brute force, orientation, energy balance, error messages."""
 
 from pathlib import Path
 
@@ -23,7 +23,7 @@ PLAIN = {"floor": 0.3, "ceiling": 0.8, "walls": 0.5}
 LAMP = {"id": 1, "position_m": [1.5, 1.5, 2.5], "radius_m": 0.02, "luminance_cd_m2": 20000.0}
 
 
-def papered(
+def textured(
     folder: Path, image: np.ndarray, tile_m: tuple[float, float], name: str = "ceiling", **changes: object
 ) -> Scene:
     """The test room with an image of reflectances, written in 16 bits, on one of its surfaces."""
@@ -48,15 +48,13 @@ def speckled() -> np.ndarray:
 
 def evenly_lit(scene: Scene, lux: float) -> Background:
     mesh = room_mesh(scene)
-    corners = len(mesh.vertices_m)
+    count = len(mesh.vertices_m)
     albedo = np.append(mesh.albedo, 0.5)
-    return Background(
-        scene, Lightmap(mesh, albedo, np.zeros(corners + 1), np.full(corners + 1, lux), np.zeros(corners + 1))
-    )
+    return Background(scene, Lightmap(mesh, albedo, np.zeros(count + 1), np.full(count + 1, lux), np.zeros(count + 1)))
 
 
 def brute_force(texture: Texture, camera: Camera, pose: Pose, grid: int) -> np.ndarray:
-    """Mean reflectance in each pixel's view of the ceiling: grid x grid rays a pixel, linear between image pixels."""
+    """Mean reflectance of the ceiling in each pixel: grid x grid rays per pixel, linear between texture pixels."""
     rows, columns = texture.reflectances.shape
     total = np.zeros((camera.height_px, camera.width_px))
     within = (np.arange(grid) + 0.5) / grid
@@ -81,7 +79,7 @@ def brute_force(texture: Texture, camera: Camera, pose: Pose, grid: int) -> np.n
     "pose", [Pose((1.4, 1.5, 0.3)), Pose((1.4, 1.6, 0.3), yaw_deg=45.0), Pose((1.2, 1.3, 1.6), 40.0, 0.0, 70.0)]
 )
 @pytest.mark.parametrize("pitch_um", [1.2, 36.0, 120.0, 400.0], ids=["magnified", "alike", "3 to 1", "10 to 1"])
-def test_a_view_of_a_texture_errs_by_less_than_a_hundredth_of_the_shot_noise(
+def test_the_error_of_a_texture_is_below_a_hundredth_of_the_shot_noise(
     tmp_path: Path, pitch_um: float, pose: Pose
 ) -> None:
     """Tiles of 0.6 m in 128 pixels of 4.7 mm, seen from 2.2 m in pixels of 0.15 to 50 mm.
@@ -89,7 +87,7 @@ def test_a_view_of_a_texture_errs_by_less_than_a_hundredth_of_the_shot_noise(
     The brightest LED of 16 000 cd/m2 holds 4 000 electrons, so the ceiling under 440 lux some 28 at a reflectance of
     0.8. The error's variance is its mean square over the image, and the shot noise's is the mean number of electrons.
     """
-    scene = papered(tmp_path, speckled(), (0.6, 0.6))
+    scene = textured(tmp_path, speckled(), (0.6, 0.6))
     camera = Camera(width_px=80, height_px=60, pixel_pitch_um=pitch_um)
     rates = ElectronRates(led=0.0, ambient=4000 / 16000)
     (region,) = evenly_lit(scene, 440.0).regions(PosedCamera(camera, pose), (Roi.of_sensor(camera),), rates)
@@ -118,14 +116,16 @@ def test_a_view_of_a_texture_errs_by_less_than_a_hundredth_of_the_shot_noise(
         ("walls", [0.4, 3.0, 2.35], Pose((0.4, 1.0, 2.3), -90.0)),
     ],
 )
-def test_an_image_lies_as_written(tmp_path: Path, name: str, place: list[float], pose: Pose) -> None:
+def test_a_texture_has_the_documented_origin_and_axes(
+    tmp_path: Path, name: str, place: list[float], pose: Pose
+) -> None:
     """A white spot at column 4 of 6 and row 1 of 3 of a tile 0.6 m across and 0.3 m down, in black."""
     image = np.zeros((6, 12))
     image[3, 8] = 1.0  # centre at 0.425 m across and 0.175 m down
     at = np.array(place) + (np.array([0.025, 0.025, 0]) if name != "walls" else [0, 0, -0.025])
     if name == "walls":
         at[1 if place[0] in (0.0, 3.0) and place[1] == 0.4 else 0] += 0.025
-    scene = papered(tmp_path, image, (0.6, 0.3), name)
+    scene = textured(tmp_path, image, (0.6, 0.3), name)
     camera = Camera(width_px=400, height_px=300, pixel_pitch_um=20.0)
     rates = ElectronRates(led=0.0, ambient=1.0)
     (region,) = evenly_lit(scene, 100.0).regions(PosedCamera(camera, pose), (Roi.of_sensor(camera),), rates)
@@ -139,7 +139,7 @@ def test_an_image_lies_as_written(tmp_path: Path, name: str, place: list[float],
     assert np.abs(found - pixel).max() < 0.5
 
 
-def test_the_reference_sees_the_same_texture(tmp_path: Path) -> None:
+def test_a_texture_agrees_with_the_reference(tmp_path: Path) -> None:
     """An image without symmetry on the ceiling, a panel cut into it, seen slanted and lit by an LED."""
     image = np.linspace(0.1, 0.9, 12).reshape(3, 4)[:, [2, 0, 3, 1]]
     leds = {
@@ -159,7 +159,7 @@ def test_the_reference_sees_the_same_texture(tmp_path: Path) -> None:
         "reflectance": 0.7,
         "leds": leds,
     }
-    scene = papered(tmp_path, image, (0.8, 0.6), led=[], panels=[panel])
+    scene = textured(tmp_path, image, (0.8, 0.6), led=[], panels=[panel])
     camera = Camera(**SMALL_VIEW)
     ours, reference, variance, lit = both_ways(scene, camera, Pose((1.2, 2.0, 0.5), 20.0, 2.0, 25.0), 128)
     assert lit.any()
@@ -171,20 +171,20 @@ def test_the_reference_sees_the_same_texture(tmp_path: Path) -> None:
     assert np.ptp(theirs) > 0.5 * theirs.mean()
 
 
-def test_what_leds_send_is_what_a_papered_room_absorbs(tmp_path: Path) -> None:
-    """Energy balance with a texture on the floor whose pixels are as large as texels, and do not fall together."""
+def test_a_textured_room_absorbs_the_flux_of_the_leds(tmp_path: Path) -> None:
+    """Energy balance with a texture on the floor with pixels as large as texels, at other positions."""
     image = np.array([[0.1, 0.9], [0.8, 0.2]])
-    scene = papered(tmp_path, image, (0.34, 0.5), "floor", bake={"texel_m": 0.1, "paths": 512})
+    scene = textured(tmp_path, image, (0.34, 0.5), "floor", bake={"texel_m": 0.1, "paths": 512})
     light = bake(scene, tmp_path)
-    corners = len(light.mesh.vertices_m)
-    absorbed = ((1 - light.mesh.albedo) * light.led_lux[:corners] * light.mesh.areas_m2()).sum()
+    count = len(light.mesh.vertices_m)
+    absorbed = ((1 - light.mesh.albedo) * light.led_lux[:count] * light.mesh.areas_m2()).sum()
     flux = np.pi * 20000 * np.pi * 0.02**2
     # as in a plain room: 1 % for the quadrature and Monte Carlo
     assert absorbed == pytest.approx(flux, rel=0.01)
     floor = mesh_of_surfaces(scene.surfaces[:1], 0.1)
     texture = scene.surfaces[0].texture
     assert texture is not None
-    # 3 m are not whole tiles: the mean over the floor, which a corner's area weighs exactly but at the triangles' ends
+    # 3 m are not whole tiles: the mean over the floor, which the vertices' areas weigh exactly but at the ends
     whole = texture.means(np.zeros((1, 3)), np.array([[3.0, 3.0, 0.0]]))[0]
     assert (floor.albedo * floor.areas_m2()).sum() / 9 == pytest.approx(whole, abs=1e-3)
 
@@ -211,12 +211,12 @@ def test_grey_values_are_read_linearly(tmp_path: Path) -> None:
         assert read_reflectances(tmp_path / name, "test").tolist() == [[0.0, 0.2, 1.0]]
 
 
-def test_another_image_is_another_bake(tmp_path: Path) -> None:
+def test_another_texture_gives_another_bake(tmp_path: Path) -> None:
     """Two images whose means over texels are the same are still two."""
     image = np.kron([[0.2, 0.8], [0.8, 0.2]], np.ones((4, 4)))
     coarse = {"texel_m": 1.0, "paths": 8}
     for pixels in (image, image[::-1], image):
-        bake(papered(tmp_path, pixels, (0.1, 0.1), "floor", bake=coarse), tmp_path)
+        bake(textured(tmp_path, pixels, (0.1, 0.1), "floor", bake=coarse), tmp_path)
     assert len(list(tmp_path.glob("*.npz"))) == 2
 
 
@@ -243,7 +243,7 @@ BAD_FILES = {
 
 
 @pytest.mark.parametrize("message", BAD_FILES)
-def test_an_image_that_cannot_be_used_is_refused_in_one_line(tmp_path: Path, message: str) -> None:
+def test_an_unusable_texture_is_refused_in_one_line(tmp_path: Path, message: str) -> None:
     BAD_FILES[message](tmp_path / "x.png")
     room = {**dict(ROOM["room"]), "reflectance": {"ceiling": 0.8, "walls": 0.5}}  # type: ignore[call-overload]
     room["texture"] = {"floor": {"file": "x.png", "tile_m": [1.0, 1.0]}}

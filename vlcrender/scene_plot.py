@@ -1,4 +1,4 @@
-"""A picture of a room: its plan and what a camera in it sees, with the share of poses that see enough LEDs."""
+"""Picture of a scene: a floor plan, and the image of a camera on the floor."""
 
 from pathlib import Path
 from typing import Any
@@ -20,9 +20,13 @@ from vlcrender.scene.visibility import leds_in_view
 from vlcrender.sensor.radiometry import Silicon, electron_rate_per_cd_m2
 
 EXPOSURE_S = 160e-6
+"""Exposure time of the image."""
 REFERENCE_SCALE = 8
+"""Size of the reference's pixels, in pixels of the camera."""
 REFERENCE_SAMPLES = 128
+"""Samples per pixel of the reference."""
 WHITE_E = 4000.0
+"""Electrons that are drawn white."""
 
 
 def show_pose(scene: Scene, camera: Camera) -> PosedCamera:
@@ -44,9 +48,9 @@ def show_pose(scene: Scene, camera: Camera) -> PosedCamera:
 
 
 def draw(scene: Scene, camera: Camera, path: Path, reference: bool = False) -> None:
-    """Write a PNG with the plan and the view from `show_pose`.
+    """Write a PNG with the floor plan and the image from `show_pose`.
 
-    With `reference` the view is path-traced by Mitsuba, slowly and in larger pixels.
+    reference: let Mitsuba path-trace the image, slowly and in pixels REFERENCE_SCALE times as large.
     """
     posed = show_pose(scene, camera)
     electrons: NDArray[Any]
@@ -79,7 +83,7 @@ def _draw_plan(axes: Axes, scene: Scene, posed: PosedCamera) -> EllipseCollectio
         )
     )
     leds = scene.leds
-    widths = np.maximum(2 * leds.radii_m, 0.004 * x_m)
+    widths = np.maximum(2 * leds.half_widths_m, 0.004 * x_m)
     discs = EllipseCollection(
         widths,
         widths,
@@ -104,7 +108,7 @@ def _draw_plan(axes: Axes, scene: Scene, posed: PosedCamera) -> EllipseCollectio
         ylabel="y, m (down, as in the image)",
     )
     axes.set_aspect("equal")
-    axes.set_title(f"{scene.name}: {x_m:g} x {y_m:g} x {z_m:g} m seen from below, {len(leds)} LEDs; blue: the view")
+    axes.set_title(f"{scene.name}: {x_m:g} x {y_m:g} x {z_m:g} m seen from below, {len(leds)} LEDs; blue: the image")
     return discs
 
 
@@ -152,6 +156,6 @@ def _draw_view(axes: Axes, scene: Scene, posed: PosedCamera, electrons: NDArray[
     x, y, z = pose.position_m
     axes.set(xlabel="u, px", ylabel="v, px")
     axes.set_title(
-        f"seen level from ({x:.2f}, {y:.2f}, {z:.2f}) m, yaw {pose.yaw_deg:g} deg, "
+        f"level camera at ({x:.2f}, {y:.2f}, {z:.2f}) m, yaw {pose.yaw_deg:g} deg, "
         f"{EXPOSURE_S * 1e6:g} us at f/{camera.f_number:g}; gamma 2.2"
     )

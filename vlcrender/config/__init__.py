@@ -1,4 +1,4 @@
 """Checked configuration: TOML files into frozen models, and presets of sensors and accelerometers.
 
-Every refusal names file, key, value and the allowed values.
+Error messages name file, key, value and the allowed values.
 """

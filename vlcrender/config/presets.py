@@ -1,8 +1,7 @@
-"""Presets: parts of recipes that come with the package, such as a sensor's numbers.
+"""Presets: parts of recipes that come with the package, such as the parameters of a sensor.
 
-A preset of a kind is a TOML file in `preset_files/KIND/NAME.toml` beside this module: a partial recipe, in which each
-number says where it is from. In a recipe, or with --set, `preset = "NAME"` in the table that the kind is named for
-stands for all that the file says.
+A preset is a TOML file `preset_files/KIND/NAME.toml` beside this module: a partial recipe with the source of each
+number. `preset = "NAME"` in the table of its kind, in a recipe or with --set, inserts the file's tables.
 """
 
 from collections.abc import Iterable, Mapping
@@ -14,27 +13,26 @@ from vlcrender.errors import InputError
 
 FOLDER = Path(__file__).parent / "preset_files"
 KINDS = {"sensor": "sensors", "accelerometer": "accelerometers"}
-"""Table of a recipe -> folder of its presets."""
+"""Folder of the presets, by table of a recipe."""
 
 
 def presets(kind: str) -> tuple[str, ...]:
-    """Names of the presets of a kind, "sensors" or "accelerometers"."""
+    """Names of the presets of a kind, "sensors" or "accelerometers", sorted."""
     return tuple(sorted(path.stem for path in (FOLDER / kind).glob("*.toml")))
 
 
 def preset(kind: str, name: str) -> dict[str, Any]:
-    """The partial recipe of this name. Raises InputError, with the names there are, where there is none."""
+    """The partial recipe of a preset. Raises InputError that lists the presets for an unknown name."""
     if name not in presets(kind):
-        raise InputError(f'preset = "{name}": is not one of the {kind} there are: {", ".join(presets(kind))}')
+        raise InputError(f'preset = "{name}": unknown; presets of {kind}: {", ".join(presets(kind))}')
     return read_toml(FOLDER / kind / f"{name}.toml")
 
 
 def with_presets(tree: Mapping[str, Any], assignments: Iterable[str], source: str) -> dict[str, Any]:
-    """A recipe's tree with its presets put in, then `key=value` assignments as `settings.override` has them.
+    """A recipe's tree with presets inserted and `key=value` assignments applied (see `toml_model.override`).
 
-    What the recipe itself says wins over a preset that it names; a preset that an assignment names takes the place of
-    the recipe's own table, and other assignments win over all. `source` names the recipe in the InputError for a preset
-    that there is not.
+    Keys of the recipe override a preset that it names. A preset named by an assignment replaces the recipe's table.
+    Other assignments override everything. Raises InputError that starts with `source` for an unknown preset.
     """
     given = list(assignments)
     chosen = {key: [a for a in given if a.partition("=")[0].strip() == f"{key}.preset"] for key in KINDS}
@@ -46,7 +44,7 @@ def with_presets(tree: Mapping[str, Any], assignments: Iterable[str], source: st
             tree = _merged(_named(kind, key, table["preset"], source), own)
         for assignment in chosen[key]:
             name = override({}, [assignment])[key]["preset"]
-            tree = _merged({**tree, key: {}}, _named(kind, key, name, source))  # of one part, nothing of another
+            tree = _merged({**tree, key: {}}, _named(kind, key, name, source))  # no key of another preset remains
     return override(tree, [a for a in given if not any(a in of_key for of_key in chosen.values())])
 
 
@@ -58,7 +56,7 @@ def _named(kind: str, key: str, name: object, source: str) -> dict[str, Any]:
 
 
 def _merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """Tables put together, `over` winning, as deep as a recipe's tables with keys of their own: the first level."""
+    """Two trees merged to the depth of a recipe's first level of tables; keys of `over` override."""
     result = dict(base)
     for key, value in over.items():
         both = isinstance(value, dict) and isinstance(result.get(key), dict)

@@ -1,4 +1,4 @@
-"""TOML files into checked models; every refusal names file, key, value and what is allowed."""
+"""TOML files into checked models. Error messages name file, key, value and the allowed values."""
 
 import difflib
 import json
@@ -10,68 +10,87 @@ from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic.fields import FieldInfo
+from pydantic_core import PydanticCustomError
 
 from vlcrender.errors import InputError
 
 
 class Settings(BaseModel):
-    """A table of a TOML file: unknown keys, NaN, infinities and values of another type are refused."""
+    """Base class of the tables of TOML files. It refuses unknown keys, NaN, infinities and values of another type."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)
 
 
 S = TypeVar("S", bound=Settings)
 
+RENAMED_KEYS = {
+    "exposure.longest_s": "exposure.max_s",
+    "window": "glazing",
+    "windows": "regions",
+}
+"""Former key -> present key of recipes and scenes, dotted paths without array indices. `check` refuses former keys."""
+
+
+def key_error(key: str, message: str) -> PydanticCustomError:
+    """The exception that a model's validator raises for one `key` of its table; `message` follows the key."""
+    return PydanticCustomError("key_error", "{message}", {"key": key, "message": message})
+
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Parse a TOML file. Raises InputError where it is missing, not text or not TOML."""
+    """The tree of a TOML file. Raises InputError for a file that is missing, not UTF-8 or not TOML."""
     try:
         text = path.read_text(encoding="utf-8")
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
     except UnicodeDecodeError:
-        raise InputError(f"{path}: is not UTF-8 text; a TOML file is expected") from None
+        raise InputError(f"{path}: is not UTF-8 text; give a TOML file") from None
     try:
         return tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # ValueError also of a number of thousands of digits
+    except (ValueError, RecursionError) as error:  # ValueError: also for numbers of thousands of digits
         raise InputError(f"{path}: is not TOML: {error}") from None
 
 
 def override(tree: dict[str, Any], assignments: Iterable[str]) -> dict[str, Any]:
-    """Return `tree` with `key=value` assignments applied; keys are dotted, values are TOML (or bare words)."""
+    """A copy of `tree` with `key=value` assignments applied. Keys are dotted; values are TOML or bare words.
+
+    Raises InputError for an assignment without a key or value, and for a key below a value that is no table.
+    """
     result = dict(tree)
     for assignment in assignments:
         key, equals, text = assignment.partition("=")
         if not equals or not all(part.strip() for part in key.split(".")):
-            raise InputError(f"--set {assignment}: is not key=value, as in --set camera.f_number=2.8")
+            raise InputError(f"--set {assignment}: is not key=value; write, for example, --set camera.f_number=2.8")
         *parents, last = (part.strip() for part in key.split("."))
         table = result
         for parent in parents:
             below = table.get(parent, {})
             if not isinstance(below, dict):
                 raise InputError(f"--set {assignment}: {parent} is not a table of the recipe")
-            table[parent] = dict(below)  # a copy: `tree` is left as it is
+            table[parent] = dict(below)  # a copy: `tree` is not changed
             table = table[parent]
         table[last] = _value(text)
     return result
 
 
 def _value(text: str) -> Any:
-    """What TOML has for a value, or a bare word, such as `none` in noise=none."""
+    """The value of a TOML expression; any other text is a bare word, such as `none` in noise=none."""
     try:
         table = tomllib.loads(f"value = {text}")
     except (ValueError, RecursionError):
         return text.strip()
-    return table["value"] if len(table) == 1 else text.strip()  # a second line is no part of a value
+    return table["value"] if len(table) == 1 else text.strip()  # text with a second line is a bare word
 
 
 def check(tree: Mapping[str, Any], model: type[S], source: str) -> S:
-    """Check a tree against a model. `source` names it in the InputError raised for the first thing wrong."""
+    """The model of a tree. Raises InputError, one line that starts with `source`, for the first problem."""
+    for former, present in RENAMED_KEYS.items():
+        if _has_key(tree, former.split(".")):
+            raise InputError(f"{source}: key {former} was renamed: write {present}")
     try:
-        # JSON in strict mode: 1 passes for 1.0 and a list for a tuple, but "1" and true do not pass for 1.
+        # Strict JSON accepts 1 for 1.0 and a list for a tuple, but neither "1" nor true for 1.
         return model.model_validate_json(json.dumps(tree, default=str), strict=True)
     except ValidationError as error:
-        # a key in another unit is both unknown and missing: the unknown one says more
+        # A key in another unit is reported as unknown and as missing: report the unknown one, which says more.
         problems = sorted(error.errors(include_url=False), key=lambda problem: problem["type"] != "extra_forbidden")
         more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
         raise InputError(f"{source}: {_one_line(problems[0], model)}{more}") from None
@@ -79,11 +98,25 @@ def check(tree: Mapping[str, Any], model: type[S], source: str) -> S:
         raise InputError(f"{source}: {error}") from None
 
 
+def _has_key(tree: Any, path: list[str]) -> bool:
+    """Whether a tree has a key at a path; a path passes through arrays of tables."""
+    if isinstance(tree, (list, tuple)):
+        return any(_has_key(item, path) for item in tree)
+    if not isinstance(tree, Mapping) or path[0] not in tree:
+        return False
+    return len(path) == 1 or _has_key(tree[path[0]], path[1:])
+
+
 def _one_line(problem: Any, model: type[Settings]) -> str:
+    """The message of a problem that pydantic reports."""
     location = [part for part in problem["loc"] if not _is_tag(part, model)]
-    key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in location).lstrip(".")
     kind, message, value = str(problem["type"]), str(problem["msg"]), problem["input"]
+    if kind == "key_error":
+        location.append(problem["ctx"]["key"])
+    key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in location).lstrip(".")
     message = message.removeprefix("Value error, ").replace("\n", " ")
+    if kind == "key_error":
+        return f"{key}: {message}" if message != "is missing" else f"key {key} is missing"
     if kind == "extra_forbidden":
         allowed = _keys_at(model, list(problem["loc"])[:-1])
         unknown = str(location[-1])
@@ -108,7 +141,7 @@ UNITS = (
 
 
 def _stem(key: str) -> str:
-    """A key without its unit, so that radius_cm is recognised as radius_m in another unit."""
+    """A key without its unit: radius_cm and radius_m have the same stem."""
     for unit in sorted(UNITS, key=len, reverse=True):
         if key.lower().endswith("_" + unit):
             return key[: -len(unit) - 1]
@@ -116,7 +149,7 @@ def _stem(key: str) -> str:
 
 
 def _is_tag(part: object, model: type[Settings]) -> bool:
-    """Whether a part of a location is the tag pydantic puts in for a member of a tagged union."""
+    """Whether a part of a location is a tag, which pydantic inserts for a member of a tagged union."""
     return isinstance(part, str) and part in _tags(model)
 
 
@@ -127,7 +160,7 @@ def _tags(annotation: Any) -> set[str]:
         for field in annotation.model_fields.values():
             unions.append((field.annotation, field))
             tags |= _tags(field.annotation)
-    elif get_origin(annotation) is Annotated:  # a union that is optional has its discriminator here
+    elif get_origin(annotation) is Annotated:  # an optional union has its discriminator here
         union, *metadata = get_args(annotation)
         unions = [(union, item) for item in metadata if isinstance(item, FieldInfo)]
     for union, field in unions:
@@ -140,7 +173,7 @@ def _tags(annotation: Any) -> set[str]:
 
 
 def _keys_at(annotation: Any, location: list[Any]) -> set[str]:
-    """The keys a model allows at a location: follows tables, arrays and unions, tagged ones into the member meant."""
+    """The keys that a model allows at a location, through tables, arrays and unions (of a tagged union: its member)."""
     origin = get_origin(annotation)
     if origin in (Union, UnionType):
         members = get_args(annotation)
@@ -161,7 +194,7 @@ def _keys_at(annotation: Any, location: list[Any]) -> set[str]:
 
 
 def _literals(model: Any) -> set[Any]:
-    """The values of a model's literal fields, its tag among them."""
+    """The values of a model's literal fields, including its tag."""
     if not (isinstance(model, type) and issubclass(model, BaseModel)):
         return set()
     return {value for field in model.model_fields.values() for value in get_args(field.annotation)}

@@ -22,7 +22,7 @@ from vlcrender.camera.rig import Mounted
 from vlcrender.camera.roi import Roi
 from vlcrender.config.toml_model import Settings, check
 from vlcrender.errors import InputError
-from vlcrender.scene.loader import Leds
+from vlcrender.scene.leds import Leds
 
 FRAMES, EXPECTED, PREVIEWS, PROCESSED = "frames", "expected", "previews", "processed"
 """Folders with a file of each frame; the last three where asked for."""
@@ -151,7 +151,7 @@ def led_map(leds: Leds) -> tuple[LedMapEntry, ...]:
             radius_m=float(r),
             shape="square" if square else "disc",
         )
-        for i, c, r, square in zip(leds.ids, leds.centers_m, leds.radii_m, leds.squares, strict=True)
+        for i, c, r, square in zip(leds.ids, leds.centers_m, leds.half_widths_m, leds.squares, strict=True)
     )
 
 

@@ -1,4 +1,4 @@
-"""Illumination of the room: the baked lightmap, ray casting, and the room as Mitsuba sees it.
+"""Illumination of the room: the baked lightmap and its cache, ray casting, and the room as a Mitsuba scene.
 
-Direct LED light is summed, interreflection is path traced once a scene and kept in the cache.
+Direct light of LEDs is a sum; reflected light and daylight are path traced once per scene and kept in the cache.
 """

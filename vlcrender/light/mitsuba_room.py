@@ -1,4 +1,4 @@
-"""A room as Mitsuba knows it: its mesh, its window panes, and what glows."""
+"""A room as a Mitsuba scene: its mesh, its glazing, and the luminance that surfaces emit."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -11,24 +11,28 @@ from vlcrender.scene.mesh import Mesh
 from vlcrender.scene.surfaces import Glazing
 
 BEHIND_M = 1e-3
-"""What is outside lies this far behind its pane, and is larger by this part."""
+"""Distance of the scene outside behind its glazing in metres, and the share by which it is larger than the glazing."""
 GLAZING_FACES = np.array([[0, 1, 2], [0, 2, 3]])
 
 Array = NDArray[np.float64]
 
 
-def mitsuba_scene(mesh: Mesh, glow_cd_m2: Array, glazings: tuple[Glazing, ...], panes_glow: bool) -> Any:
-    """Mesh and panes as a Mitsuba scene whose every shape has an attribute `vertex_glow`, in cd/m2."""
+def mitsuba_scene(mesh: Mesh, glow_cd_m2: Array, glazings: tuple[Glazing, ...], daylight: bool) -> Any:
+    """Mesh and glazing as a Mitsuba scene.
+
+    Each shape has an attribute `vertex_glow`, the luminance that it emits in cd/m2: `glow_cd_m2` (vertices,) of the
+    mesh, and with `daylight` the luminance of the scene outside behind each glazing.
+    """
     shapes = {"room": room_shape(mesh, glow_cd_m2)}
     for i, glazing in enumerate(glazings):
-        shapes[f"pane{i}"] = glazing_shape(glazing)
-        if panes_glow:
+        shapes[f"glazing{i}"] = glazing_shape(glazing)
+        if daylight:
             shapes[f"outside{i}"] = outside_shape(glazing)
     return mi.load_dict({"type": "scene", **shapes}, optimize=False)
 
 
 def room_shape(mesh: Mesh, glow_cd_m2: Array) -> "mi.Mesh":
-    """The room's mesh for Mitsuba, diffuse, with albedo and glow at its corners."""
+    """The room's mesh as a diffuse Mitsuba shape, with albedo and emitted luminance at its vertices."""
     albedo = {"type": "mesh_attribute", "name": "vertex_albedo"}
     bsdf: dict[str, object] = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": albedo}}
     shape = _shape("room", mesh.vertices_m, mesh.faces, bsdf, glow_cd_m2)
@@ -37,12 +41,12 @@ def room_shape(mesh: Mesh, glow_cd_m2: Array) -> "mi.Mesh":
 
 
 def glazing_shape(glazing: Glazing) -> "mi.Mesh":
-    """A window pane for Mitsuba: thin glass by Fresnel's law."""
+    """Glazing as a Mitsuba shape of thin glass."""
     return _shape(glazing.name, glazing.corners_m, GLAZING_FACES, glazing_bsdf(glazing), np.zeros(4))
 
 
 def outside_shape(glazing: Glazing) -> "mi.Mesh":
-    """What is seen through a pane: black where it does not glow, just behind it and a little larger."""
+    """The scene outside of glazing as a Mitsuba shape: black, emitting the glazing's luminance, just behind it."""
     middle = glazing.corners_m.mean(axis=0)
     corners = middle + (1 + BEHIND_M) * (glazing.corners_m - middle) - BEHIND_M * glazing.normal
     black = {"type": "diffuse", "reflectance": 0.0}
@@ -50,7 +54,7 @@ def outside_shape(glazing: Glazing) -> "mi.Mesh":
 
 
 def glazing_bsdf(glazing: Glazing) -> dict[str, object]:
-    """Thin glass: mirrors by Fresnel's law at both faces and lets the rest through."""
+    """Mitsuba's BSDF of thin glass: Fresnel reflection at both faces, transmission of the rest."""
     return {"type": "thindielectric", "int_ior": glazing.refractive_index, "ext_ior": 1.0}
 
 

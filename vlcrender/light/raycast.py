@@ -1,13 +1,13 @@
-"""What rays from the camera meet: the room's baked light, and its mirror image in window panes.
+"""Ray casting from the camera: luminance of the baked room, and of its mirror image in glazing.
 
-The room is one mesh through which Mitsuba casts rays; the light at a hit is interpolated between the corners of the
-triangle. Where a ray meets a pane it is mirrored once and followed on; what a pane shows in another pane is left out.
+The room is one mesh through which Mitsuba casts rays. Luminance at a hit is interpolated between the vertices of the
+triangle. A ray that hits glazing is reflected once and traced on; reflections of glazing in glazing are left out.
 
-On a textured surface illuminance is interpolated, and multiplied by the texture's mean over what the pixel sees of the
-surface: a parallelogram, taken as PIECES x PIECES upright rectangles of the same centres and spreads, each looked up in
-a table of sums (F. Crow, Summed-area tables for texture mapping, SIGGRAPH 1984). The mean is exact for a pixel whose
-sides are along the image's, however large; nothing aliases. Within a pixel of the image reflectance is linear between
-the pixels' centres: their squares blurred by one pixel, which widens the rectangles.
+On a textured surface the interpolated illuminance is multiplied by the texture's mean over the pixel's footprint on the
+surface. The footprint is a parallelogram, taken as PIECES x PIECES axis-parallel rectangles of the same centres and
+variances, each looked up in a summed-area table (F. Crow, Summed-area tables for texture mapping, SIGGRAPH 1984). The
+mean is exact for a footprint with sides along the image's, of any size; nothing aliases. Within a pixel of the image,
+reflectance is linear between pixel centres: squares blurred by one pixel, which widens the rectangles.
 """
 
 from dataclasses import dataclass
@@ -25,33 +25,35 @@ from vlcrender.scene.surfaces import Glazing, Surface
 Array = NDArray[np.float64]
 
 PIECES = 2
-MAX_SPREAD_PX = 1e6
-"""Of a texture seen by one pixel: far beyond one tile, which is all that counts."""
-GRAZING = 1e-9
+"""Rectangles along each side of a footprint."""
+MAX_FOOTPRINT_PX = 1e6
+"""Limit of a footprint's extent in pixels of the image, far beyond one tile: the mean over a tile is exact."""
+MIN_COSINE = 1e-9
+"""Limit of a scaled cosine between ray and surface, against division by zero at grazing incidence."""
 
 
 @dataclass(frozen=True)
 class Hit:
-    """Dr.Jit arrays, one entry a ray: light seen, number of the surface met, and the distance to it in metres.
-
-    `surface` counts surfaces, then furniture, then panes, then nothing. `path_m` is the way to what a pane shows, and
-    `distance_m` where the ray meets none.
-    """
+    """Results of rays: Dr.Jit arrays with one entry per ray."""
 
     value: Any
+    """Interpolated value (see `Room.values`), with reflections in glazing and textures."""
     surface: Any
+    """Number of the surface hit: surfaces, then furniture, then glazing, then `Room.nothing`."""
     distance_m: Any
+    """Distance to the surface."""
     path_m: Any
+    """Length of the path to the point that is imaged: by way of glazing, or `distance_m` without."""
 
 
 class Room:
-    """The room's mesh in Mitsuba with its panes, ready for rays."""
+    """The room's mesh and glazing in Mitsuba, ready for rays."""
 
     def __init__(self, mesh: Mesh, glazings: tuple[Glazing, ...], surfaces: tuple[Surface, ...]) -> None:
-        """Put mesh and panes into one Mitsuba mesh. `surfaces` are the mesh's, by owner, for their textures."""
+        """Put mesh and glazing into one Mitsuba mesh. `surfaces`, by owner, have the textures."""
         self.first_glazing = int(mesh.owners.max()) + 1
         self.nothing = self.first_glazing + len(glazings)
-        self._panes = glazings
+        self._glazings = glazings
         vertices, faces, owners = [mesh.vertices_m], [mesh.faces], [mesh.owners]
         for number, glazing in enumerate(glazings):
             first = len(mesh.vertices_m) + 4 * number
@@ -65,15 +67,15 @@ class Room:
         parameters["faces"] = all_faces.astype(np.uint32).ravel()
         parameters.update()
         self._scene = mi.load_dict({"type": "scene", "room": shape}, optimize=False)
-        self._corners = [mi.UInt32(all_faces[:, i].astype(np.uint32)) for i in range(3)]
+        self._vertices = [mi.UInt32(all_faces[:, i].astype(np.uint32)) for i in range(3)]
         self._owners = mi.UInt32(np.append(np.concatenate(owners), self.nothing).astype(np.uint32))
         normals = np.zeros((self.nothing + 1, 3))
         indices = np.ones(self.nothing + 1)
         for number, glazing in enumerate(glazings):
             normals[self.first_glazing + number] = glazing.normal
             indices[self.first_glazing + number] = glazing.refractive_index
-        self._pane_normal = mi.Vector3f(*normals.T.astype(np.float32))
-        self._pane_index = mi.Float(indices.astype(np.float32))
+        self._glazing_normal = mi.Vector3f(*normals.T.astype(np.float32))
+        self._refractive_index = mi.Float(indices.astype(np.float32))
         self._triangles = len(all_faces)
         self.textures = Textures(surfaces, self.nothing + 1) if any(s.texture is not None for s in surfaces) else None
         self._textured = np.zeros(len(mesh.vertices_m), dtype=bool)
@@ -81,52 +83,54 @@ class Room:
             if surface.texture is not None:
                 self._textured[mesh.faces[mesh.owners == number]] = True
 
-    def values(self, light: Lightmap, led_rate: float, surround_rate: float) -> "mi.Float":
-        """What corners are worth in `look`: light from LEDs times one factor plus other light times another.
+    def values(self, light: Lightmap, led_rate: float, ambient_rate: float) -> "mi.Float":
+        """Values of the vertices for `trace`: luminance by LEDs times one rate plus other luminance times another.
 
-        Of textured surfaces that is what they would be worth if they reflected all.
+        Vertices of textured surfaces have the value of a reflectance of 1.
         """
-        corners = len(light.mesh.vertices_m)
-        surfaces = led_rate * light.led_cd_m2()[:corners] + surround_rate * light.ambient_cd_m2()[:corners]
-        lux = led_rate * light.led_lux[:corners] + surround_rate * light.surround_lux[:corners]
+        count = len(light.mesh.vertices_m)
+        surfaces = led_rate * light.led_cd_m2()[:count] + ambient_rate * light.ambient_cd_m2()[:count]
+        lux = led_rate * light.led_lux[:count] + ambient_rate * light.ambient_lux[:count]
         surfaces = np.where(self._textured, lux / np.pi, surfaces)
-        glazings = np.repeat([surround_rate * glazing.luminance_cd_m2 for glazing in self._panes], 4)
+        glazings = np.repeat([ambient_rate * glazing.luminance_cd_m2 for glazing in self._glazings], 4)
         return mi.Float(np.concatenate([surfaces, glazings]).astype(np.float32))
 
     def trace(
         self, origin: Any, direction: Any, values: Any, coherent: bool = True, spread: tuple[Any, Any] | None = None
     ) -> Hit:
-        """Cast rays (Dr.Jit points and unit directions, world).
+        """Trace rays from Dr.Jit points along unit directions, world.
 
-        `spread` says by how much the direction changes across and down a pixel; textures need it.
+        values: by `values`. spread: change of the direction over one pixel, along rows and along columns; textures
+        need it.
         """
-        value, surface, distance = self._meet(origin, direction, values, coherent, mi.Bool(True))
+        value, surface, distance = self._intersect(origin, direction, values, coherent, mi.Bool(True))
         path = distance
         if self.textures is not None and spread is not None:
             point = dr.fma(direction, distance, origin)
             value *= self.textures.reflectance(surface, point, direction, distance, spread)
-        if self._panes:
+        if self._glazings:
             on_glazing = (surface >= self.first_glazing) & (surface < self.nothing)
-            normal = dr.gather(mi.Vector3f, self._pane_normal, surface)
+            normal = dr.gather(mi.Vector3f, self._glazing_normal, surface)
             cosine = dr.abs(dr.dot(direction, normal))
             onward = _mirrored(direction, normal)
             start = dr.fma(direction, distance, origin) + normal * 1e-5
-            second, shown, beyond = self._meet(start, onward, values, False, on_glazing)
+            reflected, reflected_surface, beyond = self._intersect(start, onward, values, False, on_glazing)
             if self.textures is not None and spread is not None:
                 turned = _mirrored(spread[0], normal), _mirrored(spread[1], normal)
                 point = dr.fma(onward, beyond, start)
-                second *= self.textures.reflectance(shown, point, onward, distance + beyond, turned)
-            reflectance = glazing_reflectance(cosine, dr.gather(mi.Float, self._pane_index, surface), dr.sqrt)
-            value = dr.select(on_glazing, dr.lerp(value, second, reflectance), value)
+                reflected *= self.textures.reflectance(reflected_surface, point, onward, distance + beyond, turned)
+            reflectance = glazing_reflectance(cosine, dr.gather(mi.Float, self._refractive_index, surface), dr.sqrt)
+            value = dr.select(on_glazing, dr.lerp(value, reflected, reflectance), value)
             path = dr.select(on_glazing, distance + beyond, distance)
         return Hit(value, surface, distance, path)
 
-    def _meet(self, origin: Any, direction: Any, values: Any, coherent: bool, active: Any) -> tuple[Any, Any, Any]:
+    def _intersect(self, origin: Any, direction: Any, values: Any, coherent: bool, active: Any) -> tuple[Any, Any, Any]:
+        """Value, surface number and distance of the first hit of each ray."""
         hit = self._scene.ray_intersect_preliminary(mi.Ray3f(origin, direction), coherent=coherent, active=active)
         valid = hit.is_valid() & active
         triangle = dr.select(valid, hit.prim_index, self._triangles)
         b1, b2 = hit.prim_uv.x, hit.prim_uv.y
-        at = [dr.gather(mi.Float, values, dr.gather(mi.UInt32, c, triangle, valid), valid) for c in self._corners]
+        at = [dr.gather(mi.Float, values, dr.gather(mi.UInt32, c, triangle, valid), valid) for c in self._vertices]
         value = dr.fma(b2, at[2] - at[0], dr.fma(b1, at[1] - at[0], at[0]))
         return dr.select(valid, value, 0.0), dr.gather(mi.UInt32, self._owners, triangle), dr.select(valid, hit.t, 1e9)
 
@@ -136,10 +140,10 @@ def _mirrored(vector: Any, normal: Any) -> Any:
 
 
 class Textures:
-    """The textures of a room's surfaces on Dr.Jit's side."""
+    """The textures of a room's surfaces as Dr.Jit arrays."""
 
     def __init__(self, surfaces: tuple[Surface, ...], owners: int) -> None:
-        """Tables of sums, one an image, of 2 x 2 tiles: a rectangle of up to one tile never crosses their border."""
+        """Make one summed-area table per image, of 2 x 2 tiles: rectangles of up to one tile never cross its border."""
         tables: list[Array] = []
         starts: dict[int, int] = {}
         offsets, columns, rows = (np.zeros(owners) for _ in range(3))
@@ -152,7 +156,7 @@ class Textures:
             if id(image) not in starts:
                 starts[id(image)] = sum(map(len, tables))
                 sums = np.tile(image, (2, 2)).cumsum(axis=0).cumsum(axis=1)
-                tables.append(np.pad(sums, 1).ravel())  # on the far sides only for what rounding puts there
+                tables.append(np.pad(sums, 1).ravel())  # the far sides are for indices that rounding puts there
             offsets[owner] = starts[id(image)]
             rows[owner], columns[owner] = image.shape
             origin[owner] = texture.origin_m
@@ -167,7 +171,7 @@ class Textures:
         )
 
     def reflectance(self, owner: Any, point: Any, direction: Any, path_m: Any, spread: tuple[Any, Any]) -> Any:
-        """Mean over a pixel's part of a surface, 1 where there is no texture. `path_m`: from the lens to the point."""
+        """Mean reflectance over a pixel's footprint, 1 without a texture. path_m: length from the lens to the point."""
         columns, rows = (dr.gather(mi.Float, count, owner) for count in (self._columns, self._rows))
         textured = columns > 0
         origin, across, down, normal = (
@@ -175,13 +179,15 @@ class Textures:
             for vectors in (self._origin, self._across, self._down, self._normal)
         )
         facing = dr.dot(direction, normal)
-        facing = dr.select(dr.abs(facing) > GRAZING, facing, GRAZING)
+        facing = dr.select(dr.abs(facing) > MIN_COSINE, facing, MIN_COSINE)
         sides = [path_m * (side - direction * (dr.dot(side, normal) / facing)) for side in spread]
         ux, uy, vx, vy = (
-            dr.clip(dr.dot(side, axis), -MAX_SPREAD_PX, MAX_SPREAD_PX) for side in sides for axis in (across, down)
+            dr.clip(dr.dot(side, axis), -MAX_FOOTPRINT_PX, MAX_FOOTPRINT_PX)
+            for side in sides
+            for axis in (across, down)
         )
         x, y = dr.dot(point - origin, across), dr.dot(point - origin, down)
-        # a piece's spread, and that of the blur by one pixel of the image
+        # variance of a piece of the footprint plus that of the blur by one pixel of the image
         width = dr.minimum(dr.sqrt((ux * ux + vx * vx) / PIECES**2 + 1), columns)
         height = dr.minimum(dr.sqrt((uy * uy + vy * vy) / PIECES**2 + 1), rows)
         total = mi.Float(0.0)
@@ -195,9 +201,9 @@ class Textures:
         return dr.select(textured, total / (PIECES**2 * width * height), 1.0)
 
     def _sum(self, start: Any, stride: Any, left: Any, top: Any, width: Any, height: Any, active: Any) -> Any:
-        """Integral over a rectangle, in the image's pixels. Double precision: small differences of large sums."""
-        at_x = [_whole_and_rest(mi.Float64(edge)) for edge in (left, mi.Float64(left) + mi.Float64(width))]
-        at_y = [_whole_and_rest(mi.Float64(edge)) for edge in (top, mi.Float64(top) + mi.Float64(height))]
+        """Integral over rectangles, in pixels. Double precision, for small differences of large sums."""
+        at_x = [_floor_and_fraction(mi.Float64(edge)) for edge in (left, mi.Float64(left) + mi.Float64(width))]
+        at_y = [_floor_and_fraction(mi.Float64(edge)) for edge in (top, mi.Float64(top) + mi.Float64(height))]
         edges = []
         for row, below in at_y:
             first = start + row * stride
@@ -213,6 +219,6 @@ class Textures:
         return mi.Float(edges[1] - edges[0])
 
 
-def _whole_and_rest(place: Any) -> tuple[Any, Any]:
+def _floor_and_fraction(place: Any) -> tuple[Any, Any]:
     whole = dr.floor(place)
     return mi.UInt32(whole), place - whole

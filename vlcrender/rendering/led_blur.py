@@ -14,7 +14,7 @@ from vlcrender.camera.psf import SplitKernel, blur, blur_kernel, kernel_radius_p
 from vlcrender.camera.roi import Roi
 from vlcrender.rendering.led_coverage import candidate_leds
 from vlcrender.rendering.led_edges import LedEdges
-from vlcrender.scene.loader import Leds
+from vlcrender.scene.leds import Leds
 
 BLUR_MARGIN_PX = 500
 """Distance from the sensor within which an LED's blur is computed, since it may light the sensor."""

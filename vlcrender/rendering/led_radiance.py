@@ -22,7 +22,7 @@ from vlcrender.rendering.led_blur import LedBlur
 from vlcrender.rendering.led_coverage import LedFace, candidate_leds, coverage_of_led, intersections_with_plane
 from vlcrender.rendering.led_edges import LedEdges, edges_of_led
 from vlcrender.rendering.occlusion import LitRegion, Occlusion
-from vlcrender.scene.loader import Leds
+from vlcrender.scene.leds import Leds
 
 OVERSCAN_DEG = 75.0
 """Angle off the optical axis, across or down, up to which regions may extend beyond the sensor."""
@@ -100,7 +100,7 @@ def led_images(
 
 def face_of_led(leds: Leds, i: int) -> LedFace:
     """The luminous face: the LED's own, or the part of a diffuser that it lights."""
-    diffuser, radius = leds.diffusers[i], float(leds.radii_m[i])
+    diffuser, radius = leds.diffusers[i], float(leds.half_widths_m[i])
     if diffuser is not None:
         x0, y0, x1, y1 = diffuser.lit_m
         center: Array = np.array([(x0 + x1) / 2, (y0 + y1) / 2, leds.centers_m[i, 2]])

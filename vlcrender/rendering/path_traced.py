@@ -185,7 +185,7 @@ def scene_dict(scene: Scene, posed: PosedCamera) -> dict[str, object]:
     for i in range(len(leds)):
         if leds.diffusers[i] is not None:
             continue  # its diffuser emits
-        radius = leds.radii_m[i]
+        radius = leds.half_widths_m[i]
         frame = np.diag([radius, -radius, -1.0, 1.0])  # faces down
         frame[:3, 3] = leds.centers_m[i] - [0, 0, LED_STANDOFF_M]
         shape = "rectangle" if leds.squares[i] else "disk"

@@ -1,4 +1,4 @@
-"""Scenes: TOML into checked geometry in world coordinates.
+"""Scenes: TOML files into checked geometry in world coordinates.
 
-Room surfaces, textures, panels, LEDs, diffusers, glazing and furniture; and which poses see how many LEDs.
+Room surfaces, textures, panels, LEDs, diffusers, glazing and furniture; visibility of LEDs from poses.
 """

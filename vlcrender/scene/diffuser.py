@@ -1,12 +1,12 @@
-"""A panel's diffuser: what one LED makes of the translucent sheet before it.
+"""Panel diffusers: the luminance of a diffuser lit by one LED behind it.
 
-The model: an LED small against its distance d behind the sheet, of intensity I cos^m(theta), lights the sheet at an
-offset r from its foot by E = I cos^(m+3)(theta) / d^2, with tan(theta) = r / d. The sheet lets a share T through and
-spreads it evenly (an ideal Lambertian diffuser): its luminance, the same from everywhere, is T E / pi. Left out are
-light that the panel's inside reflects, which in a real one evens the sheet out, what the sheet takes of light that
-comes at a slant, and the LED's own size: near the foot E is less by about (radius / d)^2.
+Model: an LED of intensity I cos^m(theta), small against its distance d behind the diffuser, illuminates the diffuser at
+an offset r from the LED's foot with E = I cos^(m+3)(theta) / d^2, tan(theta) = r / d. The diffuser transmits a share T
+of the light and scatters it evenly (an ideal Lambertian diffuser): its luminance is T E / pi in every direction. The
+model leaves out reflections inside the panel, which make a real diffuser more even; the lower transmittance of oblique
+light; and the LED's own size, which lowers E near the foot by about (radius / d)^2.
 
-Light is followed to where it falls below DIM_SHARE of that at the foot, and to the border of the opening.
+The lit part ends at MIN_RELATIVE_LUMINANCE of the luminance at the foot, and at the border of the panel's opening.
 """
 
 from dataclasses import dataclass
@@ -16,65 +16,70 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-DIM_SHARE = 1e-3
-"""What is darker than this part of the foot is left out: 3 % of the light of an LED of order 1, less of narrower."""
+MIN_RELATIVE_LUMINANCE = 1e-3
+"""Luminance at the end of the lit part over that at the foot. Beyond is 3 % of the light of an LED of order 1, less of
+a narrower one."""
 MIN_DISTANCE_RADII = 3.0
-"""An LED is at least this many of its radii behind the sheet: at the foot E is then too large by 11 % at the most."""
-NODES = 32
-"""Of the quadrature along each side of a quadrant."""
+"""Smallest distance of an LED from its diffuser, in LED radii: E at the foot is then too large by at most 11 %."""
+QUADRATURE_NODES = 32
+"""Nodes of the quadrature along each side of a quadrant."""
 
 
 @dataclass(frozen=True)
 class Diffuser:
-    """The part of a diffuser that one LED lights, a rectangle. Places are the room's (x, y)."""
+    """The part of a diffuser that one LED lights, a rectangle. Positions are the room's (x, y)."""
 
     foot_m: tuple[float, float]
-    """Straight below the LED."""
+    """The LED's foot: the point of the diffuser straight below it."""
     distance_m: float
+    """Distance of the LED behind the diffuser."""
     transmittance: float
+    """Share of the light that the diffuser transmits."""
     area_m2: float
-    """Of the LED's face."""
+    """Area of the LED's face."""
     order: float
+    """Lambertian order of the LED."""
     opening_m: tuple[float, float, float, float]
-    """(x0, y0, x1, y1) of the whole sheet."""
+    """(x0, y0, x1, y1) of the whole diffuser."""
 
     @property
-    def reach_m(self) -> float:
-        """How far from the foot light is followed, along x and along y."""
-        cosine = DIM_SHARE ** (1 / (self.order + 3))
+    def lit_radius_m(self) -> float:
+        """Distance from the foot at which luminance falls to MIN_RELATIVE_LUMINANCE."""
+        cosine = MIN_RELATIVE_LUMINANCE ** (1 / (self.order + 3))
         return self.distance_m * float(np.sqrt(1 / cosine**2 - 1))
 
     @property
     def lit_m(self) -> tuple[float, float, float, float]:
-        """(x0, y0, x1, y1) of the part that is lit."""
-        (x, y), reach, (x0, y0, x1, y1) = self.foot_m, self.reach_m, self.opening_m
-        return max(x0, x - reach), max(y0, y - reach), min(x1, x + reach), min(y1, y + reach)
+        """(x0, y0, x1, y1) of the lit part: a square about the foot, cut at the border of the opening."""
+        (x, y), radius, (x0, y0, x1, y1) = self.foot_m, self.lit_radius_m, self.opening_m
+        return max(x0, x - radius), max(y0, y - radius), min(x1, x + radius), min(y1, y + radius)
 
     def luminance(self, x_m: Array, y_m: Array) -> Array:
-        """Of the sheet at (x, y), for an LED whose own luminance is 1: T A cos^(m+3)(theta) / (pi d^2)."""
+        """Luminance of the diffuser at (x, y) over that of the LED: T A cos^(m+3)(theta) / (pi d^2)."""
         tan2 = ((x_m - self.foot_m[0]) ** 2 + (y_m - self.foot_m[1]) ** 2) / self.distance_m**2
         at_foot = self.transmittance * self.area_m2 / (np.pi * self.distance_m**2)
         luminance: Array = at_foot * (1 + tan2) ** (-(self.order + 3) / 2)
         return luminance
 
     def quadrants(self) -> tuple[Array, Array]:
-        """Centroid (x, y) of the light and luminance times area, of each of four parts about the foot: (4, 2), (4,).
+        """Centroids (x, y) of light, (4, 2), and luminance times area, (4,), of the four quadrants about the foot.
 
-        Integrated by Gauss and Legendre's rule after x = d sinh(s), which levels the integrand.
+        Luminance is relative to the LED's. Gauss-Legendre quadrature in s with x = d sinh(s), which flattens the
+        integrand.
         """
-        nodes, weights = np.polynomial.legendre.leggauss(NODES)
+        nodes, weights = np.polynomial.legendre.leggauss(QUADRATURE_NODES)
         x0, y0, x1, y1 = self.lit_m
         centers, totals = np.tile(self.foot_m, (4, 1)), np.zeros(4)
         for number, (side_x, side_y) in enumerate(((x0, y0), (x1, y0), (x1, y1), (x0, y1))):
-            places, steps = [], []
+            positions, steps = [], []
             for side, foot in ((side_x, self.foot_m[0]), (side_y, self.foot_m[1])):
                 end = np.arcsinh((side - foot) / self.distance_m)
                 s = end * (nodes + 1) / 2
-                places.append(foot + self.distance_m * np.sinh(s))
+                positions.append(foot + self.distance_m * np.sinh(s))
                 steps.append(np.abs(end) / 2 * weights * self.distance_m * np.cosh(s))
-            x, y = np.meshgrid(*places)
+            x, y = np.meshgrid(*positions)
             light = self.luminance(x, y) * np.outer(steps[1], steps[0])
             totals[number] = light.sum()
-            if totals[number] > 0:  # a foot on the border has quadrants without extent
+            if totals[number] > 0:  # a foot on the border has quadrants without area
                 centers[number] = (light * x).sum() / totals[number], (light * y).sum() / totals[number]
         return centers, totals

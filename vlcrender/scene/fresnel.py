@@ -1,12 +1,13 @@
-"""Glass: what a window pane mirrors."""
+"""Reflectance of glazing by Fresnel's equations."""
 
 from typing import Any
 
 
 def glazing_reflectance(cosine: Any, index: Any, sqrt: Any) -> Any:
-    """Reflectance of a thin pane: Fresnel's F for unpolarised light at both faces, 2 F / (1 + F).
+    """Reflectance of thin glazing, 2 F / (1 + F) with Fresnel's F for unpolarised light at each of its two faces.
 
-    `cosine` is that of the angle of incidence; NumPy or Dr.Jit arrays, with their square root.
+    cosine: cosine of the angle of incidence. index: refractive index. sqrt: square root of their type of array, NumPy's
+    or Dr.Jit's.
     """
     inside = sqrt(1.0 - (1.0 - cosine * cosine) / (index * index))
     s = (cosine - index * inside) / (cosine + index * inside)

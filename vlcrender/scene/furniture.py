@@ -1,73 +1,152 @@
-"""Furniture: PLY and OBJ meshes, and Mitsuba XML made of meshes, as part of a room's mesh."""
+"""Furniture: PLY and OBJ meshes, and Mitsuba XML made of meshes, as part of a room's mesh.
+
+Closed meshes end up with every triangle's vertices counter-clockwise as seen from outside, which is the side that is
+lit. A body that is inside out is turned, with a warning: furniture is opaque, so that its outside is the only side
+that can be meant, and files of both senses are common. A closed mesh whose neighbouring triangles disagree is refused:
+which of them are wrong is not known before all are compared, and every modeller has the command for it.
+"""
+
+import logging
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 
 from vlcrender.core.backend import dr, mi
+from vlcrender.core.warn_once import warn_once
 from vlcrender.errors import InputError
 from vlcrender.scene.loader import Scene
 from vlcrender.scene.mesh import Mesh, join, probes_inward
 from vlcrender.scene.schema import Furniture
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+logger = logging.getLogger(__name__)
+
 MAX_TRIANGLES = 2_000_000
+"""Triangles of one shape, after its subdivision to texels."""
+ROOM_TOLERANCE_M = 1e-6
+"""Rounding allowance of furniture that stands on a floor or at a wall."""
+MAX_SUBDIVISIONS = 64
+"""Each subdivision halves the long edges of triangles: 64 go from any length to any texel."""
+OBJ_ZERO_INDEX = re.compile(rb"^[ \t]*f[ \t](?:[^\r\n]*[ \t])?0+(?=[/ \t\r\n]|$)", re.MULTILINE)
+"""A face of an OBJ file with vertex 0; vertices count from 1, and trimesh takes 0 for the last one."""
+
+
+@dataclass(frozen=True)
+class _Shape:
+    """Triangles of a file: vertices (n, 3) in its units, faces (k, 3), albedo (k,). `where` names file and shape."""
+
+    where: str
+    vertices: Array
+    faces: Indices
+    albedo: Array
 
 
 def furniture_meshes(scene: Scene, first_owner: int) -> list[Mesh]:
-    """One mesh a piece, cut into texels; owners go on from `first_owner`.
+    """One mesh per piece of furniture, subdivided to texels; owners count from `first_owner`.
 
-    Raises InputError where a file is no mesh, is empty, or stands outside the room.
+    Raises InputError, one line that names file and shape, for a file that holds no mesh, for a mesh that is empty, not
+    finite, outside the room, too large or of mixed winding, and for a face index out of range.
     """
     meshes = []
     for number, piece in enumerate(scene.settings.furniture):
         where = f"furniture[{number}].file = {piece.file!r}"
-        parts = [_mesh(shape, piece, first_owner + number, scene, where) for shape in _shapes(scene, piece, where)]
-        meshes.append(join(parts))
+        path = scene.folder / piece.file
+        shapes = _xml_shapes(path, where) if path.suffix == ".xml" else [_file_shape(path, piece.reflectance, where)]
+        meshes.append(join([_room_mesh(shape, piece, first_owner + number, scene) for shape in shapes]))
     return meshes
 
 
-def _shapes(scene: Scene, piece: Furniture, where: str) -> "list[mi.Mesh]":
-    path = scene.folder / piece.file
+def _file_shape(path: Path, reflectance: float, where: str) -> _Shape:
+    vertices, faces = _read_mesh(path, where)
+    return _Shape(where, vertices, faces, np.full(len(faces), reflectance))
+
+
+def _read_mesh(path: Path, where: str) -> tuple[Array, Indices]:
+    """Vertices (n, 3) and faces (k, 3) of a PLY or OBJ file, polygons cut into triangles, indices checked."""
+    kind = path.suffix[1:]
+    options: dict[str, Any] = {"skip_materials": True, "group_material": False} if kind == "obj" else {}
+    if kind == "obj" and OBJ_ZERO_INDEX.search(path.read_bytes()):
+        raise InputError(f"{where}: has a face index 0; vertices of an OBJ file count from 1")
     try:
-        if path.suffix == ".xml":
-            shapes = list(mi.load_file(str(path), optimize=False).shapes())
-        else:
-            bsdf = {"type": "diffuse", "reflectance": piece.reflectance}
-            shapes = [mi.load_dict({"type": path.suffix[1:], "filename": str(path), "bsdf": bsdf})]
-    except RuntimeError as error:
-        raise InputError(f"{where}: Mitsuba cannot load it: {' '.join(str(error).split())[:200]}") from None
+        with path.open("rb") as file, np.errstate(all="ignore"):
+            mesh = trimesh.load_mesh(file, file_type=kind, process=False, **options)
+        vertices = np.array(mesh.vertices, dtype=np.float64).reshape(len(mesh.vertices), 3)
+        faces = np.array(mesh.faces, dtype=np.int64).reshape(len(mesh.faces), 3)
+    except IndexError as error:
+        raise InputError(f"{where}: has a face index out of range: {_one_line(error)}") from None
+    except Exception as error:  # whatever its parser trips over, the file is no mesh
+        raise InputError(f"{where}: is no {kind.upper()} mesh that can be read: {_one_line(error)}") from None
+    _check_indices(faces, len(vertices), where)
+    return vertices, faces
+
+
+def _check_indices(faces: Indices, count: int, where: str) -> None:
+    wrong = faces[(faces < 0) | (faces >= count)]
+    if wrong.size:
+        raise InputError(f"{where}: has a face index {wrong[0]}, out of range for {count} vertices")
+
+
+def _xml_shapes(path: Path, where: str) -> list[_Shape]:
+    """The shapes of a Mitsuba scene file with their transformations, albedo by their BSDFs."""
+    try:
+        _check_mesh_files(path, where)
+        shapes = list(mi.load_file(str(path), optimize=False).shapes())
+    except (RuntimeError, UnicodeDecodeError) as error:
+        raise InputError(f"{where}: Mitsuba cannot load it: {_one_line(error)}") from None
     if not shapes:
         raise InputError(f"{where}: holds no shape")
+    checked = []
     for shape in shapes:
+        of_shape = f"{where}: shape {shape.id()!r}"
         if not shape.is_mesh():
-            raise InputError(f"{where}: shape {shape.id()!r} is no mesh; ply, obj, serialized, cube and rectangle are")
+            raise InputError(f"{of_shape} is no mesh; allowed are ply, obj, serialized, cube and rectangle")
         if shape.is_emitter():
-            raise InputError(f"{where}: shape {shape.id()!r} is an emitter; light comes from LEDs, windows and ambient")
-    return shapes
+            raise InputError(f"{of_shape} is an emitter; light comes from LEDs, glazing and ambient alone")
+        vertices, faces = _mesh_arrays(shape)
+        checked.append(_Shape(of_shape, vertices, faces, _albedo(shape, faces)))
+    return checked
 
 
-def _mesh(shape: "mi.Mesh", piece: Furniture, owner: int, scene: Scene, where: str) -> Mesh:
-    parameters = mi.traverse(shape)
-    vertices = np.array(parameters["vertex_positions"], dtype=np.float64).reshape(-1, 3)
-    faces = np.array(parameters["faces"], dtype=np.int64).reshape(-1, 3)
-    yaw = np.radians(piece.yaw_deg)
-    turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
-    vertices = piece.scale * vertices @ turn.T + np.array(piece.position_m)
-    if not len(faces) or not np.isfinite(vertices).all():
-        raise InputError(f"{where}: has no triangle, or corners that are not finite")
-    if (vertices < -1e-6).any() or (vertices > scene.room_m + 1e-6).any():
-        low, high = vertices.min(axis=0).round(3).tolist(), vertices.max(axis=0).round(3).tolist()
-        raise InputError(f"{where}: reaches from {low} to {high} m, outside the room of {scene.room_m.tolist()} m")
-    albedo = _albedo(shape, faces)
-    corners, albedo = _subdivide(vertices[faces], albedo, scene.settings.bake.texel_m, where)
-    return _unshared(corners, albedo, owner)
+def _check_mesh_files(path: Path, where: str) -> None:
+    """Refuse face indices out of range in mesh files that a Mitsuba scene names: they end Mitsuba's process."""
+    state = mi.parser.parse_file(mi.parser.ParserConfig(str(mi.variant())), str(path))
+    resolver: Any = mi.FileResolver(mi.file_resolver())  # type: ignore[operator]  # a copy
+    resolver.prepend(str(path.parent))
+    for node in state.nodes:
+        kind = node.props.plugin_name()
+        if node.type != mi.ObjectType.Shape or kind not in ("ply", "obj", "serialized"):
+            continue
+        name = str(node.props.get("filename"))
+        file = Path(str(resolver.resolve(name)))
+        of_shape = f"{where}: shape {node.props.id() or name!r}"
+        if not file.is_file():
+            raise InputError(f"{of_shape}: there is no file {name!r}")
+        if kind != "serialized":
+            _read_mesh(file, of_shape)
+            continue
+        number = int(node.props.get("shape_index", 0))
+        # Face normals keep Mitsuba from following the indices.
+        tree = {"type": kind, "filename": str(file), "shape_index": number, "face_normals": True}
+        vertices, faces = _mesh_arrays(mi.load_dict(tree))
+        _check_indices(faces, len(vertices), of_shape)
 
 
-def _albedo(shape: "mi.Mesh", faces: NDArray[np.int64]) -> Array:
+def _mesh_arrays(shape: "mi.Mesh") -> tuple[Array, Indices]:
+    vertices = np.array(shape.vertex_positions_buffer(), dtype=np.float64).reshape(-1, 3)
+    return vertices, np.array(shape.faces_buffer(), dtype=np.int64).reshape(-1, 3)
+
+
+def _albedo(shape: "mi.Mesh", faces: Indices) -> Array:
     """Diffuse reflectance in the middle of each triangle, textures included, (triangles,)."""
     count = len(faces)
     si = dr.zeros(mi.SurfaceInteraction3f, count)
-    uv = np.array(mi.traverse(shape)["vertex_texcoords"], dtype=np.float64).reshape(-1, 2)
+    uv = np.array(shape.vertex_texcoords_buffer(), dtype=np.float64).reshape(-1, 2)
     middle = uv[faces].mean(axis=1) if len(uv) else np.full((count, 2), 0.5)
     si.uv = mi.Point2f(middle.T.astype(np.float32))
     si.wi = mi.Vector3f(0, 0, 1)
@@ -75,36 +154,100 @@ def _albedo(shape: "mi.Mesh", faces: NDArray[np.int64]) -> Array:
     return np.broadcast_to(np.array(value, dtype=np.float64).reshape(-1), (count,)).copy()
 
 
-def _subdivide(corners: Array, albedo: Array, texel_m: float, where: str) -> tuple[Array, Array]:
-    """Halve the longest edge of triangles (n, 3, 3) until none is longer than a texel."""
-    done: list[tuple[Array, Array]] = []
-    while len(corners):
-        edges = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
-        long = edges.max(axis=1) > texel_m * (1 + 1e-9)
-        done.append((corners[~long], albedo[~long]))
-        if sum(len(part) for part, _ in done) + 2 * long.sum() > MAX_TRIANGLES:
-            raise InputError(f"{where}: makes more than {MAX_TRIANGLES} triangles at bake.texel_m = {texel_m}")
-        corners, albedo, longest = corners[long], albedo[long], edges[long].argmax(axis=1)
-        rows = np.arange(len(corners))
-        a, b, c = (corners[rows, (longest + i) % 3] for i in range(3))
-        middle = (a + b) / 2
-        corners = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
-        albedo = np.concatenate([albedo, albedo])
-    return np.concatenate([part for part, _ in done]), np.concatenate([part for _, part in done])
+def _room_mesh(shape: _Shape, piece: Furniture, owner: int, scene: Scene) -> Mesh:
+    """A shape put into the room, checked, oriented and subdivided."""
+    if not len(shape.faces):
+        raise InputError(f"{shape.where}: has no triangle")
+    if not np.isfinite(shape.vertices).all():
+        raise InputError(f"{shape.where}: has vertices that are not finite")
+    yaw = np.radians(piece.yaw_deg)
+    rotation = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+    vertices = piece.scale * shape.vertices @ rotation.T + np.array(piece.position_m)
+    used = vertices[np.unique(shape.faces)]
+    if (used < -ROOM_TOLERANCE_M).any() or (used > scene.room_m + ROOM_TOLERANCE_M).any():
+        low, high = used.min(axis=0).round(3).tolist(), used.max(axis=0).round(3).tolist()
+        raise InputError(f"{shape.where}: is from {low} to {high} m, outside the room of {scene.room_m.tolist()} m")
+    mesh = trimesh.Trimesh(vertices, shape.faces, process=False)
+    mesh.merge_vertices()
+    a, b, c = mesh.faces.T
+    distinct = (a != b) & (b != c) & (c != a)
+    mesh.update_faces(distinct)
+    albedo = shape.albedo[distinct]
+    _face_outwards(mesh, shape.where)
+    flat = mesh.area_faces > 0
+    faces = np.array(mesh.faces)[flat]
+    if not len(faces):
+        raise InputError(f"{shape.where}: has no triangle with an area")
+    triangles, origin = _subdivided(np.array(mesh.vertices), faces, scene.settings.bake.texel_m, shape.where)
+    return _unshared(triangles, albedo[flat][origin], owner)
 
 
-def _unshared(corners: Array, albedo: Array, owner: int) -> Mesh:
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+def _face_outwards(mesh: trimesh.Trimesh, where: str) -> None:
+    """Turn bodies of a mesh that are closed and inside out, in place, with a warning; warn of meshes not closed.
+
+    Raises InputError for a closed mesh whose neighbouring triangles run their common edge the same way.
+    """
+    if mesh.is_watertight and not mesh.is_winding_consistent:
+        raise InputError(
+            f"{where}: is closed, but its triangles face outwards and inwards; recalculate its normals outwards"
+        )
+    before = np.array(mesh.faces)
+    trimesh.repair.fix_inversion(mesh, multibody=True)
+    if not _has_boundary(mesh.faces) and mesh.volume < 0:  # bodies that share edges, which trimesh leaves alone
+        mesh.invert()
+    turned = int((before != np.array(mesh.faces)).any(axis=1).sum())
+    if turned:
+        warn_once(logger, f"{where}: is inside out; {turned} of {len(before)} triangles were turned to face outwards")
+    if _has_boundary(mesh.faces):
+        warn_once(
+            logger, f"{where}: is not closed; seen from behind, a triangle shows the light that falls on its front"
+        )
+
+
+def _has_boundary(faces: Indices) -> bool:
+    """Whether some edge is not run as often one way as the other by the triangles (k, 3) at it."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    forward = edges[:, 0] < edges[:, 1]
+    _, edge = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True)
+    return bool(np.bincount(edge.ravel(), np.where(forward, 1, -1)).any())
+
+
+def _subdivided(vertices: Array, faces: Indices, texel_m: float, where: str) -> tuple[Array, Indices]:
+    """Triangles (k, 3, 3) with no edge longer than a texel, and the number of the face each comes from, (k,)."""
+    triangles = vertices[faces]
+    edges = np.sort(np.linalg.norm(np.roll(triangles, -1, axis=1) - triangles, axis=2), axis=1)
+    halvings = np.ceil(np.log2(np.maximum(edges / texel_m, 1.0)))
+    expected = (2 ** (halvings[:, 0] + halvings[:, 2])).sum()  # parts of the shortest and of the longest edge
+    if expected > MAX_TRIANGLES:
+        raise InputError(
+            f"{where}: makes some {expected:.2g} triangles at bake.texel_m = {texel_m}; at most {MAX_TRIANGLES} are "
+            "allowed"
+        )
+    fine, fine_faces, origin = trimesh.remesh.subdivide_to_size(  # type: ignore[no-untyped-call]
+        vertices, faces, texel_m * (1 + 1e-9), max_iter=MAX_SUBDIVISIONS, return_index=True
+    )
+    return np.asarray(fine[fine_faces], dtype=np.float64), np.asarray(origin, dtype=np.int64)
+
+
+def _unshared(triangles: Array, albedo: Array, owner: int) -> Mesh:
+    """A mesh of triangles (k, 3, 3) that share no vertex, so that each has its own normal and light."""
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
     solid = lengths[:, 0] > 0
-    corners, albedo, normals = corners[solid], albedo[solid], (normals / np.where(lengths > 0, lengths, 1))[solid]
-    faces = np.arange(3 * len(corners)).reshape(-1, 3)
-    vertices = corners.reshape(-1, 3)
+    triangles, albedo, normals = triangles[solid], albedo[solid], normals[solid] / lengths[solid]
+    faces = np.arange(3 * len(triangles)).reshape(-1, 3)
+    vertices = triangles.reshape(-1, 3)
     return Mesh(
         vertices_m=vertices,
-        probes_m=probes_inward(vertices, faces, corners.mean(axis=1)),
+        probes_m=probes_inward(vertices, faces, triangles.mean(axis=1)),
         normals=np.repeat(normals, 3, axis=0),
         albedo=np.repeat(albedo, 3),
         faces=faces,
         owners=np.full(len(faces), owner),
     )
+
+
+def _one_line(error: Exception) -> str:
+    """An error's text, of a long one the end, which says most."""
+    text = " ".join(str(error).split())
+    return text if len(text) <= 200 else f"...{text[-197:]}"

@@ -1,225 +1,64 @@
-"""The room: surfaces, panels and LEDs. TOML in, checked geometry in world coordinates out.
+"""Scenes: a TOML file into checked geometry in world coordinates.
 
-World: metres, right-handed, z up, origin at a floor corner.
+World frame: metres, right-handed, z up, origin at a floor corner.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vlcrender.config.toml_model import check, read_toml
-from vlcrender.core.random_keys import stream
 from vlcrender.errors import InputError
-from vlcrender.scene.diffuser import MIN_DISTANCE_RADII, Diffuser
-from vlcrender.scene.schema import PanelDiffuser, PanelGrid, PanelLeds, SceneSettings
-from vlcrender.scene.surfaces import (
-    TOUCH_M,
-    Glazing,
-    Surface,
-    glazings_of,
-    panel_centers_m,
-    panel_opening_m,
-    panel_surfaces,
-    room_surfaces,
-)
-
-
-@dataclass(frozen=True)
-class Leds:
-    """All LEDs of a scene, sorted by id: discs or squares that face down (normal 0, 0, -1)."""
-
-    ids: NDArray[np.int64]
-    centers_m: NDArray[np.float64]
-    """Of the face; where an LED is behind a diffuser, straight below it on the sheet, where it is brightest."""
-    radii_m: NDArray[np.float64]
-    luminances_cd_m2: NDArray[np.float64]
-    orders: NDArray[np.float64]
-    """Lambertian order m: luminance at an angle theta from the normal is luminance * cos^(m-1)(theta)."""
-
-    squares: NDArray[np.bool_]
-    """Where True the LED is a square of half side `radii_m`, sides along x and y."""
-
-    diffusers: tuple[Diffuser | None, ...]
-    """What each lights of a diffuser, which is seen in place of its face."""
-
-    def __len__(self) -> int:
-        """Count the LEDs."""
-        return len(self.ids)
-
-    @property
-    def areas_m2(self) -> NDArray[np.float64]:
-        """Area of each face."""
-        return np.where(self.squares, 4.0, np.pi) * self.radii_m**2
-
-    @property
-    def reaches_m(self) -> NDArray[np.float64]:
-        """From each centre to the farthest point seen to shine: a square's corner, a disc's rim, lit corner."""
-        reaches = np.where(self.squares, np.sqrt(2.0), 1.0) * self.radii_m
-        for i, diffuser in enumerate(self.diffusers):
-            if diffuser is not None:
-                x0, y0, x1, y1 = diffuser.lit_m
-                x, y = diffuser.foot_m
-                reaches[i] = np.hypot(max(x - x0, x1 - x), max(y - y0, y1 - y))
-        return reaches
+from vlcrender.scene.leds import Leds, leds_of
+from vlcrender.scene.schema import SceneSettings
+from vlcrender.scene.surfaces import Glazing, Surface, glazings_of, panel_surfaces, room_surfaces
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A room ready to be rendered. `settings` is what it was made from."""
+    """A room ready to be rendered."""
 
     settings: SceneSettings
+    """The checked scene file."""
     surfaces: tuple[Surface, ...]
+    """Diffuse surfaces of the room and its panels: floor, ceiling, four walls, panels. Furniture is not among them."""
     glazings: tuple[Glazing, ...]
+    """Glazing in the walls."""
     leds: Leds
+    """All LEDs."""
     folder: Path
-    """Where furniture and textures are looked up."""
+    """The folder of furniture and textures."""
 
     @property
     def name(self) -> str:
-        """The scene's name."""
+        """Name of the scene."""
         return self.settings.name
 
     @property
     def room_m(self) -> NDArray[np.float64]:
-        """Extent of the room along x, y, z."""
+        """Extent of the room along x, y and z, (3,)."""
         return np.array(self.settings.room.size_m)
 
 
 def load_scene(path: Path) -> Scene:
-    """Read and check a scene file. Raises InputError naming file, key and value."""
+    """The scene of a TOML file. Raises InputError that names file, key and value."""
     return build_scene(check(read_toml(path), SceneSettings, str(path)), str(path), path.parent)
 
 
 def build_scene(settings: SceneSettings, source: str, folder: Path = Path()) -> Scene:
-    """Lay out surfaces and LEDs; files of furniture and textures are below `folder`.
+    """The scene of checked settings. Files of furniture and textures are looked up in `folder`.
 
-    Raises InputError, which starts with `source`, where something is outside the room, overlaps, is missing or, of a
-    texture, cannot be used.
+    Raises InputError that starts with `source` for geometry outside the room, for overlaps, for missing files and for
+    textures that cannot be read.
     """
-    leds = _leds(settings, source)
+    leds = leds_of(settings, source)
     glazings = glazings_of(settings, source)
     surfaces = room_surfaces(settings.room, settings.panels, glazings, folder, source)
     for index, grid in enumerate(settings.panels):
         surfaces += panel_surfaces(grid, np.array(settings.room.size_m), f"{source}: panels[{index}]")
     for index, piece in enumerate(settings.furniture):
         if not (folder / piece.file).is_file():
-            raise InputError(
-                f"{source}: furniture[{index}].file = {piece.file!r}: no such file from the scene's folder"
-            )
+            raise InputError(f"{source}: furniture[{index}].file = {piece.file!r}: no such file in the scene's folder")
     return Scene(settings, tuple(surfaces), glazings, leds, folder)
-
-
-def _leds(settings: SceneSettings, source: str) -> Leds:
-    ids: list[int] = []
-    centers: list[NDArray[np.float64]] = []
-    radii: list[float] = []
-    luminances: list[float] = []
-    half_powers: list[float] = []
-    shapes: list[str] = []
-    origins: list[str] = []
-    behind: list[tuple[PanelDiffuser, tuple[float, float, float, float]] | None] = []
-    for index, entry in enumerate(settings.led):
-        ids.append(entry.id)
-        centers.append(np.array(entry.position_m))
-        radii.append(entry.radius_m)
-        luminances.append(entry.luminance_cd_m2)
-        half_powers.append(entry.half_power_deg)
-        shapes.append(entry.shape)
-        origins.append(f"led[{index}]")
-        behind.append(None)
-    for index, grid in enumerate(settings.panels):
-        array = grid.leds
-        _check_led_array(array, grid, f"{source}: panels[{index}]")
-        x = array.pitch_m[0] * (np.arange(array.columns) - (array.columns - 1) / 2)
-        y = array.pitch_m[1] * (np.arange(array.rows) - (array.rows - 1) / 2)
-        yy, xx = np.meshgrid(y, x, indexing="ij")
-        offsets = np.stack([xx.ravel(), yy.ravel(), np.zeros(xx.size)], axis=1)
-        positions = (panel_centers_m(grid)[:, None, :] + offsets[None, :, :]).reshape(-1, 3)
-        low, high = array.luminance_cd_m2
-        ids += range(array.first_id, array.first_id + len(positions))
-        centers += list(positions)
-        radii += [array.radius_m] * len(positions)
-        luminances += list(stream(array.luminance_seed, 0, "led-luminance").uniform(low, high, len(positions)))
-        half_powers += [array.half_power_deg] * len(positions)
-        shapes += [array.shape] * len(positions)
-        origins += [f"panels[{index}].leds"] * len(positions)
-        for center in panel_centers_m(grid).tolist():
-            diffuser = None if grid.diffuser is None else (grid.diffuser, panel_opening_m(grid, center[0], center[1]))
-            behind += [diffuser] * len(offsets)
-    if not ids:
-        raise InputError(f"{source}: has no LED; add [[led]] or [[panels]]")
-    order = np.argsort(ids, kind="stable")
-    leds = Leds(
-        np.array(ids, dtype=np.int64)[order],
-        np.array(centers)[order],
-        np.array(radii)[order],
-        np.array(luminances)[order],
-        -np.log(2) / np.log(np.cos(np.radians(half_powers)))[order],
-        np.array([shape == "square" for shape in shapes])[order],
-        (None,) * len(ids),
-    )
-    diffusers = [
-        None
-        if of_led is None
-        else Diffuser(
-            (float(leds.centers_m[i, 0]), float(leds.centers_m[i, 1])),
-            of_led[0].distance_m,
-            of_led[0].transmittance,
-            float(leds.areas_m2[i]),
-            float(leds.orders[i]),
-            of_led[1],
-        )
-        for i, of_led in enumerate(behind[number] for number in order)
-    ]
-    leds = replace(leds, diffusers=tuple(diffusers))
-    _check_leds(leds, [origins[i] for i in order], np.array(settings.room.size_m), source)
-    return leds
-
-
-def _check_led_array(array: PanelLeds, grid: PanelGrid, where: str) -> None:
-    rim = 0.0 if grid.frame is None else grid.frame.width_m
-    for axis, name, count in ((0, "columns", array.columns), (1, "rows", array.rows)):
-        extent = (count - 1) * array.pitch_m[axis] + 2 * array.radius_m
-        if extent > grid.size_m[axis] - 2 * rim + TOUCH_M:
-            within = "" if grid.frame is None else f", and its frame leaves {grid.size_m[axis] - 2 * rim:.4g} m"
-            raise InputError(
-                f"{where}.leds: {count} {name} at {array.pitch_m[axis]} m and radius {array.radius_m} m span "
-                f"{extent:.4g} m; the panel is {grid.size_m[axis]} m{within}"
-            )
-    if grid.diffuser is not None:
-        least, most = MIN_DISTANCE_RADII * array.radius_m, grid.size_m[2]
-        if not least - TOUCH_M <= grid.diffuser.distance_m <= most + TOUCH_M:
-            raise InputError(
-                f"{where}.diffuser.distance_m = {grid.diffuser.distance_m}: has to be from {least:.4g} m, "
-                f"{MIN_DISTANCE_RADII:g} radii of the LEDs, to {most:.4g} m, the panel's height"
-            )
-    if array.luminance_cd_m2[0] > array.luminance_cd_m2[1]:
-        raise InputError(f"{where}.leds.luminance_cd_m2 = {list(array.luminance_cd_m2)}: the lower value comes first")
-
-
-def _check_leds(leds: Leds, origins: list[str], room_m: NDArray[np.float64], source: str) -> None:
-    repeated = np.flatnonzero(np.diff(leds.ids) == 0)
-    if len(repeated):
-        raise InputError(f"{source}: {origins[repeated[0] + 1]}: LED id {leds.ids[repeated[0]]} is used twice")
-    reach = np.stack([leds.radii_m, leds.radii_m, np.zeros(len(leds))], axis=1)
-    outside = ((leds.centers_m - reach < -TOUCH_M) | (leds.centers_m + reach > room_m + TOUCH_M)).any(axis=1)
-    if outside.any():
-        i = int(np.flatnonzero(outside)[0])
-        center = [round(float(v), 4) for v in leds.centers_m[i]]
-        raise InputError(
-            f"{source}: {origins[i]}: LED {leds.ids[i]} at {center} m with radius {leds.radii_m[i]} m "
-            f"is not inside the room of {room_m.tolist()} m"
-        )
-    for i in range(len(leds) - 1):
-        between = leds.centers_m[i + 1 :] - leds.centers_m[i]
-        both_square = leds.squares[i + 1 :] & leds.squares[i]
-        apart = np.where(both_square, np.abs(between).max(axis=1), np.linalg.norm(between, axis=1))
-        close = np.flatnonzero(apart < leds.radii_m[i + 1 :] + leds.radii_m[i] - TOUCH_M)
-        if len(close):
-            other = i + 1 + close[0]
-            raise InputError(
-                f"{source}: {origins[other]}: LEDs {leds.ids[i]} and {leds.ids[other]} overlap: centres "
-                f"{apart[close[0]]:.4g} m apart, radii {leds.radii_m[i]} and {leds.radii_m[other]} m"
-            )

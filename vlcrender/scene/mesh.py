@@ -1,8 +1,8 @@
-"""All diffuse surfaces of a room as one triangle mesh whose corners are where its light is computed.
+"""All diffuse surfaces of a room as one triangle mesh, at whose vertices illuminance is computed.
 
-A surface is cut along the edges of its holes and then into texels. Corners are shared within a surface and never
-between surfaces, so that light may jump at an edge. Where a corner's light is computed it is moved a little into its
-own surface: at the very edge of a wall a ray would leave the room.
+A surface is cut along the edges of its holes and then into texels. Triangles of one surface share vertices, those of
+different surfaces do not, so that illuminance may jump at an edge. Illuminance of a vertex is computed at its probe, a
+point slightly inside the surface: a ray from the very edge of a wall would leave the room.
 """
 
 from dataclasses import dataclass
@@ -16,28 +16,29 @@ from vlcrender.scene.surfaces import Surface
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-INWARD = 0.02
-"""How far towards the middle of the texels around it a corner's light is computed, of that distance."""
+PROBE_INSET = 0.02
+"""Distance of a probe from its vertex, as a fraction of that to the mean centre of the triangles at the vertex."""
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """Triangles with what each corner needs to be lit.
-
-    vertices_m, probes_m (where the light is computed) and normals: (corners, 3); albedo: (corners,), of a texture its
-    mean around each;
-    faces: (triangles, 3); owners: (triangles,), the number of the surface each belongs to.
-    """
+    """n vertices with the data that their illumination needs, and k triangles."""
 
     vertices_m: Array
+    """Positions, (n, 3), world."""
     probes_m: Array
+    """Points at which the vertices' illuminance is computed, (n, 3), world."""
     normals: Array
+    """Unit normals, (n, 3), towards the lit side."""
     albedo: Array
+    """Diffuse reflectance, (n,); of a texture, the mean around each vertex."""
     faces: Indices
+    """Vertices of each triangle, (k, 3)."""
     owners: Indices
+    """Number of the surface or piece of furniture that each triangle belongs to, (k,)."""
 
     def areas_m2(self) -> Array:
-        """Area that each corner stands for: a third of the triangles around it, (corners,)."""
+        """Area of each vertex, (n,): a third of the area of the triangles at it."""
         a, b, c = (self.vertices_m[self.faces[:, i]] for i in range(3))
         triangle = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
         areas = np.bincount(self.faces.ravel(), np.repeat(triangle / 3, 3), minlength=len(self.vertices_m))
@@ -45,12 +46,12 @@ class Mesh:
 
 
 def mesh_of_surfaces(surfaces: tuple[Surface, ...], texel_m: float) -> Mesh:
-    """Cut every surface into texels of at most `texel_m`; owners are the surfaces' numbers."""
+    """Surfaces cut into texels of at most `texel_m`; owners are the surfaces' numbers."""
     return join([_mesh_of_surface(surface, texel_m, number) for number, surface in enumerate(surfaces)])
 
 
 def join(meshes: list[Mesh]) -> Mesh:
-    """Put meshes into one; owners are kept."""
+    """Several meshes as one; owners are kept."""
     offsets = np.cumsum([0] + [len(mesh.vertices_m) for mesh in meshes[:-1]])
     return Mesh(
         vertices_m=np.concatenate([mesh.vertices_m for mesh in meshes]),
@@ -63,7 +64,7 @@ def join(meshes: list[Mesh]) -> Mesh:
 
 
 def probes_inward(vertices_m: Array, faces: Indices, centers_m: Array) -> Array:
-    """Corners moved towards the mean of the centres (triangles, 3) of the faces around them."""
+    """Vertices (n, 3) moved by PROBE_INSET towards the mean of the centres (k, 3) of the triangles at them."""
     count = np.bincount(faces.ravel(), minlength=len(vertices_m))
     middle = np.stack(
         [
@@ -72,7 +73,7 @@ def probes_inward(vertices_m: Array, faces: Indices, centers_m: Array) -> Array:
         ],
         axis=1,
     )
-    probes: Array = vertices_m + INWARD * (middle - vertices_m)
+    probes: Array = vertices_m + PROBE_INSET * (middle - vertices_m)
     return probes
 
 
@@ -86,8 +87,8 @@ def _mesh_of_surface(surface: Surface, texel_m: float, number: int) -> Mesh:
     for a0, b0, a1, b1 in holes:
         kept &= ~((middle_a > a0) & (middle_a < a1) & (middle_b > b0) & (middle_b < b1))
     i, j = i[kept], j[kept]
-    corner = i * len(b) + j
-    quads = np.stack([corner, corner + len(b), corner + len(b) + 1, corner + 1], axis=1)
+    vertex = i * len(b) + j
+    quads = np.stack([vertex, vertex + len(b), vertex + len(b) + 1, vertex + 1], axis=1)
     used, faces = np.unique(np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]), return_inverse=True)
     faces = faces.reshape(-1, 3)
     position = np.stack(np.meshgrid(a, b, indexing="ij"), axis=-1).reshape(-1, 2)[used]
@@ -106,7 +107,10 @@ def _mesh_of_surface(surface: Surface, texel_m: float, number: int) -> Mesh:
 
 
 def _albedo(surface: Surface, a: Array, b: Array) -> Array:
-    """Of each corner of the grid a x b: the texture's mean half way to its neighbours, so that the light balances."""
+    """Reflectance of each vertex of the grid a x b: the texture's mean half way to its neighbours.
+
+    These cells tile the surface, so that their means conserve energy.
+    """
     count = len(a) * len(b)
     if surface.texture is None:
         return np.full(count, surface.reflectance)
@@ -118,15 +122,15 @@ def _albedo(surface: Surface, a: Array, b: Array) -> Array:
     return surface.texture.means(surface.corner_m + low @ edges, surface.corner_m + high @ edges)
 
 
-def _half_way(at: Array) -> tuple[Array, Array]:
-    """From where to where each of some sorted places reaches: half way to the next one."""
-    middle = (at[:-1] + at[1:]) / 2
-    return np.append(at[:1], middle), np.append(middle, at[-1:])
+def _half_way(positions: Array) -> tuple[Array, Array]:
+    """Lower and upper limits half way between sorted positions; the first and the last position at the ends."""
+    middle = (positions[:-1] + positions[1:]) / 2
+    return np.append(positions[:1], middle), np.append(middle, positions[-1:])
 
 
-def _cuts(at: Array, length_m: float, texel_m: float) -> Array:
-    """Sorted places in [0, 1] with every hole's edge and no step longer than a texel."""
-    fixed = np.unique(np.round(np.concatenate([[0.0, 1.0], np.clip(at, 0.0, 1.0)]), 12))
+def _cuts(hole_edges: Array, length_m: float, texel_m: float) -> Array:
+    """Sorted positions in [0, 1] that include every hole's edge, with no step longer than a texel."""
+    fixed = np.unique(np.round(np.concatenate([[0.0, 1.0], np.clip(hole_edges, 0.0, 1.0)]), 12))
     steps = [
         np.linspace(low, high, max(1, int(np.ceil((high - low) * length_m / texel_m - 1e-9))), endpoint=False)
         for low, high in pairwise(fixed)

@@ -1,6 +1,6 @@
-"""What light falls on: the room's diffuse surfaces with those of its panels, and window panes.
+"""Diffuse surfaces of a room and its panels, and glazing in its walls.
 
-World: metres, right-handed, z up, origin at a floor corner.
+World frame: metres, right-handed, z up, origin at a floor corner.
 """
 
 from dataclasses import dataclass
@@ -14,27 +14,30 @@ from vlcrender.scene.schema import PanelFrame, PanelGrid, Room, SceneSettings, T
 from vlcrender.scene.texture import Texture, read_reflectances
 
 TOUCH_M = 1e-9
-"""Rounding allowance where two things touch."""
+"""Rounding allowance for solids that touch."""
 
 
 @dataclass(frozen=True)
 class Surface:
-    """A diffuse rectangle: corner + a * edge_u + b * edge_v with a, b in [0, 1]; seen from edge_u x edge_v."""
+    """A diffuse rectangle: corner + a * edge_u + b * edge_v with a, b in [0, 1].
+
+    Its normal edge_u x edge_v points to the side that is lit.
+    """
 
     name: str
     corner_m: NDArray[np.float64]
     edge_u_m: NDArray[np.float64]
     edge_v_m: NDArray[np.float64]
     reflectance: float
-    """The mean, where there is a texture."""
+    """Diffuse reflectance; the mean over its texture, where it has one."""
     holes: tuple[tuple[float, float, float, float], ...] = ()
-    """(a0, b0, a1, b1) of what is cut out: panels on a ceiling, windows in a wall."""
+    """(a0, b0, a1, b1) of rectangles that are cut out: panels on a ceiling, glazing in a wall."""
     texture: Texture | None = None
 
 
 @dataclass(frozen=True)
 class Glazing:
-    """A window pane: the rectangle corner + a * edge_u + b * edge_v, seen from edge_u x edge_v."""
+    """Glazing in a wall: the rectangle corner + a * edge_u + b * edge_v; edge_u x edge_v points into the room."""
 
     name: str
     corner_m: NDArray[np.float64]
@@ -45,7 +48,7 @@ class Glazing:
 
     @property
     def corners_m(self) -> NDArray[np.float64]:
-        """The four corners in order around, shape (4, 3)."""
+        """The four corners in order around the rectangle, (4, 3)."""
         shares = ((0, 0), (1, 0), (1, 1), (0, 1))
         return np.stack([self.corner_m + a * self.edge_u_m + b * self.edge_v_m for a, b in shares])
 
@@ -56,13 +59,13 @@ class Glazing:
         return normal / float(np.linalg.norm(normal))
 
     def mirrored(self, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Mirror images (..., 3) of points (..., 3) in the pane's plane."""
+        """Mirror images (..., 3) of points (..., 3) in the plane of the glazing."""
         height = ((points_m - self.corner_m) * self.normal).sum(axis=-1, keepdims=True)
         images: NDArray[np.float64] = points_m - 2 * height * self.normal
         return images
 
     def contains(self, points_m: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Whether points (..., 3) of its plane are within the pane, (...,)."""
+        """Whether points (..., 3) of its plane are within the glazing, (...,)."""
         from_corner = points_m - self.corner_m
         inside = np.ones(points_m.shape[:-1], dtype=bool)
         for edge in (self.edge_u_m, self.edge_v_m):
@@ -72,7 +75,7 @@ class Glazing:
 
 
 def panel_centers_m(grid: PanelGrid) -> NDArray[np.float64]:
-    """Centres of the undersides, shape (rows * columns, 3), columns (x) fastest."""
+    """Centres of the undersides of a grid's panels, (rows * columns, 3), columns (x) fastest."""
     x = grid.first_center_m[0] + grid.pitch_m[0] * np.arange(grid.columns)
     y = grid.first_center_m[1] + grid.pitch_m[1] * np.arange(grid.rows)
     yy, xx = np.meshgrid(y, x, indexing="ij")
@@ -80,7 +83,7 @@ def panel_centers_m(grid: PanelGrid) -> NDArray[np.float64]:
 
 
 def panel_opening_m(grid: PanelGrid, x: float, y: float) -> tuple[float, float, float, float]:
-    """(x0, y0, x1, y1) of what the frame leaves of the underside of the panel centred at (x, y)."""
+    """(x0, y0, x1, y1) of the opening in the frame of the panel centred at (x, y); without a frame, the underside."""
     rim = 0.0 if grid.frame is None else grid.frame.width_m
     half_x, half_y = grid.size_m[0] / 2 - rim, grid.size_m[1] / 2 - rim
     return x - half_x, y - half_y, x + half_x, y + half_y
@@ -89,14 +92,18 @@ def panel_opening_m(grid: PanelGrid, x: float, y: float) -> tuple[float, float, 
 def room_surfaces(
     room: Room, panels: tuple[PanelGrid, ...], glazings: tuple[Glazing, ...], folder: Path, source: str
 ) -> list[Surface]:
-    """Floor, ceiling and walls, cut where panels touch and panes are; images are read from below `folder`."""
+    """Floor, ceiling and walls, with holes for panels and glazing. Textures are read from `folder`.
+
+    Raises InputError that starts with `source` for a surface with neither or both of reflectance and texture, and for a
+    texture that cannot be read.
+    """
     o = np.zeros(3)
     x, y, z = (np.diag(room.size_m)[i] for i in range(3))
-    skins = {name: _skin(room, name, folder, source) for name in ("floor", "ceiling", "walls")}
-    floor, ceiling = (_hung(skins[name], corner, x, y) for name, corner in (("floor", o), ("ceiling", z)))
+    finishes = {name: _finish(room, name, folder, source) for name in ("floor", "ceiling", "walls")}
+    floor, ceiling = (_texture(finishes[name], corner, x, y) for name, corner in (("floor", o), ("ceiling", z)))
     surfaces = [
-        Surface("floor", o, x, y, skins["floor"].reflectance, texture=floor),
-        Surface("ceiling", z, y, x, skins["ceiling"].reflectance, _panels_on_ceiling(room, panels), ceiling),
+        Surface("floor", o, x, y, finishes["floor"].reflectance, texture=floor),
+        Surface("ceiling", z, y, x, finishes["ceiling"].reflectance, _panels_on_ceiling(room, panels), ceiling),
     ]
     for name, (corner, edge_u, edge_v) in _walls(room).items():
         holes = tuple(
@@ -105,43 +112,45 @@ def room_surfaces(
             if glazing.name.startswith(f"glazing {name} ")
         )
         along = y if name.startswith("x") else x
-        texture = _hung(skins["walls"], corner + z, along, -z)
-        surfaces.append(Surface(f"wall {name}", corner, edge_u, edge_v, skins["walls"].reflectance, holes, texture))
+        texture = _texture(finishes["walls"], corner + z, along, -z)
+        surfaces.append(Surface(f"wall {name}", corner, edge_u, edge_v, finishes["walls"].reflectance, holes, texture))
     return surfaces
 
 
 @dataclass(frozen=True)
-class _Skin:
-    """What a surface looks like: its (mean) reflectance, and an image with the size of its tile where it has one."""
+class _Finish:
+    """Mean reflectance of a surface, and the image of its texture with the size of a tile, where it has one."""
 
     reflectance: float
     image: NDArray[np.float64] | None = None
     tile_m: tuple[float, float] = (1.0, 1.0)
 
 
-def _skin(room: Room, name: str, folder: Path, source: str) -> _Skin:
+def _finish(room: Room, name: str, folder: Path, source: str) -> _Finish:
     reflectance: float | None = getattr(room.reflectance, name)
     entry: TextureEntry | None = getattr(room.texture, name)
     if entry is None:
         if reflectance is None:
-            raise InputError(f"{source}: key room.reflectance.{name} is missing, and there is no room.texture.{name}")
-        return _Skin(reflectance)
+            raise InputError(f"{source}: key room.reflectance.{name} is missing; give it or room.texture.{name}")
+        return _Finish(reflectance)
     if reflectance is not None:
         raise InputError(
-            f"{source}: room.reflectance.{name} = {reflectance}: room.texture.{name} says it already; leave one out"
+            f"{source}: room.reflectance.{name} = {reflectance}: there is a room.texture.{name} too; remove one of them"
         )
     image = read_reflectances(folder / entry.file, f"{source}: room.texture.{name}.file = {entry.file!r}")
-    return _Skin(float(image.mean()), image, entry.tile_m)
+    return _Finish(float(image.mean()), image, entry.tile_m)
 
 
-def _hung(
-    skin: _Skin, corner: NDArray[np.float64], across: NDArray[np.float64], down: NDArray[np.float64]
+def _texture(
+    finish: _Finish, corner: NDArray[np.float64], across: NDArray[np.float64], down: NDArray[np.float64]
 ) -> Texture | None:
-    """The skin's image with its first pixel in a corner and its sides along two edges."""
-    if skin.image is None:
+    """The image of a finish with its first pixel at a corner and its sides along two edges; None without an image."""
+    if finish.image is None:
         return None
-    width, height = (side * edge / np.linalg.norm(edge) for side, edge in zip(skin.tile_m, (across, down), strict=True))
-    return Texture(skin.image, corner, width, height)
+    width, height = (
+        side * edge / np.linalg.norm(edge) for side, edge in zip(finish.tile_m, (across, down), strict=True)
+    )
+    return Texture(finish.image, corner, width, height)
 
 
 def _walls(room: Room) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]]:
@@ -152,7 +161,7 @@ def _walls(room: Room) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float6
 
 
 def _panels_on_ceiling(room: Room, panels: tuple[PanelGrid, ...]) -> tuple[tuple[float, float, float, float], ...]:
-    """Parts of the ceiling that panels touch, in its (a, b) = (y, x) shares."""
+    """Holes of the ceiling for panels that touch it, in the ceiling's (a, b), which run along y and x."""
     width, depth, height = room.size_m
     holes = []
     for grid in panels:
@@ -175,7 +184,7 @@ def _hole(
 
 
 def glazings_of(settings: SceneSettings, source: str) -> tuple[Glazing, ...]:
-    """The scene's window panes. Raises InputError where one does not fit into its wall or overlaps another."""
+    """A scene's glazing. Raises InputError for glazing that does not fit into its wall or overlaps another one."""
     glazings: list[Glazing] = []
     taken: list[tuple[str, tuple[NDArray[np.float64], NDArray[np.float64]]]] = []
     for index, glazing in enumerate(settings.glazing):
@@ -222,7 +231,7 @@ def _overlap(
 
 
 def panel_surfaces(grid: PanelGrid, room_m: NDArray[np.float64], where: str) -> list[Surface]:
-    """Underside, sides and frame of each panel. Raises InputError where panels overlap or leave the room."""
+    """Underside, sides and frame of each panel. Raises InputError for panels that overlap or are outside the room."""
     size = np.array(grid.size_m)
     for axis, name, count in ((0, "columns", grid.columns), (1, "rows", grid.rows)):
         if count > 1 and grid.pitch_m[axis] < size[axis] - TOUCH_M:
@@ -252,7 +261,7 @@ def panel_surfaces(grid: PanelGrid, room_m: NDArray[np.float64], where: str) -> 
 def _sides(
     name: str, low: NDArray[np.float64], size: NDArray[np.float64], reflectance: float, inwards: bool = False
 ) -> list[Surface]:
-    """The four upright sides of a box, seen from outside or from inside."""
+    """The four vertical sides of a box with its lowest corner at `low`, facing outwards or `inwards`."""
     x, y, z = (np.diag(size)[i] for i in range(3))
     outside = (("x-", low, z, y), ("x+", low + x, y, z), ("y-", low, x, z), ("y+", low + y, z, x))
     return [
@@ -262,7 +271,7 @@ def _sides(
 
 
 def _frame_surfaces(name: str, low: NDArray[np.float64], size: NDArray[np.float64], frame: PanelFrame) -> list[Surface]:
-    """A rim below a panel whose lowest corner is `low`: its outside, its inside and what faces down."""
+    """The rim below a panel with its lowest corner at `low`: outer sides, inner sides and the face down."""
     bottom = low - [0, 0, frame.depth_m]
     rim = np.array([frame.width_m, frame.width_m, 0])
     outer, inner = (np.array([*(size[:2] - 2 * width), frame.depth_m]) for width in (0.0, frame.width_m))

@@ -1,7 +1,7 @@
-"""Images on surfaces: a PNG's grey values as reflectances, repeated tile by tile, and their exact means.
+"""Textures: grey values of a PNG as reflectances, repeated tile by tile, and exact means over rectangles.
 
-Between the centres of the image's pixels reflectance is linear; means take each pixel as a square of one reflectance,
-which differs from that by half a pixel of blur and keeps the light.
+Reflectance is linear between the centres of the image's pixels. Means take each pixel as a square of one reflectance:
+this conserves energy and differs from the linear form by a blur of half a pixel.
 """
 
 from dataclasses import dataclass
@@ -16,25 +16,29 @@ from vlcrender.errors import InputError
 Array = NDArray[np.float64]
 
 MAX_PIXELS = 4_000_000
-"""Of an image: the table of sums that a view looks up takes 32 bytes a pixel."""
+"""Largest number of pixels of an image; its table of sums takes 32 bytes a pixel."""
+
+
+FULL_SCALE = {"L": 255, "I;16": 65535, "I": 65535}
+"""Value of a reflectance of 1, by Pillow's modes of grey images."""
 
 
 @dataclass(frozen=True)
 class Texture:
-    """Reflectances (rows, columns) of one tile that repeats.
-
-    The first pixel's outer corner lies at `origin_m`; `across_m` and `down_m` (3,) are the tile's sides along the
-    image's rows and columns, at right angles, in the surface's plane.
-    """
+    """An image of reflectances, repeated tile by tile in the plane of a surface."""
 
     reflectances: Array
+    """Reflectances of one tile, (rows, columns), 0 to 1."""
     origin_m: Array
+    """Position of the first pixel's outer corner, (3,), world."""
     across_m: Array
+    """Side of a tile along the image's rows, (3,), world."""
     down_m: Array
+    """Side of a tile along the image's columns, (3,), world; at a right angle to `across_m`."""
 
     @property
     def mean(self) -> float:
-        """Mean reflectance of a tile."""
+        """Mean reflectance."""
         return float(self.reflectances.mean())
 
     def at_px(self, points_m: Array) -> Array:
@@ -45,7 +49,7 @@ class Texture:
         return at
 
     def means(self, first_m: Array, last_m: Array) -> Array:
-        """Mean reflectance of rectangles (n,) with sides along the tile's, of which two opposite corners are given."""
+        """Mean reflectances (n,) of rectangles with sides along the tile's, given by two opposite corners (n, 3)."""
         a, b = self.at_px(first_m), self.at_px(last_m)
         (x0, y0), (x1, y1) = np.minimum(a, b).T, np.maximum(a, b).T
         total = self._sum_to(x1, y1) - self._sum_to(x0, y1) - self._sum_to(x1, y0) + self._sum_to(x0, y0)
@@ -54,7 +58,7 @@ class Texture:
 
     @cached_property
     def _sums(self) -> Array:
-        """Sum of all reflectances above and left of each pixel corner, (rows + 1, columns + 1)."""
+        """Sum of all reflectances above and to the left of each pixel corner, (rows + 1, columns + 1)."""
         return np.pad(self.reflectances.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
 
     def _sum_to(self, x: Array, y: Array) -> Array:
@@ -78,29 +82,26 @@ class Texture:
 
 
 def read_reflectances(path: Path, where: str) -> Array:
-    """A grey PNG's values as reflectances, (rows, columns): 0 to 255, or 0 to 65535, is 0 to 1, linearly, no gamma.
+    """Reflectances (rows, columns) of a grey PNG: 0 to 255, or 0 to 65535, is 0 to 1, linearly, without gamma.
 
-    Raises InputError, which starts with `where`, for what is missing, no PNG, not grey or larger than MOST_PIXELS.
+    Raises InputError that starts with `where` for a missing file, a file that is no PNG, an image that is not grey, and
+    one of more than MAX_PIXELS pixels.
     """
-    from PIL import Image, UnidentifiedImageError  # loaded only where a scene has a texture
+    from PIL import Image, UnidentifiedImageError  # loaded for scenes with a texture only
 
     if not path.is_file():
-        raise InputError(f"{where}: no such file from the scene's folder")
+        raise InputError(f"{where}: no such file in the scene's folder")
     try:
         with Image.open(path, formats=["PNG"]) as image:
             if image.width * image.height > MAX_PIXELS:
                 raise InputError(
-                    f"{where}: is {image.width} x {image.height} pixels; at most {MAX_PIXELS} in all are allowed"
+                    f"{where}: has {image.width} x {image.height} pixels; at most {MAX_PIXELS} in all are allowed"
                 )
-            if image.mode not in LARGEST:
+            if image.mode not in FULL_SCALE:
                 raise InputError(f"{where}: is no grey image of 8 or 16 bits without transparency")
-            values = np.asarray(image, dtype=np.float64) / LARGEST[image.mode]
+            values = np.asarray(image, dtype=np.float64) / FULL_SCALE[image.mode]
     except InputError:
         raise
     except (UnidentifiedImageError, OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise InputError(f"{where}: is no PNG that can be read: {' '.join(str(error).split())[:120]}") from None
     return values
-
-
-LARGEST = {"L": 255, "I;16": 65535, "I": 65535}
-"""By Pillow's mode of grey images, the value of a reflectance of 1."""

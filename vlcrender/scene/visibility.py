@@ -1,4 +1,4 @@
-"""Which LEDs a pose sees whole, and what share of poses sees enough of them."""
+"""LEDs in view of a pose, and visibility: the share of poses with enough LEDs in view."""
 
 from dataclasses import dataclass
 
@@ -12,24 +12,31 @@ from vlcrender.core.random_keys import stream
 from vlcrender.scene.loader import Scene
 
 LEVEL_GRID = 350
-"""Positions a side, as in Table 1 of Huynh & Yoo 2016: 7 m in steps of 0.02 m."""
+"""Positions along x and along y, as in Table 1 of Huynh & Yoo 2016: 7 m in steps of 0.02 m."""
 TILTED_POSES = 5_000
+"""Random poses of `tilted_visibility`."""
 TILT_LIMIT_DEG = 60.0
+"""Largest tilt of `tilted_visibility` about each axis."""
 ENOUGH_LEDS = 4
+"""LEDs in view that count as enough for a position."""
 
 
 @dataclass(frozen=True)
 class Visibility:
-    """Share of `poses` poses that see ENOUGH_LEDS LEDs or more."""
+    """Count of poses with ENOUGH_LEDS LEDs or more in view."""
 
     height_m: float
+    """Height of all poses above the floor."""
     attitude: str
+    """Orientation of the poses, in words."""
     poses: int
+    """Number of poses."""
     seen: int
+    """Poses with enough LEDs in view."""
 
     @property
     def share(self) -> float:
-        """Of all poses, 0 to 1."""
+        """Share of poses with enough LEDs in view, 0 to 1."""
         return self.seen / self.poses
 
 
@@ -39,7 +46,7 @@ def leds_in_view(posed: PosedCamera, scene: Scene, margin_px: float = 0.0) -> ND
     candidates = np.flatnonzero(_on_sensor(camera, posed.camera_coordinates(leds.centers_m)))
     angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     rim = np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=1)
-    # The circumscribed 24-gon: what holds it holds the circle.
+    # The 24-gon about the circle: a sensor that contains it contains the circle.
     points = leds.centers_m[candidates, None, :] + rim * (leds.reaches_m[candidates, None, None] / np.cos(np.pi / 24))
     pixels = posed.project(points)
     inside = (pixels >= margin_px) & (pixels <= np.array([camera.width_px, camera.height_px]) - margin_px)
@@ -49,7 +56,7 @@ def leds_in_view(posed: PosedCamera, scene: Scene, margin_px: float = 0.0) -> ND
 
 
 def level_visibility(camera: Camera, scene: Scene, height_m: float, yaw_deg: float) -> Visibility:
-    """Level poses on a LEVEL_GRID x LEVEL_GRID grid of cell centres over the floor, LED centres in view."""
+    """Visibility of LED centres over level poses at the cell centres of a LEVEL_GRID x LEVEL_GRID grid of the floor."""
     room = scene.room_m
     x = (np.arange(LEVEL_GRID) + 0.5) * room[0] / LEVEL_GRID
     y = (np.arange(LEVEL_GRID) + 0.5) * room[1] / LEVEL_GRID
@@ -63,15 +70,15 @@ def level_visibility(camera: Camera, scene: Scene, height_m: float, yaw_deg: flo
     tree = cKDTree(positions[:, :2])
     counts = np.zeros(len(positions), dtype=np.int64)
     for center in scene.leds.centers_m[scene.leds.centers_m[:, 2] > height_m]:
-        reach = np.hypot(slopes[:, 0], slopes[:, 1]).max() * (center[2] - height_m)
-        near = np.array(tree.query_ball_point(center[:2], reach), dtype=np.int64)
+        radius_m = np.hypot(slopes[:, 0], slopes[:, 1]).max() * (center[2] - height_m)
+        near = np.array(tree.query_ball_point(center[:2], radius_m), dtype=np.int64)
         counts[near] += _on_sensor(camera, transform(pose.rotation, center - positions[near]))
     side = "x" if yaw_deg == 0 else "y"
     return Visibility(height_m, f"level, long side along {side}", len(positions), int((counts >= ENOUGH_LEDS).sum()))
 
 
 def tilted_visibility(camera: Camera, scene: Scene, height_m: float) -> Visibility:
-    """Random poses: anywhere, 0 to 60 deg on both axes, any yaw; not aimed."""
+    """Visibility of LED centres over random poses: any position, 0 to TILT_LIMIT_DEG about both axes, any yaw."""
     generator = stream(0, 0, "tilted-coverage")
     room = scene.room_m
     positions = np.stack(
