@@ -89,7 +89,7 @@ def test_windows_are_read_where_they_were_taken_and_give_the_same_positions(tmp_
     # Not so steep that lamps melt into each other: where they do, which are told apart hangs on the last electron.
     tilts = ["poses.tilt_x_deg=[0, 25]", "poses.tilt_y_deg=[0, 25]", "poses.height_m=[0.9, 1.8]"]
     base = [*SMALL, *tilts, "poses.count=2", "sensor.noise=none", "poses.border_px=20"]
-    for name, more in (("full", []), ("regions", ['windows={ kind = "leds", margin_px = 20 }'])):
+    for name, more in (("full", []), ("regions", ['regions={ kind = "leds", margin_px = 20 }'])):
         generate(load_plan(ROOT / "datasets/quickstart.toml", [*base, *more]), tmp_path / name)
     for whole, cut in zip(device_frames(tmp_path / "full"), device_frames(tmp_path / "regions"), strict=True):
         image = whole.parts[0].image_dn

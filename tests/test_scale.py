@@ -31,7 +31,7 @@ def test_every_point_lands_on_a_tenth_of_its_pixel() -> None:
 
 
 def test_keys_in_pixels_are_scaled_and_the_light_is_as_the_mode_says() -> None:
-    regions = ('windows={ kind = "leds", margin_px = 30 }', "poses.border_px=20")
+    regions = ('regions={ kind = "leds", margin_px = 30 }', "poses.border_px=20")
     full = recipe(*regions)
     binned, same = (recipe(*regions, scale=10, mode=mode) for mode in ("binned", "same-photons"))
     for small in (binned, same):

@@ -184,7 +184,7 @@ def scaled(recipe: Recipe, by: int, mode: ScaleMode) -> Recipe:
             changes["exposure_s"] = recipe.exposure_s / by**2
         else:  # what is metered are electrons in a pixel
             changes["exposure"] = recipe.exposure and recipe.exposure.model_copy(
-                update={"longest_s": recipe.exposure.max_s / by**2}
+                update={"max_s": recipe.exposure.max_s / by**2}
             )
     else:
         changes["sensor"] = recipe.sensor.binned(by)
