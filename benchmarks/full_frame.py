@@ -17,7 +17,8 @@ import numpy as np
 from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.roi import Roi
 from vlcrender.core.backend import dr, mi
-from vlcrender.dataset.files import exr_attributes, write_exr, write_preview
+from vlcrender.dataset.exr import exr_attributes, write_exr
+from vlcrender.dataset.preview import write_preview
 from vlcrender.rendering.path_traced import scene_dict
 from vlcrender.rendering.renderer import Renderer
 from vlcrender.scene.loader import load_scene

@@ -13,7 +13,7 @@ from vlcrender.camera.roi import Roi
 from vlcrender.dataset.auto_exposure import Metering, NoiseLevelMetering, PeakMetering
 from vlcrender.dataset.generate import generate
 from vlcrender.dataset.recipe import load_plan
-from vlcrender.dataset.verify import problems_of
+from vlcrender.dataset.verify import verify
 from vlcrender.rendering.expected_image import ExpectedImage, ExpectedRegion, LedPatch
 
 
@@ -55,7 +55,7 @@ def test_frames_are_exposed_for_it(kind: str, tmp_path: Path) -> None:
     assigned = [a for a in SMALL if not a.startswith("exposure_s")]
     plan = load_plan(ROOT / "datasets/quickstart.toml", [*assigned, "poses.count=2", "expected=true", *METERED[kind]])
     generate(plan, tmp_path / "set")
-    assert problems_of(tmp_path / "set") == []
+    assert verify(tmp_path / "set") == []
     rows = pq.read_table(tmp_path / "set/frames.parquet").to_pylist()
     times = [row["exposure_s"] for row in rows]
     assert times[0] != times[1], "each frame has its own"

@@ -17,9 +17,9 @@ from vlcrender.camera.distortion import Distortion
 from vlcrender.camera.intrinsics import Camera, Pose, image_of_points, project
 from vlcrender.camera.rig import mounted_cameras
 from vlcrender.core.random_keys import stream
-from vlcrender.dataset.files import camera_entry
 from vlcrender.dataset.generate import generate
 from vlcrender.dataset.recipe import load_plan
+from vlcrender.dataset.schema import camera_entry
 from vlcrender.sensor.accelerometer import TiltError
 
 

@@ -20,7 +20,7 @@ from conftest import ROOT, SMALL
 
 from vlcrender.dataset.generate import generate
 from vlcrender.dataset.recipe import Plan, load_plan
-from vlcrender.dataset.verify import problems_of
+from vlcrender.dataset.verify import verify
 from vlcrender.errors import InputError
 
 RECIPE = ROOT / "datasets/quickstart.toml"
@@ -42,7 +42,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_dataset_is_complete_and_intact(made: Path) -> None:
-    assert problems_of(made) == []
+    assert verify(made) == []
     assert not (made / "plan.json").exists()
     assert not list(made.rglob("*.partial"))
 
@@ -103,7 +103,7 @@ def test_an_interrupted_run_goes_on_where_it_stopped(made: Path, tmp_path: Path)
     assert counts[0] == 1, "only the intact frame counts as done"
     assert (directory / "frames/000001.exr").stat().st_mtime_ns == kept, "a finished frame is not made twice"
     assert digests(directory) == digests(made)
-    assert problems_of(directory) == []
+    assert verify(directory) == []
 
 
 def test_a_finished_set_is_left_alone(made: Path) -> None:
@@ -224,9 +224,9 @@ def test_verify_finds(made: Path, tmp_path: Path, damage: str) -> None:
     for path in [made, *made.rglob("*")]:
         target = directory / path.relative_to(made)
         target.mkdir(exist_ok=True) if path.is_dir() else target.write_bytes(path.read_bytes())
-    assert problems_of(directory) == []
+    assert verify(directory) == []
     DAMAGES[damage](directory)
-    found = problems_of(directory)
+    found = verify(directory)
     assert found, damage
     assert all("\n" not in line for line in found)
 
@@ -240,7 +240,7 @@ def test_verify_finds_a_truth_that_is_another_pose(made: Path, tmp_path: Path) -
     rows = table.to_pylist()
     rows[1]["position_m"][0] += 1e-4
     pq.write_table(table.from_pylist(rows, schema=table.schema), directory / "truth.parquet")
-    assert any("frame 1" in line and "not where the pose puts it" in line for line in problems_of(directory))
+    assert any("frame 1" in line and "not where the pose puts it" in line for line in verify(directory))
 
 
 LENSES = {
@@ -267,16 +267,16 @@ def changed(made: Path, directory: Path, **entry: object) -> Path:
 
 
 def test_verify_projects_through_the_lens(seen_by_a_lens: Path, tmp_path: Path) -> None:
-    assert problems_of(seen_by_a_lens) == []
+    assert verify(seen_by_a_lens) == []
     another = changed(seen_by_a_lens, tmp_path / "pinhole", projection="perspective", distortion=None)
-    assert any("not where the pose puts it" in line for line in problems_of(another))
+    assert any("not where the pose puts it" in line for line in verify(another))
     directory = changed(seen_by_a_lens, tmp_path / "moved")
     table = pq.read_table(directory / "truth.parquet")
     for move in ([1e-4, 0.0, 0.0], [0.0, 0.0, 100.0]):  # the second puts the LEDs behind the camera
         rows = table.to_pylist()
         rows[0]["position_m"] = [a + b for a, b in zip(rows[0]["position_m"], move, strict=True)]
         pq.write_table(table.from_pylist(rows, schema=table.schema), directory / "truth.parquet")
-        assert any("not where the pose puts it" in line for line in problems_of(directory))
+        assert any("not where the pose puts it" in line for line in verify(directory))
 
 
 @pytest.mark.parametrize(
@@ -292,7 +292,7 @@ def test_a_camera_that_cannot_be_is_refused_in_one_line(
     made: Path, tmp_path: Path, entry: dict[str, object], words: str
 ) -> None:
     with pytest.raises(InputError, match=words) as refusal:
-        problems_of(changed(made, tmp_path / "set", **entry))
+        verify(changed(made, tmp_path / "set", **entry))
     assert "\n" not in str(refusal.value)
     assert "dataset.json" in str(refusal.value)
 
@@ -360,14 +360,14 @@ def test_a_lost_preview_or_expected_image_is_found(made: Path, tmp_path: Path) -
     (tmp_path / "set/expected/000001.exr").unlink()
     (tmp_path / "set/previews/000002.png").unlink()
     names = ("expected/000001", "previews/000002")
-    assert sorted(problems_of(tmp_path / "set")) == [f"{tmp_path}/set/{name}: is missing" for name in names]
+    assert sorted(verify(tmp_path / "set")) == [f"{tmp_path}/set/{name}: is missing" for name in names]
 
 
 def test_a_frame_whose_preview_was_lost_is_made_again(made: Path, tmp_path: Path) -> None:
     """An unfinished run goes on: a journal of all three frames, and one preview gone."""
     generate(small_plan("expected=true"), tmp_path / "set")
     tables = [pq.read_table(tmp_path / "set" / name).to_pylist() for name in ("frames.parquet", "truth.parquet")]
-    rows = [{"frame": n, "device": d, "truth": t} for n, (d, t) in enumerate(zip(*tables, strict=True))]
+    rows = [{"device": device, "truth": truth} for device, truth in zip(*tables, strict=True)]
     provenance = json.loads((tmp_path / "set/dataset.json").read_text())["provenance"]
     (tmp_path / "set/dataset.json").unlink()
     (tmp_path / "set/plan.json").write_text(json.dumps({"provenance": provenance}))
@@ -376,5 +376,5 @@ def test_a_frame_whose_preview_was_lost_is_made_again(made: Path, tmp_path: Path
     done: list[int] = []
     generate(small_plan("expected=true"), tmp_path / "set", progress=lambda ready, _: done.append(ready))
     assert done == [2, 3]
-    assert problems_of(tmp_path / "set") == []
+    assert verify(tmp_path / "set") == []
     assert digests(tmp_path / "set") == digests(made)

@@ -13,7 +13,7 @@ from conftest import ROOT, SMALL
 from vlcrender.dataset.frame_job import Job, make_frame
 from vlcrender.dataset.generate import generate
 from vlcrender.dataset.recipe import Plan, load_plan
-from vlcrender.dataset.verify import problems_of
+from vlcrender.dataset.verify import verify
 
 LEFT = "rig=[{ name = 'left', offset_m = [-0.1, 0.0, 0.0], tilt_x_deg = 0.0, tilt_y_deg = 1.0 }]"
 NOISY = (
@@ -47,7 +47,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_it_is_complete_and_intact(made: Path) -> None:
-    assert problems_of(made) == []
+    assert verify(made) == []
     assert len(digests(made)) == 2 * FRAMES
 
 
@@ -128,7 +128,7 @@ def test_a_resumed_run_has_the_same_bytes(made: Path, tmp_path: Path) -> None:
         generate(noisy_plan(), tmp_path / "set", progress=stop)
     generate(noisy_plan(), tmp_path / "set")
     assert digests(tmp_path / "set") == digests(made)
-    assert problems_of(tmp_path / "set") == []
+    assert verify(tmp_path / "set") == []
 
 
 @pytest.mark.parametrize("change", ["seed=2017", "sensor.serial=13"])

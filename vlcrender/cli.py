@@ -17,7 +17,6 @@ from vlcrender import __version__
 from vlcrender.camera.intrinsics import Camera
 from vlcrender.dataset.files import read_dataset_file
 from vlcrender.dataset.recipe import ScaleMode, load_plan
-from vlcrender.dataset.verify import problems_of
 from vlcrender.errors import InputError
 from vlcrender.scene.loader import load_scene
 from vlcrender.scene.visibility import ENOUGH_LEDS, level_visibility, tilted_visibility
@@ -109,6 +108,8 @@ def verify(directory: Path, /) -> None:
     directory
         Folder of the dataset.
     """
+    from vlcrender.dataset.verify import verify as problems_of
+
     dataset = read_dataset_file(directory)
     found = problems_of(directory)
     for problem in found:

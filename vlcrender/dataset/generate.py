@@ -13,23 +13,24 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from pydantic import ValidationError
+
 from vlcrender import __version__
-from vlcrender.dataset.files import (
-    FRAMES,
-    FRAMES_SCHEMA,
-    TRUTH_SCHEMA,
+from vlcrender.dataset.files import FRAMES, sha256_of, write_json
+from vlcrender.dataset.frame_job import Job, make_frame, poses_of
+from vlcrender.dataset.recipe import Plan, Recipe
+from vlcrender.dataset.schema import (
     AccelerometerEntry,
     DatasetFile,
+    FrameRecord,
+    FrameRow,
     SensorEntry,
+    TruthRow,
     camera_entry,
     led_map,
-    sha256_of,
-    write_json,
-    write_table,
 )
-from vlcrender.dataset.frame_job import Job, Record, make_frame, poses_of
-from vlcrender.dataset.recipe import Plan, Recipe
-from vlcrender.dataset.verify import folders_of, missing_files, problems_of
+from vlcrender.dataset.tables import write_table
+from vlcrender.dataset.verify import extra_folders, missing_files, verify
 from vlcrender.errors import InputError
 from vlcrender.light.lightmap import bake, room_mesh
 from vlcrender.rendering.renderer import check_inside, share_cores
@@ -55,7 +56,7 @@ def generate(
     provenance = _provenance(plan)
     if (directory / "dataset.json").exists():
         _check_same(directory / "dataset.json", provenance, "a dataset of another recipe, scene or version")
-        damage = problems_of(directory)
+        damage = verify(directory)
         if damage:
             raise InputError(f"{directory}: is complete but damaged: {damage[0]}; delete it or choose another --out")
         return False
@@ -76,15 +77,15 @@ def generate(
     bake(plan.scene, progress=baking)  # into the cache, from which every worker takes it
     with (directory / "journal.jsonl").open("a", encoding="utf-8") as journal:
         for record in _records(job, missing, workers, scheduler):
-            done[record["frame"]] = record
-            journal.write(json.dumps(record) + "\n")
+            done[record.frame] = record
+            journal.write(record.model_dump_json() + "\n")
             journal.flush()
             progress(len(done), plan.recipe.frame_count)
     _finish(plan, directory, provenance, [done[frame] for frame in sorted(done)])
     return True
 
 
-def _records(job: Job, frames: list[int], workers: int, scheduler: str | None) -> Iterator[Record]:
+def _records(job: Job, frames: list[int], workers: int, scheduler: str | None) -> Iterator[FrameRecord]:
     if scheduler is not None:
         yield from _on_cluster(job, frames, scheduler)
     elif workers == 1 or len(frames) <= 1:
@@ -94,11 +95,11 @@ def _records(job: Job, frames: list[int], workers: int, scheduler: str | None) -
         yield from _in_processes(job, frames, workers)
 
 
-def _in_processes(job: Job, frames: list[int], workers: int) -> Iterator[Record]:
+def _in_processes(job: Job, frames: list[int], workers: int) -> Iterator[FrameRecord]:
     # spawn: a forked child of a process that ran kernels is left with one thread
     context = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(min(workers, len(frames)), context, _start_worker, (workers,))
-    pending: set[Future[Record]] = set()
+    pending: set[Future[FrameRecord]] = set()
     queue = iter(frames)
     try:
         while True:
@@ -137,7 +138,7 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def _on_cluster(job: Job, frames: Iterable[int], address: str) -> Iterator[Record]:
+def _on_cluster(job: Job, frames: Iterable[int], address: str) -> Iterator[FrameRecord]:
     try:
         from dask.distributed import Client, as_completed
     except ImportError:
@@ -183,40 +184,40 @@ def _prepare(directory: Path, provenance: dict[str, Any], recipe: Recipe) -> Non
         _check_same(plan_file, provenance, "an unfinished dataset of another recipe, scene or version")
     elif directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
         raise InputError(f"{directory}: is not empty and not a dataset; nothing was changed; choose another --out")
-    for name in [FRAMES, *folders_of(recipe.expected, recipe.processed is not None)]:
+    for name in [FRAMES, *extra_folders(recipe.expected, recipe.processed is not None)]:
         (directory / name).mkdir(parents=True, exist_ok=True)
     for leftover in directory.rglob("*.partial"):
         leftover.unlink()
     write_json(plan_file, {"provenance": provenance})
 
 
-def _journal(directory: Path, recipe: Recipe) -> dict[int, Record]:
+def _journal(directory: Path, recipe: Recipe) -> dict[int, FrameRecord]:
     """Frames that an interrupted run finished and whose files are still intact."""
     path = directory / "journal.jsonl"
     if not path.exists():
         return {}
-    done: dict[int, Record] = {}
+    done: dict[int, FrameRecord] = {}
     for line in path.read_text(encoding="utf-8").splitlines():
         try:
-            record = json.loads(line)
-            file = directory / record["device"]["file"]
-            if file.is_file() and sha256_of(file) == record["device"]["sha256"]:
-                done[int(record["frame"])] = record
-        except (ValueError, KeyError, TypeError):
-            continue  # the line a crash cut short: that frame is made again
-    folders = folders_of(recipe.expected, recipe.processed is not None)
+            record = FrameRecord.model_validate_json(line)
+        except ValidationError:
+            continue  # a line that a crash truncated: its frame is made again
+        file = directory / record.device.file
+        if file.is_file() and sha256_of(file) == record.device.sha256:
+            done[record.frame] = record
+    folders = extra_folders(recipe.expected, recipe.processed is not None)
     for frame in missing_files(directory, folders, list(done)):
         del done[frame]
     write_partial = path.with_suffix(".partial")
-    write_partial.write_text("".join(json.dumps(record) + "\n" for record in done.values()), encoding="utf-8")
+    write_partial.write_text("".join(record.model_dump_json() + "\n" for record in done.values()), encoding="utf-8")
     os.replace(write_partial, path)
     return done
 
 
-def _finish(plan: Plan, directory: Path, provenance: dict[str, Any], records: list[Record]) -> None:
+def _finish(plan: Plan, directory: Path, provenance: dict[str, Any], records: list[FrameRecord]) -> None:
     recipe, scene = plan.recipe, plan.scene
-    write_table(directory / "frames.parquet", [record["device"] for record in records], FRAMES_SCHEMA)
-    write_table(directory / "truth.parquet", [record["truth"] for record in records], TRUTH_SCHEMA)
+    write_table(directory / "frames.parquet", [record.device for record in records], FrameRow)
+    write_table(directory / "truth.parquet", [record.truth for record in records], TruthRow)
     dataset = DatasetFile(
         format="vlcrender-dataset",
         version=3,
