@@ -54,7 +54,7 @@ def main() -> None:
     view = renderer.expected_image(camera, POSE)
     expected = view.expected_electrons(EXPOSURE_S)
     whole = Roi.of_sensor(camera)
-    dn = expose(sensor, expected, "bench")
+    dn = expose(sensor, expected, "bench", exposure_s=EXPOSURE_S)
     loaded = mi.load_dict(scene_dict(scene, camera, POSE), optimize=False)
     depth, path = mi.load_dict({"type": "depth"}), mi.load_dict({"type": "path", "max_depth": 8})
     with tempfile.TemporaryDirectory() as folder:
@@ -63,7 +63,7 @@ def main() -> None:
         stages: dict[str, Callable[[], object]] = {
             "rays and LED patches": lambda: renderer.expected_image(camera, POSE),
             "expected electrons": lambda: view.expected_electrons(EXPOSURE_S),
-            "Poisson noise and digital numbers": lambda: expose(sensor, expected, "bench"),
+            "Poisson noise and digital numbers": lambda: expose(sensor, expected, "bench", exposure_s=EXPOSURE_S),
             "EXR (PIZ) and its SHA-256": lambda: write_exr(exr, [(whole, dn)], whole, attributes),
             "preview": lambda: write_preview(png, [(whole, dn)], whole, sensor.largest_dn),
         }

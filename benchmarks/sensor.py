@@ -54,8 +54,8 @@ def main() -> None:
     for threads in (1, os.cpu_count() or 1):
         dr.set_thread_count(threads)
         draw_s = best_s(lambda: poisson(means, "bench"))
-        shot_s = best_s(lambda: expose(Sensor(), means, "bench"))
-        full_s = best_s(lambda: expose(FULL, means, "bench", 0, 0, 0.01))
+        shot_s = best_s(lambda: expose(Sensor(), means, "bench", exposure_s=0.01))
+        full_s = best_s(lambda: expose(FULL, means, "bench", exposure_s=0.01))
         print(f"threads: {threads}")
         print(f"  Poisson draws                    {means.size / draw_s / 1e6:6.1f} M/s")
         print(f"  NumPy / Poisson draws            {numpy_s / draw_s:6.2f}")

@@ -43,7 +43,7 @@ def main() -> None:
     sensor = Sensor()
     view = Renderer(load_scene(ROOT / "scenes/office.toml")).expected_image(BLURRED, POSE)
     expected = view.expected_electrons(EXPOSURE_S)
-    pair = [expose(sensor, expected, f"picture/{n}") for n in range(2)]
+    pair = [expose(sensor, expected, f"picture/{n}", exposure_s=EXPOSURE_S) for n in range(2)]
     raw = pair[0].astype(float) - pair[1]
     jpeg = np.subtract(*(processed(image, sensor) for image in pair))
     figure = Figure(figsize=(12, 4.4), layout="constrained")

@@ -50,7 +50,7 @@ def bound_m2(
     renderer: Renderer, camera: Camera, led_ids: Sequence[int], sigma_deg: float, exposure_s: float = EXPOSURE_S
 ) -> np.ndarray | None:
     expected = renderer.expected_image(camera, POSE).expected_electrons(exposure_s)
-    variance = [(Roi.of_sensor(camera), variance_e2(Sensor(full_well_e=1e6), expected))]
+    variance = [(Roi.of_sensor(camera), variance_e2(Sensor(full_well_e=1e6), expected, 0.0))]
     return position_bound_m2(
         camera, POSE, light_of(renderer, camera, led_ids), exposure_s, variance, 2.6, (sigma_deg, sigma_deg)
     )
@@ -138,7 +138,7 @@ def test_gravity_and_more_leds_lower_it(renderer: Renderer, small_camera: Camera
 def test_each_tilt_has_its_own_error(renderer: Renderer, small_camera: Camera) -> None:
     """Little known of one tilt costs more than as little known of none, and less than as little known of both."""
     expected = renderer.expected_image(small_camera, POSE).expected_electrons(EXPOSURE_S)
-    variance = [(Roi.of_sensor(small_camera), variance_e2(Sensor(full_well_e=1e6), expected))]
+    variance = [(Roi.of_sensor(small_camera), variance_e2(Sensor(full_well_e=1e6), expected, 0.0))]
     sizes = [
         position_bound_m2(small_camera, POSE, light_of(renderer, small_camera, [0, 1]), EXPOSURE_S, variance, 2.6, s)
         for s in ((0.1, 0.1), (0.1, 5.0), (5.0, 0.1), (5.0, 5.0))
@@ -167,7 +167,9 @@ def test_on_a_rig_it_is_of_the_cameras_own_position(renderer: Renderer, small_ca
         (
             Roi.of_sensor(small_camera),
             variance_e2(
-                Sensor(full_well_e=1e6), renderer.expected_image(small_camera, POSE).expected_electrons(EXPOSURE_S)
+                Sensor(full_well_e=1e6),
+                renderer.expected_image(small_camera, POSE).expected_electrons(EXPOSURE_S),
+                EXPOSURE_S,
             ),
         )
     ]
@@ -193,10 +195,10 @@ def test_a_frame_that_determines_nothing_has_none(renderer: Renderer, small_came
 
 def test_what_is_saturated_tells_nothing() -> None:
     mean = np.array([[100.0, 5999.0, 6000.0, 9000.0]], dtype=np.float32)
-    assert variance_e2(Sensor(full_well_e=6000, bits=12, gain_e_per_dn=2.0), mean).tolist() == [
+    assert variance_e2(Sensor(full_well_e=6000, bits=12, gain_e_per_dn=2.0), mean, 0.0).tolist() == [
         [100.0 + 1 / 3, 5999.0 + 1 / 3, np.inf, np.inf]
     ]
-    assert np.isinf(variance_e2(Sensor(bits=8), mean)).tolist() == [[False, True, True, True]]
+    assert np.isinf(variance_e2(Sensor(bits=8), mean, 0.0)).tolist() == [[False, True, True, True]]
 
 
 @pytest.mark.parametrize("key", ["motion={angular_velocity_deg_s=[1.0,0.0,0.0]}", "sensor.noise=none"])

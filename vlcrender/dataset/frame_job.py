@@ -52,7 +52,7 @@ def make_frame(job: Job, frame: int) -> FrameRecord:
     main, pose, view, exposure_s, expected = mean.main, mean.pose, mean.view, mean.exposure_s, mean.expected
     noise = f"{recipe.seed}/{frame}/shot-noise"
     dn = [
-        (roi, expose(recipe.sensor, image, noise, roi.row, roi.column, exposure_s, mounted.name))
+        (roi, expose(recipe.sensor, image, noise, roi.row, roi.column, exposure_s=exposure_s, camera=mounted.name))
         for roi, image in expected
     ]
     attributes = exr_attributes(camera, mounted.name, exposure_s, frame)

@@ -11,7 +11,7 @@ from vlcrender.sensor.poisson import MAX_MEAN, draw, poisson
 from vlcrender.sensor.sensor import Electrons, Sensor, clip_full_well
 
 
-def variance_e2(sensor: Sensor, expected_e: NDArray[np.float32], exposure_s: float = 0.0) -> NDArray[np.float64]:
+def variance_e2(sensor: Sensor, expected_e: NDArray[np.float32], exposure_s: float) -> NDArray[np.float64]:
     """Variance of each pixel's digital number in electrons squared, same shape; inf where it is saturated.
 
     The fixed patterns count: who does not know them cannot tell them from noise (that a row or a column shares its
@@ -37,7 +37,8 @@ def expose(
     key: str,
     row: int = 0,
     column: int = 0,
-    exposure_s: float = 0.0,
+    *,
+    exposure_s: float,
     camera: str = "main",
 ) -> NDArray[np.uint32]:
     """Turn expected electrons (rows, columns), finite and >= 0, into digital numbers of the same shape.
