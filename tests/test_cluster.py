@@ -29,5 +29,5 @@ def test_the_threads_of_a_cluster_make_the_same_bytes(tmp_path: Path) -> None:
 
 def test_no_scheduler_is_one_line(tmp_path: Path) -> None:
     plan = load_plan(ROOT / "datasets/quickstart.toml", [*SMALL, "poses.count=1"])
-    with pytest.raises(InputError, match=r"^--scheduler nonsense://x: no scheduler answers: "):
+    with pytest.raises(InputError, match=r"^--scheduler nonsense://x: no answer from a scheduler: "):
         generate(plan, tmp_path / "set", scheduler="nonsense://x")

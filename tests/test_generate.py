@@ -19,6 +19,7 @@ import pytest
 from conftest import ROOT, SMALL
 
 from vlcrender.dataset.generate import generate
+from vlcrender.dataset.progress import Progress, ProgressCallback
 from vlcrender.dataset.recipe import Plan, load_plan
 from vlcrender.dataset.verify import verify
 from vlcrender.errors import InputError
@@ -81,11 +82,18 @@ class Crash(Exception):
     pass
 
 
-def test_an_interrupted_run_goes_on_where_it_stopped(made: Path, tmp_path: Path) -> None:
+def frame_counts(counts: list[float]) -> ProgressCallback:
+    """A callback that collects the numbers of finished frames."""
+    return lambda report: counts.append(report.done) if report.stage == "frames" else None
+
+
+def test_an_interrupted_run_goes_on_where_it_stopped(
+    made: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     directory = tmp_path / "set"
 
-    def crash_after_two(done: int, total: int) -> None:
-        if done == 2:
+    def crash_after_two(report: Progress) -> None:
+        if (report.stage, report.done) == ("frames", 2):
             raise Crash
 
     with pytest.raises(Crash):
@@ -98,12 +106,27 @@ def test_an_interrupted_run_goes_on_where_it_stopped(made: Path, tmp_path: Path)
     damaged = directory / "frames/000000.exr"
     damaged.write_bytes(damaged.read_bytes()[:-100])
     kept = (directory / "frames/000001.exr").stat().st_mtime_ns
-    counts: list[int] = []
-    assert generate(small_plan("expected=true"), directory, progress=lambda done, total: counts.append(done))
+    counts: list[float] = []
+    with caplog.at_level("INFO", "vlcrender"):
+        assert generate(small_plan("expected=true"), directory, progress=frame_counts(counts))
+    assert "2 frames are damaged or incomplete and are made again" in caplog.text
+    assert "resumed with 1 of 3 frames" in caplog.text
     assert counts[0] == 1, "only the intact frame counts as done"
     assert (directory / "frames/000001.exr").stat().st_mtime_ns == kept, "a finished frame is not made twice"
     assert digests(directory) == digests(made)
     assert verify(directory) == []
+
+
+def test_progress_reports_the_light_and_then_each_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("VLCRENDER_CACHE", str(tmp_path / "cache"))
+    plan = load_plan(ROOT / "datasets/table1.toml", [*SMALL[:4], "poses.columns=2", "poses.rows=1"])
+    reports: list[Progress] = []
+    generate(plan, tmp_path / "set", progress=reports.append)
+    light = [report for report in reports if report.stage == "light"]
+    assert reports[: len(light)] == light
+    assert light[0].step == "light from the LEDs"
+    assert all(0 <= report.done <= report.total == 1 for report in light)
+    assert reports[len(light) :] == [Progress("frames", 1, 2), Progress("frames", 2, 2)]
 
 
 def test_a_finished_set_is_left_alone(made: Path) -> None:
@@ -298,14 +321,14 @@ def test_a_camera_that_cannot_be_is_refused_in_one_line(
 
 
 def test_a_worker_that_dies_is_a_line_and_the_run_goes_on_later(made: Path, tmp_path: Path) -> None:
-    def kill_one(done: int, total: int) -> None:
-        if done == 1:
+    def kill_one(report: Progress) -> None:
+        if (report.stage, report.done) == ("frames", 1):
             os.kill(multiprocessing.active_children()[0].pid or 0, signal.SIGKILL)
 
     with pytest.raises(InputError, match="a worker process died"):
         generate(small_plan("expected=true"), tmp_path / "set", workers=2, progress=kill_one)
-    counts: list[int] = []
-    generate(small_plan("expected=true"), tmp_path / "set", progress=lambda done, total: counts.append(done))
+    counts: list[float] = []
+    generate(small_plan("expected=true"), tmp_path / "set", progress=frame_counts(counts))
     assert counts[0] >= 1
     assert digests(tmp_path / "set") == digests(made)
 
@@ -373,8 +396,8 @@ def test_a_frame_whose_preview_was_lost_is_made_again(made: Path, tmp_path: Path
     (tmp_path / "set/plan.json").write_text(json.dumps({"provenance": provenance}))
     (tmp_path / "set/journal.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     (tmp_path / "set/previews/000001.png").unlink()
-    done: list[int] = []
-    generate(small_plan("expected=true"), tmp_path / "set", progress=lambda ready, _: done.append(ready))
+    done: list[float] = []
+    generate(small_plan("expected=true"), tmp_path / "set", progress=frame_counts(done))
     assert done == [2, 3]
     assert verify(tmp_path / "set") == []
     assert digests(tmp_path / "set") == digests(made)

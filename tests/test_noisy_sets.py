@@ -12,6 +12,7 @@ from conftest import ROOT, SMALL
 
 from vlcrender.dataset.frame_job import Job, make_frame
 from vlcrender.dataset.generate import generate
+from vlcrender.dataset.progress import Progress
 from vlcrender.dataset.recipe import Plan, load_plan
 from vlcrender.dataset.verify import verify
 
@@ -120,8 +121,8 @@ class Crash(Exception):
 
 
 def test_a_resumed_run_has_the_same_bytes(made: Path, tmp_path: Path) -> None:
-    def stop(done: int, total: int) -> None:
-        if done == 3:
+    def stop(report: Progress) -> None:
+        if (report.stage, report.done) == ("frames", 3):
             raise Crash
 
     with pytest.raises(Crash):
