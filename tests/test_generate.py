@@ -9,11 +9,13 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import OpenEXR
+import psutil
 import pyarrow.parquet as pq
 import pytest
 from conftest import ROOT, SMALL
@@ -347,20 +349,30 @@ def started_with_workers(directory: Path) -> subprocess.Popen[str]:
     )
 
 
-def wait_for(path: Path, within_s: float = 60.0) -> None:
-    end = time.monotonic() + within_s
-    while not (path.exists() and path.stat().st_size):
-        assert time.monotonic() < end, f"{path} never came"
-        time.sleep(0.02)
+HANG_S = 600.0
+"""Ends a test whose event never happens; no test waits for it on any machine that works."""
+
+
+def wait_until(happened: Callable[[], bool], process: subprocess.Popen[str]) -> None:
+    """Wait for an event; fail where the process ends first."""
+    end = time.monotonic() + HANG_S
+    while not happened():
+        assert process.poll() is None, process.communicate()[0]
+        assert time.monotonic() < end, "the event never happened"
+        time.sleep(0.01)
 
 
 def test_an_interrupt_while_workers_start_is_one_line(tmp_path: Path) -> None:
-    """Ctrl-C goes to the whole group of processes, also to children that are still importing."""
+    """Ctrl-C goes to the whole group of processes, also to children that are still importing.
+
+    The event is the first child process once the plan is written: from there workers import for seconds, and 300
+    frames are to be made.
+    """
     process = started_with_workers(tmp_path / "set")
-    wait_for(tmp_path / "set/plan.json")
-    time.sleep(1.0)
+    command, plan = psutil.Process(process.pid), tmp_path / "set/plan.json"
+    wait_until(lambda: plan.exists() and bool(command.children()), process)
     os.killpg(process.pid, signal.SIGINT)
-    output, _ = process.communicate(timeout=60)
+    output, _ = process.communicate(timeout=HANG_S)
     assert process.returncode == 130
     assert "interrupted" in output
     assert "Traceback" not in output, output
@@ -369,10 +381,11 @@ def test_an_interrupt_while_workers_start_is_one_line(tmp_path: Path) -> None:
 def test_workers_end_with_their_parent(tmp_path: Path) -> None:
     """A kill that cannot be caught. They share its output, which ends with the last of them."""
     process = started_with_workers(tmp_path / "set")
-    wait_for(tmp_path / "set/journal.jsonl")
+    journal = tmp_path / "set/journal.jsonl"
+    wait_until(lambda: journal.exists() and journal.stat().st_size > 0, process)
     process.kill()
     try:
-        process.communicate(timeout=20)
+        process.communicate(timeout=HANG_S)
     finally:
         with suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)

@@ -10,6 +10,7 @@ import threading
 from collections.abc import Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -112,14 +113,9 @@ def _in_processes(job: Job, frames: list[int], workers: int) -> Iterator[FrameRe
     queue = iter(frames)
     try:
         while True:
-            # submit() starts children. They inherit the mask that blocks interrupts, so that only the parent handles
-            # them and no child prints a traceback; an interrupt during this block is delivered after it.
-            before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-            try:
+            with _interrupts_deferred():  # submit() starts children
                 while len(pending) < 2 * workers and (frame := next(queue, None)) is not None:
                     pending.add(pool.submit(make_frame, job, frame))
-            finally:
-                signal.pthread_sigmask(signal.SIG_SETMASK, before)
             if not pending:
                 return
             finished, pending = wait(pending, return_when=FIRST_COMPLETED)
@@ -132,6 +128,28 @@ def _in_processes(job: Job, frames: list[int], workers: int) -> Iterator[FrameRe
         ) from None
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def _interrupts_deferred() -> Iterator[None]:
+    """Deliver an interrupt (SIGINT) after this block; child processes started in it never receive one.
+
+    Children inherit the blocked signal, so that only the parent handles an interrupt and no child prints a traceback.
+    The handler is needed beside the mask: a mask holds for this thread alone, another thread may receive the signal,
+    and Python then runs the handler in the main thread, in the middle of starting a child.
+    """
+    received = threading.Event()
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    handler = signal.signal(signal.SIGINT, lambda *_: received.set()) if in_main_thread else None
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        if handler is not None:
+            signal.signal(signal.SIGINT, handler)
+    if received.is_set():
+        signal.raise_signal(signal.SIGINT)
 
 
 def _start_worker(workers: int) -> None:
