@@ -319,7 +319,7 @@ def test_the_command_prints_a_table_or_json_and_writes_the_page(
 @pytest.mark.parametrize(
     ("arguments", "mention"),
     [
-        (["ideal", "--wavelength-nm", "1200"], "--wavelength-nm 1200: the sensor is blind there"),
+        (["blind.toml", "--wavelength-nm", "800"], "--wavelength-nm 800: quantum efficiency is 0 there"),
         (["ideal", "--wavelength-nm", "nan"], "--wavelength-nm nan"),
         (["ideal", "--side-px", "1"], "--side-px 1"),
         (["unknown"], "unknown"),
@@ -328,8 +328,16 @@ def test_the_command_prints_a_table_or_json_and_writes_the_page(
     ],
 )
 def test_the_command_refuses_in_one_line(
-    arguments: list[str], mention: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    arguments: list[str],
+    mention: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "blind.toml").write_text(
+        "[sensor.quantum_efficiency]\nwavelengths_nm = [400, 700]\nvalues = [0.5, 0.5]\n"
+    )
     assert run(monkeypatch, "datasheet", *arguments) == 2
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1

@@ -122,8 +122,8 @@ def make_datasheet(
     kinds = detectors(sensor)
     detector = kinds[0] if len(kinds) == 1 else kinds[COLOURS.index("green")]
     efficiency = float(detector.quantum_efficiency(np.array([wavelength_nm]))[0])
-    if not efficiency > 1e-6:
-        raise InputError(f"--wavelength-nm {wavelength_nm:g}: the sensor is blind there")
+    if not efficiency > 0:
+        raise InputError(f"--wavelength-nm {wavelength_nm:g}: quantum efficiency is 0 there")
     measured = measure(bench(sensor, efficiency, side_px, progress))
     conditions = (
         f"light of {wavelength_nm:g} nm, even over the pixels" + (", all of them green" if len(kinds) > 1 else ""),
