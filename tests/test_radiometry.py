@@ -86,7 +86,7 @@ def test_electrons_agree_with_a_hand_calculation() -> None:
     """The quickstart's brightest LED, 16 000 cd/m2 at f/2.2, 1.2 um, 160 us, tau 0.9: every 5 nm, in plain Python.
 
     N = (pi/4) / 2.2^2 * (1.2 um)^2 * 0.9 * 160 us * 16 000 / 683 * sum(S QE lambda) / (h c) / sum(S V), with S and V
-    from their tables and QE from k, linear between its 10 nm. The code sums every 1 nm with a linear logarithm of alpha:
+    from their tables and QE from k, linear between its 10 nm. The code sums every 1 nm, log(alpha) linear:
     - the trapezoidal rule of 5 nm errs by 3e-5 in the photons and 2.5e-4 in the luminance (against one of 0.01 nm),
     - alpha falls by a tenth in 10 nm, so that a line lies above the exponential by 0.1^2 / 8 = 1.3e-3 at most and
       0.8e-3 on average; QE follows with x / (e^x - 1), 0.3 to 0.8 for x = 3 um * alpha: 6e-4.

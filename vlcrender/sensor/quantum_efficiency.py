@@ -53,7 +53,7 @@ class QuantumEfficiency(Settings):
         return self.values is None
 
     def at(self, wavelengths_nm: NDArray[np.float64], colour: str = "values") -> NDArray[np.float64]:
-        """Electrons per photon, same shape as the wavelengths. `colour` is a curve's name; "values" without a mosaic."""
+        """Electrons per photon, same shape as the wavelengths. `colour` names a curve: "values" without a mosaic."""
         table = getattr(self, colour)
         interpolated: NDArray[np.float64] = np.interp(wavelengths_nm, self.wavelengths_nm, table, left=0.0, right=0.0)
         return interpolated
