@@ -29,7 +29,7 @@ def write_exr(path: Path, images: Sequence[RegionPixels], sensor: Roi, attribute
         "displayWindow": _box(sensor),
         **attributes,
     }
-    names = [f"window {number}" for number in range(len(images))] if len(images) > 1 else [""]
+    names = [f"region {number}" for number in range(len(images))] if len(images) > 1 else [""]
     parts = [
         OpenEXR.Part({**header, "dataWindow": _box(roi)}, {"Y": np.ascontiguousarray(image)}, name)
         for name, (roi, image) in zip(names, images, strict=True)

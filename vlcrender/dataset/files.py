@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from vlcrender.config.toml_model import check
-from vlcrender.dataset.schema import DatasetFile
+from vlcrender.dataset.schema import FORMAT_VERSION, DatasetFile
 from vlcrender.errors import InputError
 
 FRAMES, EXPECTED, PREVIEWS, PROCESSED = "frames", "expected", "previews", "processed"
@@ -60,4 +60,9 @@ def read_dataset_file(directory: Path) -> DatasetFile:
         raise InputError(f"{path}: cannot be read as JSON: {error}") from None
     if not isinstance(tree, dict):
         raise InputError(f"{path}: is not a JSON object")
+    if tree.get("version") != FORMAT_VERSION:
+        found = json.dumps(tree.get("version"))
+        raise InputError(
+            f"{path}: version = {found}: this program reads version {FORMAT_VERSION}; generate the dataset again"
+        )
     return check(tree, DatasetFile, str(path))

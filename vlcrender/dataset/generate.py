@@ -23,6 +23,8 @@ from vlcrender.dataset.frame_job import Job, make_frame, poses_of
 from vlcrender.dataset.progress import Progress, ProgressCallback
 from vlcrender.dataset.recipe import Plan, Recipe
 from vlcrender.dataset.schema import (
+    DATA_VERSION,
+    FORMAT_VERSION,
     AccelerometerEntry,
     DatasetFile,
     FrameRecord,
@@ -187,6 +189,7 @@ def _provenance(plan: Plan) -> dict[str, Any]:
     return {
         "recipe": recipe,
         "scene": plan.scene.settings.model_dump(mode="json"),
+        "data_version": DATA_VERSION,
         "versions": {
             "vlcrender": __version__,
             **{package: version(package) for package in ("mitsuba", "drjit", "numpy", "OpenEXR")},
@@ -249,7 +252,7 @@ def _finish(plan: Plan, directory: Path, provenance: dict[str, Any], records: li
     write_table(directory / "truth.parquet", [record.truth for record in records], TruthRow)
     dataset = DatasetFile(
         format="vlcrender-dataset",
-        version=3,
+        version=FORMAT_VERSION,
         name=recipe.name,
         frame_count=len(records),
         cameras={mounted.name: camera_entry(mounted) for mounted in recipe.cameras},

@@ -5,16 +5,22 @@ verifier reads them back, and the Arrow schemas of the tables derive from them.
 """
 
 from types import NoneType, UnionType
-from typing import Any, Literal, Union, get_args, get_origin
+from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
+from pydantic import Field
 
 from vlcrender.camera.distortion import Distortion
 from vlcrender.camera.rig import Mounted
 from vlcrender.config.toml_model import Settings
 from vlcrender.scene.loader import Leds
+
+FORMAT_VERSION: Final = 4
+"""`version` of dataset.json."""
+DATA_VERSION = 1
+"""`data_version` of the provenance: raised whenever the same recipe gives other bits."""
 
 Triple = tuple[float, float, float]
 Matrix = tuple[Triple, Triple, Triple]
@@ -172,20 +178,32 @@ class AccelerometerEntry(Settings):
     error_deg: float
 
 
-class LedMapEntry(Settings):
-    """One LED in dataset.json: the data that it broadcasts about itself."""
+class DiscEntry(Settings):
+    """A round LED in dataset.json: the data that it broadcasts about itself."""
 
     id: int
     position_m: Triple
+    shape: Literal["disc"]
     radius_m: float
-    shape: Literal["disc", "square"]
+
+
+class SquareEntry(Settings):
+    """A square LED in dataset.json, sides along x and y: the data that it broadcasts about itself."""
+
+    id: int
+    position_m: Triple
+    shape: Literal["square"]
+    side_m: float
+
+
+LedMapEntry = Annotated[DiscEntry | SquareEntry, Field(discriminator="shape")]
 
 
 class DatasetFile(Settings):
     """dataset.json."""
 
     format: Literal["vlcrender-dataset"]
-    version: Literal[3]
+    version: Literal[4]
     name: str
     frame_count: int
     cameras: dict[str, CameraEntry]
@@ -204,14 +222,14 @@ def camera_entry(mounted: Mounted) -> CameraEntry:
     return CameraEntry.model_validate({**shared, **own})
 
 
-def led_map(leds: Leds) -> tuple[LedMapEntry, ...]:
+def led_map(leds: Leds) -> tuple[DiscEntry | SquareEntry, ...]:
     """The entries of all LEDs, in the order of the scene."""
-    return tuple(
-        LedMapEntry(
-            id=int(i),
-            position_m=(float(c[0]), float(c[1]), float(c[2])),
-            radius_m=float(r),
-            shape="square" if square else "disc",
-        )
-        for i, c, r, square in zip(leds.ids, leds.centers_m, leds.radii_m, leds.squares, strict=True)
-    )
+    half_widths_m = leds.radii_m
+    entries: list[DiscEntry | SquareEntry] = []
+    for led, center, half_width, square in zip(leds.ids, leds.centers_m, half_widths_m, leds.squares, strict=True):
+        x, y, z = map(float, center)
+        if square:
+            entries.append(SquareEntry(id=int(led), position_m=(x, y, z), shape="square", side_m=2 * float(half_width)))
+        else:
+            entries.append(DiscEntry(id=int(led), position_m=(x, y, z), shape="disc", radius_m=float(half_width)))
+    return tuple(entries)
