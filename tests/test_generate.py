@@ -1,4 +1,4 @@
-"""Datasets: resumable, the same bits for any number of workers, and never a file lost."""
+"""Generation: resumable, the same bits for any number of workers, and no file lost."""
 
 import hashlib
 import json
@@ -89,9 +89,7 @@ def frame_counts(counts: list[float]) -> ProgressCallback:
     return lambda report: counts.append(report.done) if report.stage == "frames" else None
 
 
-def test_an_interrupted_run_goes_on_where_it_stopped(
-    made: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_an_interrupted_run_resumes(made: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     directory = tmp_path / "set"
 
     def crash_after_two(report: Progress) -> None:
@@ -101,7 +99,7 @@ def test_an_interrupted_run_goes_on_where_it_stopped(
     with pytest.raises(Crash):
         generate(small_plan("expected=true"), directory, progress=crash_after_two)
     assert not (directory / "dataset.json").exists()
-    # what a crash can leave: a cut journal line, a half-written file, a finished file damaged later
+    # a crash can leave a truncated journal line, a half-written file, a finished file damaged later
     with (directory / "journal.jsonl").open("a") as journal:
         journal.write('{"frame": 2, "dev')
     (directory / "frames/000002.partial").write_bytes(b"half")
@@ -138,7 +136,7 @@ def test_a_finished_set_is_left_alone(made: Path) -> None:
 
 
 @pytest.mark.parametrize("state", ["another recipe", "unfinished other", "foreign files", "a file", "damaged"])
-def test_nothing_that_is_not_ours_is_overwritten(made: Path, tmp_path: Path, state: str) -> None:
+def test_foreign_files_are_never_overwritten(made: Path, tmp_path: Path, state: str) -> None:
     directory = tmp_path / "set"
     plan = small_plan("expected=true")
     if state == "foreign files":
@@ -165,14 +163,14 @@ def test_nothing_that_is_not_ours_is_overwritten(made: Path, tmp_path: Path, sta
     assert {p: p.read_bytes() for p in [directory, *directory.rglob("*")] if p.is_file()} == before
 
 
-def test_impossible_poses_are_said_before_the_first_frame(tmp_path: Path) -> None:
+def test_impossible_poses_are_refused_before_the_first_frame(tmp_path: Path) -> None:
     plan = load_plan(RECIPE, [*SMALL, "poses.min_leds=500"])
     with pytest.raises(InputError, match=r"frame 0: no position .* 500 LEDs"):
         generate(plan, tmp_path / "never")
     assert not (tmp_path / "never").exists()
 
 
-def test_the_header_says_nothing_of_the_true_pose(made: Path) -> None:
+def test_the_exr_header_holds_no_pose(made: Path) -> None:
     with OpenEXR.File(str(made / "frames/000000.exr")) as file:
         header = dict(file.header())  # gone once the file is closed
     known = {
@@ -198,7 +196,7 @@ def test_frames_are_poisson_draws_of_the_expected_images(made: Path) -> None:
         with OpenEXR.File(str(made / f"expected/{index:06d}.exr"), separate_channels=True) as file:
             expected = file.channels()["Y"].pixels.astype(float)
         assert dn.dtype == np.uint32
-        # the largest number is 4095: what comes within 6 sigma of it is biased by clipping
+        # clipping at the largest number, 4095, biases values within 6 sigma of it
         assert expected.max() < 4095 - 6 * np.sqrt(4095)
         z = (dn - expected) / np.sqrt(expected)
         assert abs(z.mean()) < 5 / np.sqrt(z.size)
@@ -244,7 +242,7 @@ DAMAGES = {
 
 
 @pytest.mark.parametrize("damage", DAMAGES)
-def test_verify_finds(made: Path, tmp_path: Path, damage: str) -> None:
+def test_verify_reports_damage(made: Path, tmp_path: Path, damage: str) -> None:
     directory = tmp_path / "set"
     for path in [made, *made.rglob("*")]:
         target = directory / path.relative_to(made)
@@ -256,7 +254,7 @@ def test_verify_finds(made: Path, tmp_path: Path, damage: str) -> None:
     assert all("\n" not in line for line in found)
 
 
-def test_verify_finds_a_truth_that_is_another_pose(made: Path, tmp_path: Path) -> None:
+def test_verify_reports_a_truth_of_another_pose(made: Path, tmp_path: Path) -> None:
     directory = tmp_path / "set"
     for path in [made, *made.rglob("*")]:
         target = directory / path.relative_to(made)
@@ -270,7 +268,7 @@ def test_verify_finds_a_truth_that_is_another_pose(made: Path, tmp_path: Path) -
 
 LENSES = {
     "distorted": ["camera.distortion.k1=-0.05", "camera.focus_distance_m=2.0", "camera.skew_px=3.0"],
-    # 300 px a radian: the sensor reaches 48 deg off the axis
+    # 300 px a radian: the sensor extends to 48 deg off the axis
     "equidistant": ["camera.projection=equidistant", "camera.pixel_pitch_um=60.0", "exposure_s=6e-8"],
 }
 
@@ -313,7 +311,7 @@ def test_verify_projects_through_the_lens(seen_by_a_lens: Path, tmp_path: Path) 
         ({"width_px": 3}, "width_px = 3"),
     ],
 )
-def test_a_camera_that_cannot_be_is_refused_in_one_line(
+def test_an_impossible_camera_is_refused_in_one_line(
     made: Path, tmp_path: Path, entry: dict[str, object], words: str
 ) -> None:
     with pytest.raises(InputError, match=words) as refusal:
@@ -322,7 +320,7 @@ def test_a_camera_that_cannot_be_is_refused_in_one_line(
     assert "dataset.json" in str(refusal.value)
 
 
-def test_a_worker_that_dies_is_a_line_and_the_run_goes_on_later(made: Path, tmp_path: Path) -> None:
+def test_a_dead_worker_is_one_line_and_the_run_resumes(made: Path, tmp_path: Path) -> None:
     def kill_one(report: Progress) -> None:
         if (report.stage, report.done) == ("frames", 1):
             os.kill(multiprocessing.active_children()[0].pid or 0, signal.SIGKILL)
@@ -378,7 +376,7 @@ def test_an_interrupt_while_workers_start_is_one_line(tmp_path: Path) -> None:
     assert "Traceback" not in output, output
 
 
-def test_workers_end_with_their_parent(tmp_path: Path) -> None:
+def test_workers_exit_with_their_parent(tmp_path: Path) -> None:
     """A kill that cannot be caught. They share its output, which ends with the last of them."""
     process = started_with_workers(tmp_path / "set")
     journal = tmp_path / "set/journal.jsonl"

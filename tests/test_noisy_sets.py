@@ -1,4 +1,4 @@
-"""Datasets of a sensor with everything on: the same bits however they are made, and what the tables say of them."""
+"""Datasets of the full chain: reproducible bits, and tables that state the parameters in effect."""
 
 import hashlib
 import json
@@ -63,11 +63,11 @@ def test_shots_of_a_pose_stay_together(made: Path) -> None:
     assert places[0] == places[2] != places[4]
     assert places[1] == places[3] != places[0]
     readings = [row["accelerometer_m_s2"] for row in rows]
-    assert readings[0] != readings[2], "the accelerometer errs anew in each shot"
+    assert readings[0] != readings[2], "the accelerometer has a new error in each shot"
 
 
-def test_frames_of_one_pose_differ_by_noise_alone(made: Path) -> None:
-    """PRNU, DSNU and offsets cancel in the difference; what is left are both draws and both read noises."""
+def test_frames_of_one_pose_differ_in_noise_alone(made: Path) -> None:
+    """PRNU, DSNU and offsets cancel in the difference; both draws and both read noises remain."""
     expected = pixels(made / "expected/000000.exr")
     assert np.array_equal(expected, pixels(made / "expected/000002.exr"))
     told = json.loads((made / "dataset.json").read_text())["sensor"]
@@ -84,7 +84,7 @@ def test_frames_of_one_pose_differ_by_noise_alone(made: Path) -> None:
     assert abs(np.corrcoef(first[calm], second[calm])[0, 1]) > 0.8, "they do share the patterns"
 
 
-def test_the_dataset_tells_what_acted(made: Path) -> None:
+def test_the_dataset_states_the_sensor_parameters_in_effect(made: Path) -> None:
     """At ISO 200 of base 100 half the electrons make a number; dark current at the frames' temperature."""
     told = json.loads((made / "dataset.json").read_text())["sensor"]
     assert told["gain_e_per_dn"] == pytest.approx(2.128 / 2)

@@ -1,4 +1,4 @@
-"""Counter-based Poisson draws: the law at every mean, and the same draw for a pixel whatever is drawn beside it."""
+"""Counter-based Poisson draws: the law at every mean, and draws of a pixel independent of its neighbours."""
 
 import numpy as np
 import pytest
@@ -37,15 +37,15 @@ def test_third_and_fourth_cumulants_are_lambda_too(mean: float) -> None:
         assert abs((z**p).mean() - moments[p]) < 5 * se
 
 
-def test_nothing_expected_is_nothing_drawn() -> None:
+def test_a_mean_of_zero_draws_zero() -> None:
     assert not poisson(np.zeros((10, 100), dtype=np.float32), "dark").any()
 
 
-def test_a_window_gets_the_draws_of_the_whole_frame(rng: np.random.Generator) -> None:
+def test_a_region_gets_the_draws_of_the_whole_frame(rng: np.random.Generator) -> None:
     means = rng.uniform(0, 100, (60, 80)).astype(np.float32)
     frame = poisson(means, "frame")
     assert np.array_equal(poisson(means[20:31, 5:70], "frame", 20, 5), frame[20:31, 5:70])
-    # nor does it matter what the other pixels expect
+    # independent of the means of other pixels
     others = np.where(np.arange(60)[:, None] < 30, means, np.float32(7.0))
     assert np.array_equal(poisson(others, "frame")[:30], frame[:30])
 

@@ -30,7 +30,7 @@ def test_every_point_lands_on_a_tenth_of_its_pixel() -> None:
     assert project(small, pose, points)[0] == pytest.approx(project(full, pose, points)[0] / 10, rel=1e-12)
 
 
-def test_keys_in_pixels_are_scaled_and_the_light_is_as_the_mode_says() -> None:
+def test_keys_in_pixels_are_scaled_and_the_light_follows_the_mode() -> None:
     regions = ('regions={ kind = "leds", margin_px = 30 }', "poses.border_px=20")
     full = recipe(*regions)
     binned, same = (recipe(*regions, scale=10, mode=mode) for mode in ("binned", "same-photons"))
@@ -45,8 +45,8 @@ def test_keys_in_pixels_are_scaled_and_the_light_is_as_the_mode_says() -> None:
     assert same.sensor == full.sensor
 
 
-def test_a_metered_exposure_is_the_full_cameras(office: Scene) -> None:
-    """Binned pixels gather a hundred times the light in one time, by either metering; else a quick look is too dark.
+def test_a_metered_exposure_equals_that_of_the_full_camera(office: Scene) -> None:
+    """Binned pixels gather a hundred times the light in one time, by either metering; else a frame is too dark.
 
     In the middle of an image of an LED, 4 of the large pixels wide; across one light changes by the cos^4 of 10 of the
     small ones, below 4 tan(17 deg) 10 / 3000 = 0.4 %.
@@ -87,7 +87,7 @@ def test_a_binned_pixel_holds_the_sum_of_its_pixels(office: Scene, pose: Pose, s
     off = np.abs(binned - sums) > tolerance
     assert off.mean() < 0.1
     assert (np.abs(binned - sums) <= tolerance + 4 * 0.013 * 2 * background).all()
-    assert binned.max() > 5 * background, "an LED has to be in view"
+    assert binned.max() > 5 * background, "an LED must be in view"
 
 
 def test_same_photons_in_a_larger_pixel(office: Scene) -> None:

@@ -1,4 +1,4 @@
-"""The sensor's statistics: Poisson electrons, Skellam differences, and the converter's boundary cases."""
+"""The sensor's statistics: Poisson electrons, Skellam differences, and the boundary cases of the ADC."""
 
 import numpy as np
 import pytest
@@ -75,7 +75,7 @@ def test_without_noise_the_expected_image_is_rounded() -> None:
 
 
 @pytest.mark.parametrize("bits", [8, 10, 12])
-def test_the_converter_saturates_at_its_largest_number(bits: int) -> None:
+def test_the_adc_saturates_at_its_largest_number(bits: int) -> None:
     sensor = Sensor(bits=bits, gain_e_per_dn=2.0, full_well_e=1e6, black_level_dn=16)
     full = 2.0 * (2**bits - 1 - 16)
     electrons = np.array([0.0, 1.9, full - 2, full, full + 500])
@@ -92,7 +92,7 @@ def test_full_well_clips_electrons_before_gain() -> None:
     ).tolist() == [[200]]
 
 
-def test_no_well_holds_more_than_is_drawn() -> None:
+def test_the_largest_full_well_is_the_largest_mean_of_the_draws() -> None:
     assert MAX_WELL_E == MAX_MEAN
     sensor = Sensor(full_well_e=MAX_WELL_E, gain_e_per_dn=1000.0, bits=14)
     assert (

@@ -1,4 +1,4 @@
-"""The full EMVA 1288 chain, each term measured alone, and what is the same in every frame, thread and window."""
+"""The full EMVA 1288 chain: each term alone, fixed patterns, and independence of threads and regions."""
 
 import os
 import subprocess
@@ -35,12 +35,12 @@ EVERYTHING = Sensor(
 def exposed(sensor: Sensor, mean: float, key: str = "a", exposure_s: float = 0.0, camera: str = "main") -> np.ndarray:
     """Electrons above the black level, (ROWS, COLUMNS)."""
     image = expose(sensor, np.full((ROWS, COLUMNS), mean, dtype=np.float32), key, exposure_s=exposure_s, camera=camera)
-    assert image.max() < sensor.largest_dn, "the converter is not to end what is measured"
+    assert image.max() < sensor.largest_dn, "the ADC must not clip the measured values"
     return (image.astype(float) - sensor.black_level_dn) * sensor.gain_at_iso_e_per_dn
 
 
 @pytest.mark.parametrize("gain", [0.5, 1.0, 2.0, 4.0])
-def test_without_a_term_it_is_shot_noise_alone(gain: float) -> None:
+def test_the_full_chain_without_noise_terms_is_shot_noise_alone(gain: float) -> None:
     """Halves included, which go to the even number before the black level is added."""
     means = np.linspace(0, 7000, N, dtype=np.float32).reshape(ROWS, COLUMNS)
     shot, full = (Sensor(noise=noise, gain_e_per_dn=gain, black_level_dn=63) for noise in ("shot", "full"))
@@ -82,7 +82,7 @@ def test_prnu_spreads_the_mean_and_not_the_electrons() -> None:
     se = np.sqrt(2 * mu**2 / 39 / N) / (prnu * mu)
     slope = np.polyfit(mean.ravel(), temporal.ravel(), 1)[0]
     assert abs(slope - 1) < 5 * se
-    assert abs(slope - 2) > 5 * se, "what multiplied electrons would have, d (1 + p)^2 / d p"
+    assert abs(slope - 2) > 5 * se, "the slope of multiplied electrons, d (1 + p)^2 / d p"
 
 
 @pytest.mark.parametrize(("celsius", "times"), [(25.0, 1.0), (32.0, 2.0), (18.0, 0.5), (46.0, 8.0)])
@@ -155,7 +155,7 @@ def test_twice_the_iso_is_twice_the_numbers() -> None:
 
 
 @pytest.mark.parametrize("bits", [8, 10, 12, 14])
-def test_black_level_and_both_ends_of_the_converter(bits: int) -> None:
+def test_black_level_and_both_limits_of_the_adc(bits: int) -> None:
     sensor = Sensor(noise="full", bits=bits, full_well_e=1e5, black_level_dn=20, read_noise_e=40.0, gain_e_per_dn=2.0)
     dark = expose(sensor, np.zeros((ROWS, COLUMNS), dtype=np.float32), "dark", exposure_s=0.0).astype(float)
     # Read noise has 20 DN: 0 DN takes all below -1 sigma but half a step, and what is above the black level is whole.
@@ -168,8 +168,8 @@ def test_black_level_and_both_ends_of_the_converter(bits: int) -> None:
     assert (bright == 2**bits - 1).all()
 
 
-def test_the_variance_told_is_the_variance_had() -> None:
-    """Over individuals, whose patterns nobody knows; of one row and column each, since those share offsets."""
+def test_the_predicted_variance_is_the_sample_variance() -> None:
+    """Over individual sensors with unknown patterns; one pixel per row and column, since these share offsets."""
     mean = 800.0
     sensors = [EVERYTHING.model_copy(update={"serial": serial}) for serial in range(200)]
     roi = np.full((40, 40), mean, dtype=np.float32)
@@ -213,7 +213,7 @@ def test_a_binned_sensor_has_the_noise_of_the_sums(term: dict[str, float], mean:
 
 
 def patterns(serial: int, camera: str = "main") -> np.ndarray:
-    """What of a frame belongs to the individual: response and offset together, electrons."""
+    """The fixed pattern of an individual sensor: offsets in electrons."""
     sensor = Sensor(**FINE, dsnu_e=10.0, prnu=0.3, black_level_dn=BLACK, serial=serial)
     return exposed(sensor, 0.0, "any", camera=camera)
 
@@ -235,7 +235,7 @@ def test_the_two_patterns_of_a_pixel_are_independent() -> None:
 
 @pytest.mark.parametrize("sensor", [Sensor(), EVERYTHING], ids=["shot", "full"])
 def test_neighbouring_seeds_and_frames_share_nothing(sensor: Sensor) -> None:
-    """What is left of frames when the patterns, which they do share, are taken out."""
+    """Frames without the fixed patterns, which they share, are uncorrelated."""
     means = np.full((ROWS, COLUMNS), 300.0, dtype=np.float32)
     keys = ["2016/0/shot-noise", "2017/0/shot-noise", "2016/1/shot-noise", "20160/0/shot-noise"]
     shown = sensor if sensor.noise == "shot" else sensor.model_copy(update={"prnu": 0, "dsnu_e": 0})
@@ -252,7 +252,7 @@ def test_neighbouring_seeds_and_frames_share_nothing(sensor: Sensor) -> None:
         assert abs(np.corrcoef(differences)[0, 1]) < 4 / np.sqrt(N)
 
 
-def test_a_window_gets_the_noise_of_the_whole_frame(rng: np.random.Generator) -> None:
+def test_a_region_gets_the_noise_of_the_whole_frame(rng: np.random.Generator) -> None:
     means = rng.uniform(0, 3000, (60, 80)).astype(np.float32)
     frame = expose(EVERYTHING, means, "frame", exposure_s=0.1)
     part = expose(EVERYTHING, means[20:31, 5:70], "frame", 20, 5, exposure_s=0.1)

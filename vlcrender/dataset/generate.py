@@ -198,14 +198,14 @@ def _provenance(plan: Plan) -> dict[str, Any]:
     }
 
 
-def _check_same(path: Path, provenance: dict[str, Any], what: str) -> None:
+def _check_same(path: Path, provenance: dict[str, Any], other: str) -> None:
     try:
         tree = json.loads(path.read_text(encoding="utf-8"))
         same = tree["provenance"] == json.loads(json.dumps(provenance))
     except (ValueError, KeyError, TypeError, OSError):
         raise InputError(f"{path}: damaged; delete {path.parent} or choose another --out") from None
     if not same:
-        raise InputError(f"{path.parent}: holds {what}; nothing was changed; choose another --out or delete it")
+        raise InputError(f"{path.parent}: holds {other}; nothing was changed; choose another --out or delete it")
 
 
 def _prepare(directory: Path, provenance: dict[str, Any], recipe: Recipe) -> None:
