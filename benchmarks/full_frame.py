@@ -18,7 +18,8 @@ from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.roi import Roi
 from vlcrender.core.backend import dr, mi
-from vlcrender.dataset.files import exr_attributes, write_exr, write_preview
+from vlcrender.dataset.exr import exr_attributes, write_exr
+from vlcrender.dataset.preview import write_preview
 from vlcrender.rendering.path_traced import scene_dict
 from vlcrender.rendering.renderer import Renderer
 from vlcrender.scene.loader import load_scene
@@ -55,7 +56,7 @@ def main() -> None:
     mean = renderer.expected_image(posed)
     expected = mean.expected_electrons(EXPOSURE_S)
     whole = Roi.of_sensor(camera)
-    dn = expose(sensor, expected, "bench")
+    dn = expose(sensor, expected, "bench", exposure_s=EXPOSURE_S)
     loaded = mi.load_dict(scene_dict(scene, posed), optimize=False)
     depth, path = mi.load_dict({"type": "depth"}), mi.load_dict({"type": "path", "max_depth": 8})
     with tempfile.TemporaryDirectory() as folder:
@@ -64,7 +65,7 @@ def main() -> None:
         stages: dict[str, Callable[[], object]] = {
             "rays and LED patches": lambda: renderer.expected_image(posed),
             "expected electrons": lambda: mean.expected_electrons(EXPOSURE_S),
-            "Poisson noise and digital numbers": lambda: expose(sensor, expected, "bench"),
+            "Poisson noise and digital numbers": lambda: expose(sensor, expected, "bench", exposure_s=EXPOSURE_S),
             "EXR (PIZ) and its SHA-256": lambda: write_exr(exr, [(whole, dn)], whole, attributes),
             "preview": lambda: write_preview(png, [(whole, dn)], whole, sensor.largest_dn),
         }

@@ -39,7 +39,9 @@ def shoot(number: int, regions: LedRegions | None) -> int:
     mean = renderer().expected_image(PosedCamera(Camera(), pose), regions)
     sensor, key = Sensor(), f"bench {number}"
     return sum(
-        expose(sensor, part.expected_electrons(EXPOSURE_S), key, part.roi.row, part.roi.column).size
+        expose(
+            sensor, part.expected_electrons(EXPOSURE_S), key, part.roi.row, part.roi.column, exposure_s=EXPOSURE_S
+        ).size
         for part in mean.parts
     )
 

@@ -1,9 +1,9 @@
-"""Speed of the sensor: shot noise against NumPy's, the full chain against shot noise alone.
+"""Speed of the sensor: shot noise compared with NumPy's, the full chain with shot noise alone.
 
     python benchmarks/sensor.py
 
-12 Mpx of a room's counts: 50 electrons in most, up to 4 000 in some. Machines differ and are shared: compare the ratios
-of one run only.
+12 Mpx with the means of a room: 50 electrons in nine rows of ten, 0 to 4 000 in the others. Compare ratios within one
+run: absolute speeds depend on the machine and its load.
 """
 
 import os
@@ -33,7 +33,7 @@ FULL = Sensor(
 
 
 def best_s(work: Callable[[], object]) -> float:
-    """The shortest of some runs, after one that compiles."""
+    """Shortest time of RUNS runs, after one run that compiles."""
     work()
     times = []
     for _ in range(RUNS):
@@ -50,12 +50,12 @@ def main() -> None:
     generator = np.random.Generator(np.random.PCG64(1))
     numpy_s = best_s(lambda: generator.poisson(means))
     print(f"12 Mpx, 50 e in nine rows of ten, 0 to 4 000 e in the others; best of {RUNS}")
-    print(f"numpy.random.Generator.poisson, its fastest bits     {means.size / numpy_s / 1e6:6.1f} M/s")
+    print(f"numpy.random.Generator.poisson, fastest bit generator{means.size / numpy_s / 1e6:6.1f} M/s")
     for threads in (1, os.cpu_count() or 1):
         dr.set_thread_count(threads)
         draw_s = best_s(lambda: poisson(means, "bench"))
-        shot_s = best_s(lambda: expose(Sensor(), means, "bench"))
-        full_s = best_s(lambda: expose(FULL, means, "bench", 0, 0, 0.01))
+        shot_s = best_s(lambda: expose(Sensor(), means, "bench", exposure_s=0.01))
+        full_s = best_s(lambda: expose(FULL, means, "bench", exposure_s=0.01))
         print(f"threads: {threads}")
         print(f"  Poisson draws                    {means.size / draw_s / 1e6:6.1f} M/s")
         print(f"  NumPy / Poisson draws            {numpy_s / draw_s:6.2f}")

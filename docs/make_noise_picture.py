@@ -44,7 +44,7 @@ def main() -> None:
     sensor = Sensor()
     mean = Renderer(load_scene(ROOT / "scenes/office.toml")).expected_image(PosedCamera(BLURRED, POSE))
     expected = mean.expected_electrons(EXPOSURE_S)
-    pair = [expose(sensor, expected, f"picture/{n}") for n in range(2)]
+    pair = [expose(sensor, expected, f"picture/{n}", exposure_s=EXPOSURE_S) for n in range(2)]
     raw = pair[0].astype(float) - pair[1]
     jpeg = np.subtract(*(processed(image, sensor) for image in pair))
     figure = Figure(figsize=(12, 4.4), layout="constrained")

@@ -1,4 +1,4 @@
-"""The accelerometer: each of its errors alone against its formula, over devices and over shots."""
+"""Accelerometers: each error term alone against its formula, over devices and over shots."""
 
 from pathlib import Path
 from typing import Any
@@ -36,12 +36,12 @@ def read(device: Imu, pose: Pose = LEVEL, shot: int = 0) -> NDArray[np.float64]:
 
 
 def errors_of_devices(pose: Pose, **settings: Any) -> NDArray[np.float64]:
-    """What is read in excess of gravity, (DEVICES, 3), by devices of one kind."""
+    """Readings minus gravity, (DEVICES, 3), of devices with the same settings."""
     truth = pose.rotation @ [0.0, 0.0, G]
     return np.array([read(Imu(**FINE, **settings, serial=serial), pose) for serial in range(DEVICES)]) - truth
 
 
-def test_the_papers_accelerometer_reads_what_it_always_did() -> None:
+def test_the_tilt_error_model_is_reproducible_bit_for_bit() -> None:
     """Two normal angles of the stream, on the tilts: bit for bit, and for recipes that name no kind."""
     recipe = check(read_toml(QUICKSTART), Recipe, "quickstart")
     assert recipe.accelerometer == TiltError(error_deg=0.1)
@@ -68,7 +68,7 @@ TERMS: dict[str, tuple[dict[str, float], tuple[float, float, float]]] = {
 
 @pytest.mark.parametrize("term", TERMS)
 def test_each_term_alone_spreads_the_readings_of_level_devices_as_its_formula(term: str) -> None:
-    """Gravity is along z: cross-axis reaches x and y alone, scale z alone. Means are 0 within 5 standard errors."""
+    """Gravity is along z: cross-axis affects x and y alone, scale z alone. Means are 0 within 5 standard errors."""
     settings, expected = TERMS[term]
     found = errors_of_devices(LEVEL, **settings)
     if term == "noise":  # of the shot, not of the device
@@ -97,7 +97,7 @@ def test_misalignment_turns_the_reading_and_leaves_its_length() -> None:
         assert 0 < other < np.radians(1.5)
 
 
-def test_scale_and_offset_part_in_opposite_poses() -> None:
+def test_scale_and_offset_separate_in_opposite_poses() -> None:
     """Half the sum of a level and an overturned reading is the offset, half their difference the sensitivity."""
     device = Imu(**FINE, bias_m_s2=0.2, scale_percent=1.0, cross_axis_percent=1.0, serial=3)
     up, down = read(device), read(device, OVER)
@@ -149,7 +149,7 @@ def test_readings_are_whole_steps_and_saturate() -> None:
 def test_the_stated_error_is_the_scatter_of_tilts_over_devices(name: str) -> None:
     """Presets of real parts, each shot another device: both tilts spread by error_deg.
 
-    The standard error is FIVE_SIGMA / 5; terms of second order (the length of what is read: 1 +- 0.02 from offset and
+    The standard error is FIVE_SIGMA / 5; terms of second order (the length of the reading: 1 +- 0.02 from offset and
     scale) change a variance by their square, 4e-4, and so the spread by 2e-4.
     """
     plan = load_plan(QUICKSTART, [f"accelerometer.preset={name}", "accelerometer.temperature_c=35"])
@@ -164,7 +164,7 @@ def test_the_stated_error_is_the_scatter_of_tilts_over_devices(name: str) -> Non
     assert spread == pytest.approx(device.error_deg, rel=FIVE_SIGMA + 2e-4)
 
 
-def test_on_a_tilted_device_tilt_x_is_off_by_more() -> None:
+def test_tilt_x_of_a_tilted_device_has_the_larger_error() -> None:
     """Offset and misalignment, the same either way, at tilt_y = -60 deg: twice as much on tilt_x.
 
     Second order is (0.3 deg tan(60 deg))^2 = 8e-5 of a spread, far below its standard error, FIVE_SIGMA / 5.
@@ -226,7 +226,7 @@ def test_bad_values_are_refused_by_name(assignment: str) -> None:
 
 def test_a_part_in_a_dataset(tmp_path: Path) -> None:
     """The reading with its errors goes to the device's table, the pose without them to the truth's."""
-    part = [f"accelerometer.{what}" for what in ("preset=bmi270", "serial=4", "noise_density_ug_rthz=0")]
+    part = [f"accelerometer.{key}" for key in ("preset=bmi270", "serial=4", "noise_density_ug_rthz=0")]
     plan = load_plan(QUICKSTART, [*SMALL, "poses.count=2", "sensor.noise=none", *part])
     generate(plan, tmp_path / "set")
     frames, truth = (pq.read_table(tmp_path / f"set/{name}.parquet").to_pylist() for name in ("frames", "truth"))

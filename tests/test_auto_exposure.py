@@ -1,4 +1,4 @@
-"""Automatic exposure: the target met by the noise-free image, and by what is on disk."""
+"""Automatic exposure: the noise-free image and the frames on disk reach the target."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from vlcrender.camera.roi import Roi
 from vlcrender.dataset.auto_exposure import Metering, NoiseLevelMetering, PeakMetering
 from vlcrender.dataset.generate import generate
 from vlcrender.dataset.recipe import load_plan
-from vlcrender.dataset.verify import problems_of
+from vlcrender.dataset.verify import verify
 from vlcrender.rendering.expected_image import ExpectedImage, ExpectedRegion, LedPatch
 
 
@@ -30,7 +30,7 @@ def view_of(background: float, led: float) -> ExpectedImage:
 
 def test_the_peak_holds_the_share() -> None:
     metering = PeakMetering(kind="peak", share_of_saturation=0.7, max_s=10.0)
-    view = view_of(100.0, 900.0)  # 5000 e/s in the corner
+    view = view_of(100.0, 900.0)  # 5000 e/s in the last pixel
     assert metering.time_s(view, 6000.0) == pytest.approx(4200 / 5000)
     assert metering.time_s(view_of(1.0, 0.0), 6000.0) == 10.0, "84 s would be too long"
     assert metering.time_s(view_of(0.0, 0.0), 6000.0) == 10.0, "nothing to meter"
@@ -51,11 +51,11 @@ METERED = {
 
 
 @pytest.mark.parametrize("kind", METERED)
-def test_frames_are_exposed_for_it(kind: str, tmp_path: Path) -> None:
+def test_frames_are_exposed_for_the_target(kind: str, tmp_path: Path) -> None:
     assigned = [a for a in SMALL if not a.startswith("exposure_s")]
     plan = load_plan(ROOT / "datasets/quickstart.toml", [*assigned, "poses.count=2", "expected=true", *METERED[kind]])
     generate(plan, tmp_path / "set")
-    assert problems_of(tmp_path / "set") == []
+    assert verify(tmp_path / "set") == []
     rows = pq.read_table(tmp_path / "set/frames.parquet").to_pylist()
     times = [row["exposure_s"] for row in rows]
     assert times[0] != times[1], "each frame has its own"
@@ -65,7 +65,7 @@ def test_frames_are_exposed_for_it(kind: str, tmp_path: Path) -> None:
         path = tmp_path / f"set/expected/{row['frame']:06d}.exr"
         with OpenEXR.File(str(path), separate_channels=True) as file:
             peak = float(file.channels()["Y"].pixels.max())
-        # The LEDs are what is brightest here; float32. The converter ends at 4095 DN of 1 e, before the well of 6000 e.
+        # The LEDs are brightest here; float32. The ADC saturates at 4095 DN of 1 e, before the well of 6000 e.
         assert peak == pytest.approx({"peak": 0.6 * 4095, "noise-level": 10**0.9}[kind], rel=1e-6)
 
 

@@ -17,7 +17,7 @@ def digests(directory: Path) -> dict[str, str]:
 
 
 def test_the_threads_of_a_cluster_make_the_same_bytes(tmp_path: Path) -> None:
-    """In threads, which is where the kernels' settings once differed; workers in processes are tested without dask."""
+    """Worker threads: kernel settings are per thread in Dr.Jit. Worker processes are tested without dask."""
     plan = load_plan(ROOT / "datasets/quickstart.toml", [*SMALL, "poses.count=4"])
     generate(plan, tmp_path / "alone")
     with LocalCluster(
@@ -27,7 +27,7 @@ def test_the_threads_of_a_cluster_make_the_same_bytes(tmp_path: Path) -> None:
     assert digests(tmp_path / "cluster") == digests(tmp_path / "alone")
 
 
-def test_no_scheduler_is_one_line(tmp_path: Path) -> None:
+def test_a_missing_scheduler_is_one_line(tmp_path: Path) -> None:
     plan = load_plan(ROOT / "datasets/quickstart.toml", [*SMALL, "poses.count=1"])
-    with pytest.raises(InputError, match=r"^--scheduler nonsense://x: no scheduler answers: "):
+    with pytest.raises(InputError, match=r"^--scheduler nonsense://x: no answer from a scheduler: "):
         generate(plan, tmp_path / "set", scheduler="nonsense://x")

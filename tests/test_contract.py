@@ -1,4 +1,4 @@
-"""What one package writes the other reads, and both mean the same by it."""
+"""The format as a contract: one package writes it, the other reads it, and both agree on its meaning."""
 
 import json
 from pathlib import Path
@@ -18,9 +18,9 @@ from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.rig import mounted_cameras
 from vlcrender.core.random_keys import stream
-from vlcrender.dataset.files import camera_entry
 from vlcrender.dataset.generate import generate
 from vlcrender.dataset.recipe import load_plan
+from vlcrender.dataset.schema import camera_entry
 from vlcrender.sensor.accelerometer import TiltError
 
 
@@ -65,7 +65,7 @@ def test_the_brightest_pixels_are_at_the_decoded_spots(directory: Path) -> None:
 
 @pytest.mark.parametrize("tilts", [(0.0, 0.0), (30.0, 0.0), (0.0, 45.0), (60.0, 60.0), (-20.0, 35.0)])
 def test_a_gravity_reading_levels_the_pixels_that_the_pose_tilted(tilts: tuple[float, float]) -> None:
-    """One side projects under a tilt, the other undoes it by gravity; what is left is the level view, turned by yaw."""
+    """One package projects under a tilt, the other inverts it by gravity: the level view, turned by yaw."""
     camera = Camera()
     pose = Pose((3.0, 3.0, 1.0), *tilts, yaw_deg=25.0)
     axis = pose.rotation[2]
@@ -87,11 +87,11 @@ def test_a_hand_computed_point() -> None:
     assert pixels == pytest.approx([3500.0, 500.0])
 
 
-def test_windows_are_read_where_they_were_taken_and_give_the_same_positions(tmp_path: Path) -> None:
-    # Not so steep that lamps melt into each other: where they do, which are told apart hangs on the last electron.
+def test_regions_are_read_at_their_place_and_give_the_same_positions(tmp_path: Path) -> None:
+    # Moderate tilts, at which LED images do not merge: which merged images are separated depends on single electrons.
     tilts = ["poses.tilt_x_deg=[0, 25]", "poses.tilt_y_deg=[0, 25]", "poses.height_m=[0.9, 1.8]"]
     base = [*SMALL, *tilts, "poses.count=2", "sensor.noise=none", "poses.border_px=20"]
-    for name, more in (("full", []), ("regions", ['windows={ kind = "leds", margin_px = 20 }'])):
+    for name, more in (("full", []), ("regions", ['regions={ kind = "leds", margin_px = 20 }'])):
         generate(load_plan(ROOT / "datasets/quickstart.toml", [*base, *more]), tmp_path / name)
     for whole, cut in zip(device_frames(tmp_path / "full"), device_frames(tmp_path / "regions"), strict=True):
         image = whole.parts[0].image_dn
@@ -108,7 +108,7 @@ def test_windows_are_read_where_they_were_taken_and_give_the_same_positions(tmp_
             assert np.linalg.norm(ours - full) < 5e-5
 
 
-def test_windows_beyond_the_sensor_show_the_camera_where_it_is(tmp_path: Path) -> None:
+def test_regions_beyond_the_sensor_give_the_position(tmp_path: Path) -> None:
     """Table 1's four LEDs, up to 6 m beside the axis; noise-free, level, exact gravity: discs have no ellipses' offset.
 
     Three LEDs stand on one line and span 0.6 m. Rounding and cos^4 leave 0.01 px of 1500, 7e-6 rad; a distance d is
@@ -133,13 +133,13 @@ LENSES = [
 
 
 def as_told(camera: Camera) -> DeviceCamera:
-    """A camera as the estimator reads it in dataset.json."""
+    """A camera as the estimator reads it from dataset.json."""
     (mounted,) = mounted_cameras(camera, ())
     return DeviceCamera.model_validate_json(camera_entry(mounted).model_dump_json())
 
 
 @pytest.mark.parametrize("lens", LENSES)
-def test_one_side_undoes_the_distortion_of_the_other(lens: Distortion) -> None:
+def test_one_package_inverts_the_distortion_of_the_other(lens: Distortion) -> None:
     bent = Camera(distortion=lens, skew_px=30.0, principal_point_px=(1900.0, 1600.0), focus_distance_m=2.0)
     x, y = np.meshgrid(np.linspace(-0.12, 0.12, 25), np.linspace(-0.09, 0.09, 19))
     rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
@@ -149,7 +149,7 @@ def test_one_side_undoes_the_distortion_of_the_other(lens: Distortion) -> None:
     assert np.abs(pinhole_pixels(seen, as_told(bent)) - straight).max() < 1e-6
 
 
-def test_one_side_undoes_the_fish_eye_of_the_other() -> None:
+def test_one_package_inverts_the_fish_eye_of_the_other() -> None:
     fish_eye = Camera(projection="equidistant", width_px=800, height_px=600, pixel_pitch_um=60.0, skew_px=2.0)
     theta, around = np.meshgrid(
         np.radians(np.linspace(0, MAX_FIELD_ANGLE_DEG - 0.1, 30)), np.radians(np.arange(0, 360, 15))
@@ -174,10 +174,10 @@ def median_errors_m(directory: Path) -> dict[str, float]:
 
 
 def test_a_distorted_set_is_estimated_as_well_as_a_straight_one(tmp_path: Path) -> None:
-    """The same poses and lamps through a lens that moves the corners' 250 px by 7 px.
+    """The same poses and LEDs through a lens that moves image points at the corners, 250 px off the centre, by 7 px.
 
     Taking it out stretches an error at the corner by 1 / (1 - 3 |k1| r^2) = 1.09 and moves the centroid of a disc of
-    5 px by 4 |k1| r (5 / 1500)^2 / 4 = 2e-6, 0.003 px, below the shot noise of some 0.01 px. What is left is other
+    5 px by 4 |k1| r (5 / 1500)^2 / 4 = 2e-6, 0.003 px, below the shot noise of some 0.01 px. What remains is other
     noise of the same size, and medians of five such errors: within 3 times. Left in, the lens costs pixels.
     """
     base = [*SMALL, "poses.count=5", "accelerometer.error_deg=0"]
@@ -203,7 +203,7 @@ def test_a_distorted_set_is_estimated_as_well_as_a_straight_one(tmp_path: Path) 
 
 
 def test_a_fish_eye_set_is_estimated(tmp_path: Path) -> None:
-    """500 px a radian, dozens of lamps: 0.02 px over a pattern some 300 px wide, on 3 m, are well below 2 mm."""
+    """500 px a radian, dozens of LEDs: 0.02 px over a pattern some 300 px wide, on 3 m, are well below 2 mm."""
     fish_eye = ["camera.projection=equidistant", "camera.pixel_pitch_um=36.0", "exposure_s=1.8e-7"]
     tilts = ["poses.tilt_x_deg=[0, 30]", "poses.tilt_y_deg=[0, 30]", "accelerometer.error_deg=0", "poses.count=3"]
     generate(load_plan(ROOT / "datasets/quickstart.toml", [*SMALL, *fish_eye, *tilts]), tmp_path / "set")

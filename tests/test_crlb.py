@@ -52,7 +52,7 @@ def bound_m2(
     renderer: Renderer, camera: Camera, led_ids: Sequence[int], sigma_deg: float, exposure_s: float = EXPOSURE_S
 ) -> np.ndarray | None:
     expected = renderer.expected_image(PosedCamera(camera, POSE)).expected_electrons(exposure_s)
-    variance = [RegionImage(Roi.of_sensor(camera), variance_e2(Sensor(full_well_e=1e6), expected))]
+    variance = [RegionImage(Roi.of_sensor(camera), variance_e2(Sensor(full_well_e=1e6), expected, EXPOSURE_S))]
     return position_bound_m2(
         alone(camera), POSE, light_of(renderer, led_ids), exposure_s, variance, 2.6, (sigma_deg, sigma_deg)
     )
@@ -140,7 +140,7 @@ def test_gravity_and_more_leds_lower_the_bound(renderer: Renderer, small_camera:
 def test_each_tilt_has_its_own_error(renderer: Renderer, small_camera: Camera) -> None:
     """A large error on one tilt raises the bound, and by less than a large error on both."""
     expected = renderer.expected_image(PosedCamera(small_camera, POSE)).expected_electrons(EXPOSURE_S)
-    variance = [RegionImage(Roi.of_sensor(small_camera), variance_e2(Sensor(full_well_e=1e6), expected))]
+    variance = [RegionImage(Roi.of_sensor(small_camera), variance_e2(Sensor(full_well_e=1e6), expected, EXPOSURE_S))]
     sizes = [
         position_bound_m2(alone(small_camera), POSE, light_of(renderer, [0, 1]), EXPOSURE_S, variance, 2.6, s)
         for s in ((0.1, 0.1), (0.1, 5.0), (5.0, 0.1), (5.0, 5.0))
@@ -161,7 +161,7 @@ def test_bound_on_a_rig_is_of_the_cameras_own_position(renderer: Renderer, small
     x, y, z = np.array(POSE.position_m) - POSE.rotation.T @ offset_m
     main = Pose((x, y, z), POSE.tilt_x_deg, POSE.tilt_y_deg, POSE.yaw_deg)
     expected = renderer.expected_image(PosedCamera(small_camera, POSE)).expected_electrons(EXPOSURE_S)
-    variance = [RegionImage(Roi.of_sensor(small_camera), variance_e2(Sensor(full_well_e=1e6), expected))]
+    variance = [RegionImage(Roi.of_sensor(small_camera), variance_e2(Sensor(full_well_e=1e6), expected, EXPOSURE_S))]
     mounted = Mounted("beside", small_camera, np.eye(3), offset_m)
     bound = position_bound_m2(mounted, main, light_of(renderer, [0, 1]), EXPOSURE_S, variance, 2.6, (0.5, 0.5))
     assert bound == pytest.approx(bound_m2(renderer, small_camera, [0, 1], 0.5), rel=1e-4, abs=1e-12)
@@ -176,10 +176,10 @@ def test_a_frame_that_determines_no_position_has_no_bound(renderer: Renderer, sm
 
 def test_saturated_pixels_have_no_information() -> None:
     mean = np.array([[100.0, 5999.0, 6000.0, 9000.0]], dtype=np.float32)
-    assert variance_e2(Sensor(full_well_e=6000, bits=12, gain_e_per_dn=2.0), mean).tolist() == [
+    assert variance_e2(Sensor(full_well_e=6000, bits=12, gain_e_per_dn=2.0), mean, 0.0).tolist() == [
         [100.0 + 1 / 3, 5999.0 + 1 / 3, np.inf, np.inf]
     ]
-    assert np.isinf(variance_e2(Sensor(bits=8), mean)).tolist() == [[False, True, True, True]]
+    assert np.isinf(variance_e2(Sensor(bits=8), mean, 0.0)).tolist() == [[False, True, True, True]]
 
 
 @pytest.mark.parametrize("key", ["motion={angular_velocity_deg_s=[1.0,0.0,0.0]}", "sensor.noise=none"])

@@ -84,7 +84,7 @@ def test_photon_transfer_finds_a_camera_of_numpy_and_states_its_own_error() -> N
         assert camera.linearity_error.value < camera.linearity_noise + 5 * camera.linearity_error.error
 
 
-def test_a_pair_is_blind_to_what_its_frames_share_and_to_a_change_of_light() -> None:
+def test_the_variance_of_a_pair_excludes_fixed_patterns_and_a_change_of_light() -> None:
     """Of two given frames: sigma^2 = mean((A - B)^2)/2 - (mean A - mean B)^2/2, by hand."""
     pattern = np.arange(16, dtype=np.uint32).reshape(4, 4) * 100
     frames = iter([pattern + 1, pattern + 1 + 4])
@@ -96,7 +96,7 @@ def test_a_pair_is_blind_to_what_its_frames_share_and_to_a_change_of_light() -> 
     assert point.mean_dn == pytest.approx(750 + 1.5)
 
 
-def test_patterns_are_told_apart_by_rows_columns_and_pixels(rng: np.random.Generator) -> None:
+def test_patterns_are_separated_into_rows_columns_and_pixels(rng: np.random.Generator) -> None:
     """Rows of 3 DN, columns of 2, pixels of 1 under noise of 4: each found within 5 of its standard errors."""
     rows, columns = 3 * rng.standard_normal((200, 1)), 2 * rng.standard_normal(300)
     fixed = 500 + rows + columns + rng.standard_normal((200, 300))
@@ -119,8 +119,8 @@ def test_lines_and_ratios_carry_their_errors() -> None:
     assert Quantity(6.0, 0.3).times(Quantity(2.0, 0.2)) == pytest.approx((12.0, 12 * np.hypot(0.05, 0.1)))
 
 
-def test_where_a_sensor_is_full_against_draws(rng: np.random.Generator) -> None:
-    """Well and converter near each other: the mean of many draws clipped by both, to 5 standard errors."""
+def test_saturation_agrees_with_random_draws(rng: np.random.Generator) -> None:
+    """Limits of well and ADC close to each other: the mean of many draws clipped by both, to 5 standard errors."""
     sensor = Sensor(**{**FULL, "full_well_e": 6390.0, "read_noise_e": 10.0})
     top = (4095 - 100) * 1.6
     noise = np.sqrt(10**2 + (0.5 * 1.6) ** 2 + 0.4**2 + 0.6**2)
@@ -138,7 +138,7 @@ def test_where_a_sensor_is_full_against_draws(rng: np.random.Generator) -> None:
 
 
 @pytest.mark.parametrize("z", [-1.0, 0.0, 0.7, 3.0])
-def test_clipped_normal_numbers_against_draws(z: float, rng: np.random.Generator) -> None:
+def test_clipped_normal_moments_agree_with_random_draws(z: float, rng: np.random.Generator) -> None:
     """Mean and variance of a million, each to 5 standard errors from the draws' own moments."""
     draws = np.minimum(50.0 + 4.0 * rng.standard_normal(1_000_000), 50.0 + 4.0 * z)
     mean, variance = clipped(np.array(50.0), np.array(4.0), 50.0 + 4.0 * z)
@@ -155,7 +155,7 @@ def row_of(rows: tuple[Row, ...], key: str) -> Row:
     return next(row for row in rows if row.key == key)
 
 
-def test_the_chain_measures_what_was_set(full: Datasheet) -> None:
+def test_the_data_sheet_of_the_chain_finds_the_set_values(full: Datasheet) -> None:
     for row in full.rows:
         assert row.passed, row
     assert {row.key for row in full.rows} == set(LABELS)
@@ -182,17 +182,17 @@ WRONG: dict[str, dict[str, float]] = {
 
 
 @pytest.mark.parametrize("key", WRONG)
-def test_what_was_not_set_is_found_out(full: Datasheet, key: str) -> None:
+def test_a_wrong_set_value_is_rejected(full: Datasheet, key: str) -> None:
     """The measurement of one sensor against the settings of another: a hundredth in gain is off, and so on."""
     other = Sensor(**{**FULL, **WRONG[key]})
     assert row_of(compare(other, full.efficiency, full.measurement), key).passed is False
 
 
-def test_an_efficiency_a_hundredth_off_is_found_out(full: Datasheet) -> None:
+def test_an_efficiency_off_by_one_percent_is_rejected(full: Datasheet) -> None:
     assert row_of(compare(full.sensor, full.efficiency * 1.01, full.measurement), "QE").passed is False
 
 
-def test_read_noise_that_is_not_there_is_found_out(full: Datasheet) -> None:
+def test_missing_read_noise_is_rejected(full: Datasheet) -> None:
     silent = make_datasheet("silent", Sensor(**{**FULL, "read_noise_e": 0.0, "adc_noise_dn": 0.0}), side_px=64)
     assert row_of(compare(full.sensor, full.efficiency, silent.measurement), "sigma_d").passed is False
 
@@ -205,10 +205,10 @@ def test_shot_noise_alone_has_nothing_else_set() -> None:
         assert cells(row_of(sheet.rows, key))[0] == "none set"
     assert row_of(sheet.rows, "sigma_d").measured == 0
     assert row_of(sheet.rows, "T_d").passed is None
-    assert row_of(sheet.rows, "full well").set_value == 4095  # the converter's end, not the well's 6000 e
+    assert row_of(sheet.rows, "full well").set_value == 4095  # limit of the ADC, below the well's 6000 e
 
 
-def test_noise_that_rounding_hides_is_bounded_and_not_guessed() -> None:
+def test_noise_hidden_by_rounding_has_an_upper_bound() -> None:
     sheet = make_datasheet(
         "coarse",
         Sensor(**{**FULL, "bits": 8, "black_level_dn": 10, "gain_e_per_dn": 20.0, "adc_noise_dn": 0.0}),
@@ -222,8 +222,8 @@ def test_noise_that_rounding_hides_is_bounded_and_not_guessed() -> None:
     assert row_of(sheet.rows, "DR").measured is None
 
 
-def test_a_sensor_that_clips_its_noise_in_the_dark_is_shown_to_be_off() -> None:
-    """Black level 0: half of the read noise is cut away, which no data sheet should hide."""
+def test_noise_clipped_in_the_dark_is_reported_as_off() -> None:
+    """Black level 0 clips half of the read noise; a data sheet must show it."""
     sheet = make_datasheet("clipped", Sensor(**{**FULL, "black_level_dn": 0}), side_px=64)
     assert row_of(sheet.rows, "sigma_d").passed is False
 
@@ -234,8 +234,8 @@ def test_a_data_sheet_is_the_same_each_time_and_another_device_s_is_not() -> Non
     assert row_of(first, "K").measured != row_of(other, "K").measured
 
 
-def test_a_camera_that_cannot_be_measured_is_refused(rng: np.random.Generator) -> None:
-    with pytest.raises(InputError, match="no noise to be measured by"):
+def test_an_unmeasurable_camera_is_refused(rng: np.random.Generator) -> None:
+    with pytest.raises(InputError, match="needs noise, and the sensor has none"):
         make_datasheet("x", Sensor(noise="none"), side_px=32)
 
     def endless(photons: float, exposure_s: float, warmer_c: float) -> NDArray[np.uint32]:
@@ -319,7 +319,7 @@ def test_the_command_prints_a_table_or_json_and_writes_the_page(
 @pytest.mark.parametrize(
     ("arguments", "mention"),
     [
-        (["ideal", "--wavelength-nm", "1200"], "--wavelength-nm 1200: the sensor is blind there"),
+        (["blind.toml", "--wavelength-nm", "800"], "--wavelength-nm 800: quantum efficiency is 0 there"),
         (["ideal", "--wavelength-nm", "nan"], "--wavelength-nm nan"),
         (["ideal", "--side-px", "1"], "--side-px 1"),
         (["unknown"], "unknown"),
@@ -328,8 +328,16 @@ def test_the_command_prints_a_table_or_json_and_writes_the_page(
     ],
 )
 def test_the_command_refuses_in_one_line(
-    arguments: list[str], mention: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    arguments: list[str],
+    mention: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "blind.toml").write_text(
+        "[sensor.quantum_efficiency]\nwavelengths_nm = [400, 700]\nvalues = [0.5, 0.5]\n"
+    )
     assert run(monkeypatch, "datasheet", *arguments) == 2
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1

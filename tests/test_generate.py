@@ -1,4 +1,4 @@
-"""Datasets: resumable, the same bits for any number of workers, and never a file lost."""
+"""Generation: resumable, the same bits for any number of workers, and no file lost."""
 
 import hashlib
 import json
@@ -9,18 +9,21 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import OpenEXR
+import psutil
 import pyarrow.parquet as pq
 import pytest
 from conftest import ROOT, SMALL
 
 from vlcrender.dataset.generate import generate
+from vlcrender.dataset.progress import Progress, ProgressCallback
 from vlcrender.dataset.recipe import Plan, load_plan
-from vlcrender.dataset.verify import problems_of
+from vlcrender.dataset.verify import verify
 from vlcrender.errors import InputError
 
 RECIPE = ROOT / "datasets/quickstart.toml"
@@ -42,7 +45,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_dataset_is_complete_and_intact(made: Path) -> None:
-    assert problems_of(made) == []
+    assert verify(made) == []
     assert not (made / "plan.json").exists()
     assert not list(made.rglob("*.partial"))
 
@@ -81,29 +84,49 @@ class Crash(Exception):
     pass
 
 
-def test_an_interrupted_run_goes_on_where_it_stopped(made: Path, tmp_path: Path) -> None:
+def frame_counts(counts: list[float]) -> ProgressCallback:
+    """A callback that collects the numbers of finished frames."""
+    return lambda report: counts.append(report.done) if report.stage == "frames" else None
+
+
+def test_an_interrupted_run_resumes(made: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     directory = tmp_path / "set"
 
-    def crash_after_two(done: int, total: int) -> None:
-        if done == 2:
+    def crash_after_two(report: Progress) -> None:
+        if (report.stage, report.done) == ("frames", 2):
             raise Crash
 
     with pytest.raises(Crash):
         generate(small_plan("expected=true"), directory, progress=crash_after_two)
     assert not (directory / "dataset.json").exists()
-    # what a crash can leave: a cut journal line, a half-written file, a finished file damaged later
+    # a crash can leave a truncated journal line, a half-written file, a finished file damaged later
     with (directory / "journal.jsonl").open("a") as journal:
         journal.write('{"frame": 2, "dev')
     (directory / "frames/000002.partial").write_bytes(b"half")
     damaged = directory / "frames/000000.exr"
     damaged.write_bytes(damaged.read_bytes()[:-100])
     kept = (directory / "frames/000001.exr").stat().st_mtime_ns
-    counts: list[int] = []
-    assert generate(small_plan("expected=true"), directory, progress=lambda done, total: counts.append(done))
+    counts: list[float] = []
+    with caplog.at_level("INFO", "vlcrender"):
+        assert generate(small_plan("expected=true"), directory, progress=frame_counts(counts))
+    assert "2 frames are damaged or incomplete and are made again" in caplog.text
+    assert "resumed with 1 of 3 frames" in caplog.text
     assert counts[0] == 1, "only the intact frame counts as done"
     assert (directory / "frames/000001.exr").stat().st_mtime_ns == kept, "a finished frame is not made twice"
     assert digests(directory) == digests(made)
-    assert problems_of(directory) == []
+    assert verify(directory) == []
+
+
+def test_progress_reports_the_light_and_then_each_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("VLCRENDER_CACHE", str(tmp_path / "cache"))
+    plan = load_plan(ROOT / "datasets/table1.toml", [*SMALL[:4], "poses.columns=2", "poses.rows=1"])
+    reports: list[Progress] = []
+    generate(plan, tmp_path / "set", progress=reports.append)
+    light = [report for report in reports if report.stage == "light"]
+    assert reports[: len(light)] == light
+    assert light[0].step == "light from the LEDs"
+    assert all(0 <= report.done <= report.total == 1 for report in light)
+    assert reports[len(light) :] == [Progress("frames", 1, 2), Progress("frames", 2, 2)]
 
 
 def test_a_finished_set_is_left_alone(made: Path) -> None:
@@ -113,7 +136,7 @@ def test_a_finished_set_is_left_alone(made: Path) -> None:
 
 
 @pytest.mark.parametrize("state", ["another recipe", "unfinished other", "foreign files", "a file", "damaged"])
-def test_nothing_that_is_not_ours_is_overwritten(made: Path, tmp_path: Path, state: str) -> None:
+def test_foreign_files_are_never_overwritten(made: Path, tmp_path: Path, state: str) -> None:
     directory = tmp_path / "set"
     plan = small_plan("expected=true")
     if state == "foreign files":
@@ -140,14 +163,14 @@ def test_nothing_that_is_not_ours_is_overwritten(made: Path, tmp_path: Path, sta
     assert {p: p.read_bytes() for p in [directory, *directory.rglob("*")] if p.is_file()} == before
 
 
-def test_impossible_poses_are_said_before_the_first_frame(tmp_path: Path) -> None:
+def test_impossible_poses_are_refused_before_the_first_frame(tmp_path: Path) -> None:
     plan = load_plan(RECIPE, [*SMALL, "poses.min_leds=500"])
     with pytest.raises(InputError, match=r"frame 0: no position .* 500 LEDs"):
         generate(plan, tmp_path / "never")
     assert not (tmp_path / "never").exists()
 
 
-def test_the_header_says_nothing_of_the_true_pose(made: Path) -> None:
+def test_the_exr_header_holds_no_pose(made: Path) -> None:
     with OpenEXR.File(str(made / "frames/000000.exr")) as file:
         header = dict(file.header())  # gone once the file is closed
     known = {
@@ -173,7 +196,7 @@ def test_frames_are_poisson_draws_of_the_expected_images(made: Path) -> None:
         with OpenEXR.File(str(made / f"expected/{index:06d}.exr"), separate_channels=True) as file:
             expected = file.channels()["Y"].pixels.astype(float)
         assert dn.dtype == np.uint32
-        # the largest number is 4095: what comes within 6 sigma of it is biased by clipping
+        # clipping at the largest number, 4095, biases values within 6 sigma of it
         assert expected.max() < 4095 - 6 * np.sqrt(4095)
         z = (dn - expected) / np.sqrt(expected)
         assert abs(z.mean()) < 5 / np.sqrt(z.size)
@@ -219,19 +242,19 @@ DAMAGES = {
 
 
 @pytest.mark.parametrize("damage", DAMAGES)
-def test_verify_finds(made: Path, tmp_path: Path, damage: str) -> None:
+def test_verify_reports_damage(made: Path, tmp_path: Path, damage: str) -> None:
     directory = tmp_path / "set"
     for path in [made, *made.rglob("*")]:
         target = directory / path.relative_to(made)
         target.mkdir(exist_ok=True) if path.is_dir() else target.write_bytes(path.read_bytes())
-    assert problems_of(directory) == []
+    assert verify(directory) == []
     DAMAGES[damage](directory)
-    found = problems_of(directory)
+    found = verify(directory)
     assert found, damage
     assert all("\n" not in line for line in found)
 
 
-def test_verify_finds_a_truth_that_is_another_pose(made: Path, tmp_path: Path) -> None:
+def test_verify_reports_a_truth_of_another_pose(made: Path, tmp_path: Path) -> None:
     directory = tmp_path / "set"
     for path in [made, *made.rglob("*")]:
         target = directory / path.relative_to(made)
@@ -240,12 +263,12 @@ def test_verify_finds_a_truth_that_is_another_pose(made: Path, tmp_path: Path) -
     rows = table.to_pylist()
     rows[1]["position_m"][0] += 1e-4
     pq.write_table(table.from_pylist(rows, schema=table.schema), directory / "truth.parquet")
-    assert any("frame 1" in line and "not where the pose puts it" in line for line in problems_of(directory))
+    assert any("frame 1" in line and "not where the pose puts it" in line for line in verify(directory))
 
 
 LENSES = {
     "distorted": ["camera.distortion.k1=-0.05", "camera.focus_distance_m=2.0", "camera.skew_px=3.0"],
-    # 300 px a radian: the sensor reaches 48 deg off the axis
+    # 300 px a radian: the sensor extends to 48 deg off the axis
     "equidistant": ["camera.projection=equidistant", "camera.pixel_pitch_um=60.0", "exposure_s=6e-8"],
 }
 
@@ -267,16 +290,16 @@ def changed(made: Path, directory: Path, **entry: object) -> Path:
 
 
 def test_verify_projects_through_the_lens(seen_by_a_lens: Path, tmp_path: Path) -> None:
-    assert problems_of(seen_by_a_lens) == []
+    assert verify(seen_by_a_lens) == []
     another = changed(seen_by_a_lens, tmp_path / "pinhole", projection="perspective", distortion=None)
-    assert any("not where the pose puts it" in line for line in problems_of(another))
+    assert any("not where the pose puts it" in line for line in verify(another))
     directory = changed(seen_by_a_lens, tmp_path / "moved")
     table = pq.read_table(directory / "truth.parquet")
     for move in ([1e-4, 0.0, 0.0], [0.0, 0.0, 100.0]):  # the second puts the LEDs behind the camera
         rows = table.to_pylist()
         rows[0]["position_m"] = [a + b for a, b in zip(rows[0]["position_m"], move, strict=True)]
         pq.write_table(table.from_pylist(rows, schema=table.schema), directory / "truth.parquet")
-        assert any("not where the pose puts it" in line for line in problems_of(directory))
+        assert any("not where the pose puts it" in line for line in verify(directory))
 
 
 @pytest.mark.parametrize(
@@ -288,24 +311,24 @@ def test_verify_projects_through_the_lens(seen_by_a_lens: Path, tmp_path: Path) 
         ({"width_px": 3}, "width_px = 3"),
     ],
 )
-def test_a_camera_that_cannot_be_is_refused_in_one_line(
+def test_an_impossible_camera_is_refused_in_one_line(
     made: Path, tmp_path: Path, entry: dict[str, object], words: str
 ) -> None:
     with pytest.raises(InputError, match=words) as refusal:
-        problems_of(changed(made, tmp_path / "set", **entry))
+        verify(changed(made, tmp_path / "set", **entry))
     assert "\n" not in str(refusal.value)
     assert "dataset.json" in str(refusal.value)
 
 
-def test_a_worker_that_dies_is_a_line_and_the_run_goes_on_later(made: Path, tmp_path: Path) -> None:
-    def kill_one(done: int, total: int) -> None:
-        if done == 1:
+def test_a_dead_worker_is_one_line_and_the_run_resumes(made: Path, tmp_path: Path) -> None:
+    def kill_one(report: Progress) -> None:
+        if (report.stage, report.done) == ("frames", 1):
             os.kill(multiprocessing.active_children()[0].pid or 0, signal.SIGKILL)
 
     with pytest.raises(InputError, match="a worker process died"):
         generate(small_plan("expected=true"), tmp_path / "set", workers=2, progress=kill_one)
-    counts: list[int] = []
-    generate(small_plan("expected=true"), tmp_path / "set", progress=lambda done, total: counts.append(done))
+    counts: list[float] = []
+    generate(small_plan("expected=true"), tmp_path / "set", progress=frame_counts(counts))
     assert counts[0] >= 1
     assert digests(tmp_path / "set") == digests(made)
 
@@ -324,32 +347,43 @@ def started_with_workers(directory: Path) -> subprocess.Popen[str]:
     )
 
 
-def wait_for(path: Path, within_s: float = 60.0) -> None:
-    end = time.monotonic() + within_s
-    while not (path.exists() and path.stat().st_size):
-        assert time.monotonic() < end, f"{path} never came"
-        time.sleep(0.02)
+HANG_S = 600.0
+"""Ends a test whose event never happens; no test waits for it on any machine that works."""
+
+
+def wait_until(happened: Callable[[], bool], process: subprocess.Popen[str]) -> None:
+    """Wait for an event; fail where the process ends first."""
+    end = time.monotonic() + HANG_S
+    while not happened():
+        assert process.poll() is None, process.communicate()[0]
+        assert time.monotonic() < end, "the event never happened"
+        time.sleep(0.01)
 
 
 def test_an_interrupt_while_workers_start_is_one_line(tmp_path: Path) -> None:
-    """Ctrl-C goes to the whole group of processes, also to children that are still importing."""
+    """Ctrl-C goes to the whole group of processes, also to children that are still importing.
+
+    The event is the first child process once the plan is written: from there workers import for seconds, and 300
+    frames are to be made.
+    """
     process = started_with_workers(tmp_path / "set")
-    wait_for(tmp_path / "set/plan.json")
-    time.sleep(1.0)
+    command, plan = psutil.Process(process.pid), tmp_path / "set/plan.json"
+    wait_until(lambda: plan.exists() and bool(command.children()), process)
     os.killpg(process.pid, signal.SIGINT)
-    output, _ = process.communicate(timeout=60)
+    output, _ = process.communicate(timeout=HANG_S)
     assert process.returncode == 130
     assert "interrupted" in output
     assert "Traceback" not in output, output
 
 
-def test_workers_end_with_their_parent(tmp_path: Path) -> None:
+def test_workers_exit_with_their_parent(tmp_path: Path) -> None:
     """A kill that cannot be caught. They share its output, which ends with the last of them."""
     process = started_with_workers(tmp_path / "set")
-    wait_for(tmp_path / "set/journal.jsonl")
+    journal = tmp_path / "set/journal.jsonl"
+    wait_until(lambda: journal.exists() and journal.stat().st_size > 0, process)
     process.kill()
     try:
-        process.communicate(timeout=20)
+        process.communicate(timeout=HANG_S)
     finally:
         with suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
@@ -360,21 +394,21 @@ def test_a_lost_preview_or_expected_image_is_found(made: Path, tmp_path: Path) -
     (tmp_path / "set/expected/000001.exr").unlink()
     (tmp_path / "set/previews/000002.png").unlink()
     names = ("expected/000001", "previews/000002")
-    assert sorted(problems_of(tmp_path / "set")) == [f"{tmp_path}/set/{name}: is missing" for name in names]
+    assert sorted(verify(tmp_path / "set")) == [f"{tmp_path}/set/{name}: is missing" for name in names]
 
 
 def test_a_frame_whose_preview_was_lost_is_made_again(made: Path, tmp_path: Path) -> None:
     """An unfinished run goes on: a journal of all three frames, and one preview gone."""
     generate(small_plan("expected=true"), tmp_path / "set")
     tables = [pq.read_table(tmp_path / "set" / name).to_pylist() for name in ("frames.parquet", "truth.parquet")]
-    rows = [{"frame": n, "device": d, "truth": t} for n, (d, t) in enumerate(zip(*tables, strict=True))]
+    rows = [{"device": device, "truth": truth} for device, truth in zip(*tables, strict=True)]
     provenance = json.loads((tmp_path / "set/dataset.json").read_text())["provenance"]
     (tmp_path / "set/dataset.json").unlink()
     (tmp_path / "set/plan.json").write_text(json.dumps({"provenance": provenance}))
     (tmp_path / "set/journal.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     (tmp_path / "set/previews/000001.png").unlink()
-    done: list[int] = []
-    generate(small_plan("expected=true"), tmp_path / "set", progress=lambda ready, _: done.append(ready))
+    done: list[float] = []
+    generate(small_plan("expected=true"), tmp_path / "set", progress=frame_counts(done))
     assert done == [2, 3]
-    assert problems_of(tmp_path / "set") == []
+    assert verify(tmp_path / "set") == []
     assert digests(tmp_path / "set") == digests(made)

@@ -1,4 +1,4 @@
-"""Datasets of a sensor with everything on: the same bits however they are made, and what the tables say of them."""
+"""Datasets of the full chain: reproducible bits, and tables that state the parameters in effect."""
 
 import hashlib
 import json
@@ -12,8 +12,9 @@ from conftest import ROOT, SMALL
 
 from vlcrender.dataset.frame_job import Job, make_frame
 from vlcrender.dataset.generate import generate
+from vlcrender.dataset.progress import Progress
 from vlcrender.dataset.recipe import Plan, load_plan
-from vlcrender.dataset.verify import problems_of
+from vlcrender.dataset.verify import verify
 
 LEFT = "rig=[{ name = 'left', offset_m = [-0.1, 0.0, 0.0], tilt_x_deg = 0.0, tilt_y_deg = 1.0 }]"
 NOISY = (
@@ -47,7 +48,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_it_is_complete_and_intact(made: Path) -> None:
-    assert problems_of(made) == []
+    assert verify(made) == []
     assert len(digests(made)) == 2 * FRAMES
 
 
@@ -62,11 +63,11 @@ def test_shots_of_a_pose_stay_together(made: Path) -> None:
     assert places[0] == places[2] != places[4]
     assert places[1] == places[3] != places[0]
     readings = [row["accelerometer_m_s2"] for row in rows]
-    assert readings[0] != readings[2], "the accelerometer errs anew in each shot"
+    assert readings[0] != readings[2], "the accelerometer has a new error in each shot"
 
 
-def test_frames_of_one_pose_differ_by_noise_alone(made: Path) -> None:
-    """PRNU, DSNU and offsets cancel in the difference; what is left are both draws and both read noises."""
+def test_frames_of_one_pose_differ_in_noise_alone(made: Path) -> None:
+    """PRNU, DSNU and offsets cancel in the difference; both draws and both read noises remain."""
     expected = pixels(made / "expected/000000.exr")
     assert np.array_equal(expected, pixels(made / "expected/000002.exr"))
     told = json.loads((made / "dataset.json").read_text())["sensor"]
@@ -83,7 +84,7 @@ def test_frames_of_one_pose_differ_by_noise_alone(made: Path) -> None:
     assert abs(np.corrcoef(first[calm], second[calm])[0, 1]) > 0.8, "they do share the patterns"
 
 
-def test_the_dataset_tells_what_acted(made: Path) -> None:
+def test_the_dataset_states_the_sensor_parameters_in_effect(made: Path) -> None:
     """At ISO 200 of base 100 half the electrons make a number; dark current at the frames' temperature."""
     told = json.loads((made / "dataset.json").read_text())["sensor"]
     assert told["gain_e_per_dn"] == pytest.approx(2.128 / 2)
@@ -120,15 +121,15 @@ class Crash(Exception):
 
 
 def test_a_resumed_run_has_the_same_bytes(made: Path, tmp_path: Path) -> None:
-    def stop(done: int, total: int) -> None:
-        if done == 3:
+    def stop(report: Progress) -> None:
+        if (report.stage, report.done) == ("frames", 3):
             raise Crash
 
     with pytest.raises(Crash):
         generate(noisy_plan(), tmp_path / "set", progress=stop)
     generate(noisy_plan(), tmp_path / "set")
     assert digests(tmp_path / "set") == digests(made)
-    assert problems_of(tmp_path / "set") == []
+    assert verify(tmp_path / "set") == []
 
 
 @pytest.mark.parametrize("change", ["seed=2017", "sensor.serial=13"])

@@ -85,7 +85,7 @@ REFUSED = {
     ),
     "qe backwards": (
         ["sensor.quantum_efficiency={wavelengths_nm=[500, 400], values=[0.5, 0.2]}"],
-        ["wavelengths_nm: have to increase"],
+        ["wavelengths_nm: must increase"],
     ),
     "qe half": (
         ["sensor.quantum_efficiency={wavelengths_nm=[400, 500], red=[0.5, 0.2]}"],
@@ -102,7 +102,10 @@ REFUSED = {
     ),
     "mosaic without colours": (["sensor.mosaic=rggb"], ['mosaic = "rggb"', "red, green and blue"]),
     "mosaic": (["sensor.mosaic=gbbr"], ["sensor.mosaic", "rggb"]),
-    "two exposures": (["exposure_s=1e-4", "exposure.kind=noise-level", "exposure.level_db=-9"], ["exposure_s", "both"]),
+    "two exposures": (
+        ["exposure_s=1e-4", "exposure.kind=noise-level", "exposure.level_db=-9"],
+        ["exactly one of exposure_s"],
+    ),
     "metered motion": (
         ["exposure.kind=noise-level", "exposure.level_db=-9", "motion.linear_velocity_m_s=[1, 0, 0]"],
         ["exposure", "motion", "exposure_s"],

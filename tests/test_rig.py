@@ -17,7 +17,7 @@ from vlcrender.camera.intrinsics import Pose
 from vlcrender.camera.rig import pose_of
 from vlcrender.dataset.generate import generate
 from vlcrender.dataset.recipe import load_plan
-from vlcrender.dataset.verify import problems_of
+from vlcrender.dataset.verify import verify
 
 angles = st.floats(-179, 179)
 
@@ -46,7 +46,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_shot_is_a_row_for_each_camera(made: Path) -> None:
-    assert problems_of(made) == []
+    assert verify(made) == []
     for table in ("frames.parquet", "truth.parquet"):
         rows = pq.read_table(made / table).to_pylist()
         assert [(row["frame"], row["shot"]) for row in rows] == [(i, i // 3) for i in range(6)]

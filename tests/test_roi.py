@@ -15,7 +15,7 @@ from vlcrender.camera.roi import LedRegions, Roi, led_regions
 from vlcrender.core.backend import dr
 from vlcrender.dataset.generate import generate
 from vlcrender.dataset.recipe import load_plan
-from vlcrender.dataset.verify import problems_of
+from vlcrender.dataset.verify import verify
 from vlcrender.errors import InputError
 from vlcrender.rendering.background import _edges
 from vlcrender.rendering.renderer import Renderer
@@ -141,7 +141,7 @@ def table1_set(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_frames_with_regions_beyond_the_sensor_are_not_capturable(table1_set: Path) -> None:
     """Level on the floor at the 16 cell centres no pose has all four LEDs in its 0.93 x 0.70 m of ceiling."""
-    assert problems_of(table1_set) == []
+    assert verify(table1_set) == []
     frames = pq.read_table(table1_set / "frames.parquet").to_pylist()
     truth = pq.read_table(table1_set / "truth.parquet").to_pylist()
     assert not any(row["capturable"] for row in frames)
@@ -158,6 +158,6 @@ def test_verify_compares_capturable_with_the_regions(table1_set: Path, tmp_path:
     rows = table.to_pylist()
     rows[2]["capturable"] = True
     pq.write_table(table.from_pylist(rows, schema=table.schema), tmp_path / "set/frames.parquet")
-    (problem,) = problems_of(tmp_path / "set")
+    (problem,) = verify(tmp_path / "set")
     assert "000002.exr" in problem
     assert "capturable" in problem

@@ -1,4 +1,4 @@
-"""The sensor's statistics: Poisson electrons, Skellam differences, and the converter's boundary cases."""
+"""The sensor's statistics: Poisson electrons, Skellam differences, and the boundary cases of the ADC."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ WIDE = Sensor(full_well_e=MAX_WELL_E, gain_e_per_dn=1.0)
 
 def draw(mean: float, name: str) -> np.ndarray:
     """N digital numbers of a wide-open sensor at 1 e/DN: electrons."""
-    return expose(WIDE, np.full((400, N // 400), mean, dtype=np.float32), name).ravel().astype(np.int64)
+    return expose(WIDE, np.full((400, N // 400), mean, dtype=np.float32), name, exposure_s=0.0).ravel().astype(np.int64)
 
 
 def chi_square_p(sample: np.ndarray, distribution: stats.rv_discrete) -> float:
@@ -69,13 +69,13 @@ def test_neighbouring_pixels_are_independent() -> None:
 
 def test_without_noise_the_expected_image_is_rounded() -> None:
     sensor = Sensor(noise="none")
-    image = expose(sensor, np.array([[0.0, 0.49, 0.51, 1.5, 2.5, 99.7]], dtype=np.float32), "x")
+    image = expose(sensor, np.array([[0.0, 0.49, 0.51, 1.5, 2.5, 99.7]], dtype=np.float32), "x", exposure_s=0.0)
     assert image.tolist() == [[0, 0, 1, 2, 2, 100]]  # halves go to the even number, as IEEE 754 rounds
     assert image.dtype == np.uint32
 
 
 @pytest.mark.parametrize("bits", [8, 10, 12])
-def test_the_converter_saturates_at_its_largest_number(bits: int) -> None:
+def test_the_adc_saturates_at_its_largest_number(bits: int) -> None:
     sensor = Sensor(bits=bits, gain_e_per_dn=2.0, full_well_e=1e6, black_level_dn=16)
     full = 2.0 * (2**bits - 1 - 16)
     electrons = np.array([0.0, 1.9, full - 2, full, full + 500])
@@ -85,14 +85,19 @@ def test_the_converter_saturates_at_its_largest_number(bits: int) -> None:
 def test_full_well_clips_electrons_before_gain() -> None:
     assert clip_full_well(np.array([0.0, 5999.0, 6000.0, 1e6]), 6000.0).tolist() == [0, 5999, 6000, 6000]
     assert expose(
-        Sensor(full_well_e=100.0, gain_e_per_dn=0.5, noise="none"), np.array([[1000.0]], dtype=np.float32), "x"
+        Sensor(full_well_e=100.0, gain_e_per_dn=0.5, noise="none"),
+        np.array([[1000.0]], dtype=np.float32),
+        "x",
+        exposure_s=0.0,
     ).tolist() == [[200]]
 
 
-def test_no_well_holds_more_than_is_drawn() -> None:
+def test_the_largest_full_well_is_the_largest_mean_of_the_draws() -> None:
     assert MAX_WELL_E == MAX_MEAN
     sensor = Sensor(full_well_e=MAX_WELL_E, gain_e_per_dn=1000.0, bits=14)
-    assert (expose(sensor, np.full((2, 2), 1e12, dtype=np.float32), "x") >= (MAX_WELL_E - 1e4) / 1000).all()
+    assert (
+        expose(sensor, np.full((2, 2), 1e12, dtype=np.float32), "x", exposure_s=0.0) >= (MAX_WELL_E - 1e4) / 1000
+    ).all()
     with pytest.raises(ValidationError, match="full_well_e"):
         Sensor(full_well_e=2 * MAX_WELL_E)
 

@@ -1,4 +1,4 @@
-"""The full EMVA 1288 chain, each term measured alone, and what is the same in every frame, thread and window."""
+"""The full EMVA 1288 chain: each term alone, fixed patterns, and independence of threads and regions."""
 
 import os
 import subprocess
@@ -34,17 +34,17 @@ EVERYTHING = Sensor(
 
 def exposed(sensor: Sensor, mean: float, key: str = "a", exposure_s: float = 0.0, camera: str = "main") -> np.ndarray:
     """Electrons above the black level, (ROWS, COLUMNS)."""
-    image = expose(sensor, np.full((ROWS, COLUMNS), mean, dtype=np.float32), key, 0, 0, exposure_s, camera)
-    assert image.max() < sensor.largest_dn, "the converter is not to end what is measured"
+    image = expose(sensor, np.full((ROWS, COLUMNS), mean, dtype=np.float32), key, exposure_s=exposure_s, camera=camera)
+    assert image.max() < sensor.largest_dn, "the ADC must not clip the measured values"
     return (image.astype(float) - sensor.black_level_dn) * sensor.gain_at_iso_e_per_dn
 
 
 @pytest.mark.parametrize("gain", [0.5, 1.0, 2.0, 4.0])
-def test_without_a_term_it_is_shot_noise_alone(gain: float) -> None:
+def test_the_full_chain_without_noise_terms_is_shot_noise_alone(gain: float) -> None:
     """Halves included, which go to the even number before the black level is added."""
     means = np.linspace(0, 7000, N, dtype=np.float32).reshape(ROWS, COLUMNS)
     shot, full = (Sensor(noise=noise, gain_e_per_dn=gain, black_level_dn=63) for noise in ("shot", "full"))
-    assert np.array_equal(expose(full, means, "a"), expose(shot, means, "a"))
+    assert np.array_equal(*(expose(sensor, means, "a", exposure_s=0.1) for sensor in (full, shot)))
 
 
 # Variance of the variance of n normal numbers: 2 sigma^4 / (n - 1); of Poisson numbers (2 mu^2 + mu) / n. Five sigma.
@@ -82,7 +82,7 @@ def test_prnu_spreads_the_mean_and_not_the_electrons() -> None:
     se = np.sqrt(2 * mu**2 / 39 / N) / (prnu * mu)
     slope = np.polyfit(mean.ravel(), temporal.ravel(), 1)[0]
     assert abs(slope - 1) < 5 * se
-    assert abs(slope - 2) > 5 * se, "what multiplied electrons would have, d (1 + p)^2 / d p"
+    assert abs(slope - 2) > 5 * se, "the slope of multiplied electrons, d (1 + p)^2 / d p"
 
 
 @pytest.mark.parametrize(("celsius", "times"), [(25.0, 1.0), (32.0, 2.0), (18.0, 0.5), (46.0, 8.0)])
@@ -137,7 +137,7 @@ def test_the_well_clips_before_read_noise_is_added() -> None:
 @pytest.mark.parametrize("iso", [50.0, 100.0, 800.0])
 def test_noise_after_the_gain_falls_with_iso_in_electrons(iso: float) -> None:
     sensor = Sensor(noise="full", gain_e_per_dn=4.0, iso=iso, bits=14, black_level_dn=200, adc_noise_dn=3.0)
-    image = expose(sensor, np.zeros((ROWS, COLUMNS), dtype=np.float32), f"{iso}").astype(float)
+    image = expose(sensor, np.zeros((ROWS, COLUMNS), dtype=np.float32), f"{iso}", exposure_s=0.0).astype(float)
     expected = 3.0**2 + 1 / 12
     assert abs(image.var(ddof=1) - expected) < 5 * np.sqrt(2 / N) * expected, "the same in digital numbers"
     assert sensor.dark_noise_e == pytest.approx(3.0 * 4.0 * 100 / iso)
@@ -145,7 +145,9 @@ def test_noise_after_the_gain_falls_with_iso_in_electrons(iso: float) -> None:
 
 def test_twice_the_iso_is_twice_the_numbers() -> None:
     for iso in (100.0, 200.0):
-        image = expose(Sensor(noise="full", iso=iso), np.full((ROWS, COLUMNS), 1000, dtype=np.float32), "iso")
+        image = expose(
+            Sensor(noise="full", iso=iso), np.full((ROWS, COLUMNS), 1000, dtype=np.float32), "iso", exposure_s=0.0
+        )
         dn_per_e = iso / 100
         assert abs(image.mean() - 1000 * dn_per_e) < 5 * dn_per_e * np.sqrt(1000 / N)
         expected = dn_per_e**2 * 1000
@@ -153,25 +155,27 @@ def test_twice_the_iso_is_twice_the_numbers() -> None:
 
 
 @pytest.mark.parametrize("bits", [8, 10, 12, 14])
-def test_black_level_and_both_ends_of_the_converter(bits: int) -> None:
+def test_black_level_and_both_limits_of_the_adc(bits: int) -> None:
     sensor = Sensor(noise="full", bits=bits, full_well_e=1e5, black_level_dn=20, read_noise_e=40.0, gain_e_per_dn=2.0)
-    dark = expose(sensor, np.zeros((ROWS, COLUMNS), dtype=np.float32), "dark").astype(float)
+    dark = expose(sensor, np.zeros((ROWS, COLUMNS), dtype=np.float32), "dark", exposure_s=0.0).astype(float)
     # Read noise has 20 DN: 0 DN takes all below -1 sigma but half a step, and what is above the black level is whole.
     assert dark.min() == 0
     share = stats.norm.cdf(-19.5 / 20)
     assert abs((dark == 0).mean() - share) < 5 * np.sqrt(share / N)
     share = stats.norm.cdf(-0.5 / 20)
     assert abs((dark > 20).mean() - share) < 5 * np.sqrt(share / N)
-    bright = expose(sensor, np.full((10, 10), 9e4, dtype=np.float32), "bright")
+    bright = expose(sensor, np.full((10, 10), 9e4, dtype=np.float32), "bright", exposure_s=0.0)
     assert (bright == 2**bits - 1).all()
 
 
-def test_the_variance_told_is_the_variance_had() -> None:
-    """Over individuals, whose patterns nobody knows; of one row and column each, since those share offsets."""
+def test_the_predicted_variance_is_the_sample_variance() -> None:
+    """Over individual sensors with unknown patterns; one pixel per row and column, since these share offsets."""
     mean = 800.0
     sensors = [EVERYTHING.model_copy(update={"serial": serial}) for serial in range(200)]
     roi = np.full((40, 40), mean, dtype=np.float32)
-    diagonal = [np.diag(expose(sensor, roi, f"frame {sensor.serial}", 0, 0, 0.2)).astype(float) for sensor in sensors]
+    diagonal = [
+        np.diag(expose(sensor, roi, f"frame {sensor.serial}", exposure_s=0.2)).astype(float) for sensor in sensors
+    ]
     electrons = (np.concatenate(diagonal) - 64) * EVERYTHING.gain_at_iso_e_per_dn
     expected = float(variance_e2(EVERYTHING, roi, 0.2)[0, 0])
     n = len(electrons)
@@ -209,7 +213,7 @@ def test_a_binned_sensor_has_the_noise_of_the_sums(term: dict[str, float], mean:
 
 
 def patterns(serial: int, camera: str = "main") -> np.ndarray:
-    """What of a frame belongs to the individual: response and offset together, electrons."""
+    """The fixed pattern of an individual sensor: offsets in electrons."""
     sensor = Sensor(**FINE, dsnu_e=10.0, prnu=0.3, black_level_dn=BLACK, serial=serial)
     return exposed(sensor, 0.0, "any", camera=camera)
 
@@ -231,27 +235,29 @@ def test_the_two_patterns_of_a_pixel_are_independent() -> None:
 
 @pytest.mark.parametrize("sensor", [Sensor(), EVERYTHING], ids=["shot", "full"])
 def test_neighbouring_seeds_and_frames_share_nothing(sensor: Sensor) -> None:
-    """What is left of frames when the patterns, which they do share, are taken out."""
+    """Frames without the fixed patterns, which they share, are uncorrelated."""
     means = np.full((ROWS, COLUMNS), 300.0, dtype=np.float32)
     keys = ["2016/0/shot-noise", "2017/0/shot-noise", "2016/1/shot-noise", "20160/0/shot-noise"]
     shown = sensor if sensor.noise == "shot" else sensor.model_copy(update={"prnu": 0, "dsnu_e": 0})
     shown = shown.model_copy(update={"row_offset_e": 0, "column_offset_e": 0})
-    frames = [expose(shown, means, key).astype(float).ravel() for key in keys]
+    frames = [expose(shown, means, key, exposure_s=0.0).astype(float).ravel() for key in keys]
     correlations = np.corrcoef(frames)[np.triu_indices(len(keys), 1)]
     assert np.abs(correlations).max() < 4 / np.sqrt(N)
     if sensor.noise == "full":  # as differences of frames take them out too
-        left = [expose(sensor, means, key).astype(float).ravel() for key in (*keys, "2018/0/shot-noise")]
+        left = [
+            expose(sensor, means, key, exposure_s=0.0).astype(float).ravel() for key in (*keys, "2018/0/shot-noise")
+        ]
         differences = [left[0] - left[1], left[2] - left[3]]
         # PRNU stays in the draws' variances: a difference's variance follows the pixel's mean, its sign does not.
         assert abs(np.corrcoef(differences)[0, 1]) < 4 / np.sqrt(N)
 
 
-def test_a_window_gets_the_noise_of_the_whole_frame(rng: np.random.Generator) -> None:
+def test_a_region_gets_the_noise_of_the_whole_frame(rng: np.random.Generator) -> None:
     means = rng.uniform(0, 3000, (60, 80)).astype(np.float32)
-    frame = expose(EVERYTHING, means, "frame", 0, 0, 0.1)
-    part = expose(EVERYTHING, means[20:31, 5:70], "frame", 20, 5, 0.1)
+    frame = expose(EVERYTHING, means, "frame", exposure_s=0.1)
+    part = expose(EVERYTHING, means[20:31, 5:70], "frame", 20, 5, exposure_s=0.1)
     assert np.array_equal(part, frame[20:31, 5:70])
-    beyond = expose(EVERYTHING, np.pad(means, 7, mode="edge"), "frame", -7, -7, 0.1)
+    beyond = expose(EVERYTHING, np.pad(means, 7, mode="edge"), "frame", -7, -7, exposure_s=0.1)
     assert np.array_equal(beyond[7:-7, 7:-7], frame)
 
 
@@ -261,7 +267,7 @@ def test_threads_make_no_difference(tmp_path: Path) -> None:
         "import sys, numpy as np; from test_signal_chain import EVERYTHING; from vlcrender.core.backend import dr; "
         "from vlcrender.sensor.signal_chain import expose; dr.set_thread_count(int(sys.argv[1])); "
         "means = np.linspace(0, 4000, 120000, dtype=np.float32).reshape(300, 400); "
-        "np.save(sys.argv[2], expose(EVERYTHING, means, 'key', 0, 0, 0.1))"
+        "np.save(sys.argv[2], expose(EVERYTHING, means, 'key', exposure_s=0.1))"
     )
     for threads in (1, 2):
         command = [sys.executable, "-c", code, str(threads), str(tmp_path / f"{threads}.npy")]
@@ -269,10 +275,10 @@ def test_threads_make_no_difference(tmp_path: Path) -> None:
     means = np.linspace(0, 4000, 120000, dtype=np.float32).reshape(300, 400)
     for threads in (1, 2):
         image = np.load(tmp_path / f"{threads}.npy")
-        assert np.array_equal(image, expose(EVERYTHING, means, "key", 0, 0, 0.1))
+        assert np.array_equal(image, expose(EVERYTHING, means, "key", exposure_s=0.1))
 
 
 @pytest.mark.parametrize("mean", [-1.0, np.nan])
 def test_impossible_means_are_refused(mean: float) -> None:
     with pytest.raises(ValueError, match="are allowed"):
-        expose(EVERYTHING, np.array([[1.0, mean]], dtype=np.float32), "bad")
+        expose(EVERYTHING, np.array([[1.0, mean]], dtype=np.float32), "bad", exposure_s=0.0)

@@ -17,12 +17,12 @@ from vlcrender import __version__
 from vlcrender.camera.intrinsics import Camera
 from vlcrender.dataset.files import read_dataset_file
 from vlcrender.dataset.recipe import ScaleMode, load_plan
-from vlcrender.dataset.verify import problems_of
 from vlcrender.errors import InputError
 from vlcrender.scene.loader import load_scene
 from vlcrender.scene.visibility import ENOUGH_LEDS, level_visibility, tilted_visibility
 
 if TYPE_CHECKING:
+    from vlcrender.dataset.progress import Progress as Report
     from vlcrender.emva1288.datasheet import Datasheet
 
 app = App(
@@ -85,16 +85,15 @@ def generate(
     light = bar.add_task("light", total=1.0, visible=False)
     task = bar.add_task(plan.recipe.name, total=plan.recipe.frame_count)
 
-    def progress(done: int, total: int) -> None:
+    def draw(report: "Report") -> None:
         bar.start()  # not before the first report: a refusal is one line
-        bar.update(task, completed=done, total=total)
-
-    def baking(stage: str, share: float) -> None:
-        bar.start()
-        bar.update(light, description=stage, completed=share, visible=share < 1)
+        if report.stage == "light":
+            bar.update(light, description=report.step, completed=report.done, visible=report.done < report.total)
+        else:
+            bar.update(task, completed=report.done, total=report.total)
 
     try:
-        made = make(plan, out, workers, scheduler, progress, baking)
+        made = make(plan, out, workers, scheduler, draw)
     finally:
         bar.stop()
     print(f"{out}: {plan.recipe.frame_count} frames{'' if made else ' (was already complete and intact)'}")
@@ -109,6 +108,8 @@ def verify(directory: Path, /) -> None:
     directory
         Folder of the dataset.
     """
+    from vlcrender.dataset.verify import verify as problems_of
+
     dataset = read_dataset_file(directory)
     found = problems_of(directory)
     for problem in found:

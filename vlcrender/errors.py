@@ -1,5 +1,5 @@
-"""What a user can do wrong, said in one line."""
+"""Exceptions of this package."""
 
 
-class InputError(Exception):
-    """Bad input. The message is one line naming what, where and what is allowed; the command line exits with 2."""
+class InputError(ValueError):
+    """Invalid input. The message is one line: what, where, and what is allowed. The command line exits with 2."""

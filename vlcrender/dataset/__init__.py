@@ -1,4 +1,4 @@
-"""Datasets: a recipe into frames, truth and tables on disk, and the check of a finished set.
+"""Datasets: recipes, generation of frames, tables and truth on disk, and verification of a finished dataset.
 
-A set resumes after an interruption and has the same bytes for any order and any number of workers.
+Generation resumes after an interruption; the bytes are the same for any order and any number of workers.
 """

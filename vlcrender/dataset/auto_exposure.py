@@ -1,4 +1,4 @@
-"""Automatic exposure: the time at which a frame's expected image reaches a target. The image is linear in time."""
+"""Automatic exposure: the time at which the expected image reaches a target; the image is linear in time."""
 
 from typing import Annotated, Literal
 
@@ -8,36 +8,42 @@ from pydantic import Field
 from vlcrender.config.toml_model import Settings
 from vlcrender.rendering.expected_image import ExpectedImage
 
-LongestTime = Annotated[float, Field(gt=0, le=100)]
-"""Seconds; also the exposure of a frame that shows nothing to meter."""
+MaxTime = Annotated[float, Field(gt=0, le=100)]
+"""Longest exposure time, seconds."""
 
 
 class PeakMetering(Settings):
-    """Expose until the brightest pixel of the noise-free image holds a share of what saturates it."""
+    """Expose until the brightest pixel of the noise-free image holds a share of its saturation."""
 
     kind: Literal["peak"]
+    """Metering method."""
     share_of_saturation: Annotated[float, Field(gt=0, le=1)]
-    max_s: LongestTime
+    """Electrons of the brightest pixel over the electrons at which a pixel saturates."""
+    max_s: MaxTime
+    """Longest exposure time, seconds; also the time of a frame without light."""
 
     def time_s(self, view: ExpectedImage, saturation_e: float) -> float:
-        """Exposure time of a view, seconds."""
+        """Exposure time of an expected image, seconds."""
         rate = max(float(part.expected_electrons(1.0).max()) for part in view.parts)
         return _time_s(self.share_of_saturation * saturation_e, rate, self.max_s)
 
 
 class NoiseLevelMetering(Settings):
-    """Expose for a noise level at the brightest LED pixel of the noise-free image: of photon noise of mean lambda,
-    noise power over signal power is 1 / lambda, -10 log10(lambda) dB.
+    """Expose for a noise level at the brightest LED pixel of the noise-free image.
 
-    Our reading of the noise levels of Huynh & Yoo 2016, Fig. 9, which the paper does not define.
+    Photon noise of mean lambda has the noise power over signal power 1 / lambda, which is -10 log10(lambda) dB. This is
+    our reading of the noise levels of Huynh & Yoo 2016, Fig. 9, which the paper does not define.
     """
 
     kind: Literal["noise-level"]
+    """Metering method."""
     level_db: Annotated[float, Field(ge=-60, le=30)]
-    max_s: LongestTime = 1.0
+    """Noise power over signal power, dB."""
+    max_s: MaxTime = 1.0
+    """Longest exposure time, seconds; also the time of a frame without LED light."""
 
     def time_s(self, view: ExpectedImage, saturation_e: float) -> float:
-        """Exposure time of a view, seconds; the sensor does not matter."""
+        """Exposure time of an expected image, seconds; independent of the sensor's saturation."""
         rate = 0.0
         for part in view.parts:
             image = part.expected_electrons(1.0)

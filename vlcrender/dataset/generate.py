@@ -1,38 +1,46 @@
-"""A recipe into a dataset: plan, frames, tables. Resumable; the same bits for any order and number of workers."""
+"""Generation of a dataset from a plan: frames, tables, dataset.json. Resumable; any number of workers, same bytes."""
 
 import json
+import logging
 import multiprocessing
 import os
 import platform
 import signal
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from pydantic import ValidationError
+
 from vlcrender import __version__
-from vlcrender.dataset.files import (
-    FRAMES,
-    FRAMES_SCHEMA,
-    TRUTH_SCHEMA,
+from vlcrender.dataset.files import FRAMES, sha256_of, whole_file, write_json
+from vlcrender.dataset.frame_job import Job, make_frame, poses_of
+from vlcrender.dataset.progress import Progress, ProgressCallback
+from vlcrender.dataset.recipe import Plan, Recipe
+from vlcrender.dataset.schema import (
+    DATA_VERSION,
+    FORMAT_VERSION,
     AccelerometerEntry,
     DatasetFile,
+    FrameRecord,
+    FrameRow,
     SensorEntry,
+    TruthRow,
     camera_entry,
     led_map,
-    sha256_of,
-    write_json,
-    write_table,
 )
-from vlcrender.dataset.frame_job import Job, Record, make_frame, poses_of
-from vlcrender.dataset.recipe import Plan, Recipe
-from vlcrender.dataset.verify import folders_of, missing_files, problems_of
+from vlcrender.dataset.tables import write_table
+from vlcrender.dataset.verify import extra_folders, missing_files, verify
 from vlcrender.errors import InputError
 from vlcrender.light.lightmap import bake, room_mesh
 from vlcrender.rendering.renderer import check_inside, share_cores
+
+log = logging.getLogger(__name__)
 
 
 def generate(
@@ -40,51 +48,56 @@ def generate(
     directory: Path,
     workers: int = 1,
     scheduler: str | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-    baking: Callable[[str, float], None] = lambda stage, share: None,
+    progress: ProgressCallback | None = None,
 ) -> bool:
-    """Make the dataset of a plan in `directory`. Returns False where it was already there, complete and intact.
+    """Generate the dataset of a plan in `directory`. Returns False where it is already complete and intact.
 
-    Goes on from an interrupted run of the same plan. `progress` is told (frames done, frames in all), `baking` (stage
-    of the room's light, share done). Raises InputError where the folder holds anything else.
+    Resumes an interrupted run of the same plan. `workers` is the number of processes; `scheduler` is the address of a
+    dask scheduler whose workers share the folder. `progress` is called with each report. Raises InputError where the
+    folder holds anything else, and where a pose or the furniture of the plan is impossible.
     """
+    report = progress or (lambda report: None)
     try:
         str(directory).encode()
     except UnicodeEncodeError:
-        raise InputError(f"--out {directory}: is no UTF-8 name, which EXR files need") from None
+        raise InputError(f"--out {directory}: not a UTF-8 name; EXR files need one") from None
     provenance = _provenance(plan)
     if (directory / "dataset.json").exists():
         _check_same(directory / "dataset.json", provenance, "a dataset of another recipe, scene or version")
-        damage = problems_of(directory)
+        damage = verify(directory)
         if damage:
-            raise InputError(f"{directory}: is complete but damaged: {damage[0]}; delete it or choose another --out")
+            raise InputError(f"{directory}: complete but damaged: {damage[0]}; delete it or choose another --out")
+        log.info("%s: complete and intact already", directory)
         return False
-    for pose_number in range(plan.recipe.poses.count):  # impossible poses are found before the first image
+    for pose_number in range(plan.recipe.poses.count):  # an impossible pose ends the run before the first frame
         for which in range(len(plan.recipe.cameras)):
             _, during = poses_of(plan.recipe, plan.scene, pose_number, which)
             check_inside(plan.scene, during[0])
             check_inside(plan.scene, during[-1])
-    room_mesh(plan.scene)  # furniture that cannot be used is found before anything is written
+    room_mesh(plan.scene)  # impossible furniture ends the run before anything is written
     _prepare(directory, provenance, plan.recipe)
     job = Job(
         plan.recipe.model_dump_json(), plan.scene.settings.model_dump_json(), str(plan.scene.folder), str(directory)
     )
     done = _journal(directory, plan.recipe)
-    missing = [frame for frame in range(plan.recipe.frame_count) if frame not in done]
+    total = plan.recipe.frame_count
+    missing = [frame for frame in range(total) if frame not in done]
     if done:
-        progress(len(done), plan.recipe.frame_count)
-    bake(plan.scene, progress=baking)  # into the cache, from which every worker takes it
+        log.info("%s: resumed with %d of %d frames", directory, len(done), total)
+        report(Progress("frames", len(done), total))
+    # Into the cache, from which every worker reads it.
+    bake(plan.scene, progress=lambda step, share: report(Progress("light", share, 1.0, step)))
     with (directory / "journal.jsonl").open("a", encoding="utf-8") as journal:
         for record in _records(job, missing, workers, scheduler):
-            done[record["frame"]] = record
-            journal.write(json.dumps(record) + "\n")
+            done[record.frame] = record
+            journal.write(record.model_dump_json() + "\n")
             journal.flush()
-            progress(len(done), plan.recipe.frame_count)
+            report(Progress("frames", len(done), total))
     _finish(plan, directory, provenance, [done[frame] for frame in sorted(done)])
     return True
 
 
-def _records(job: Job, frames: list[int], workers: int, scheduler: str | None) -> Iterator[Record]:
+def _records(job: Job, frames: list[int], workers: int, scheduler: str | None) -> Iterator[FrameRecord]:
     if scheduler is not None:
         yield from _on_cluster(job, frames, scheduler)
     elif workers == 1 or len(frames) <= 1:
@@ -94,22 +107,17 @@ def _records(job: Job, frames: list[int], workers: int, scheduler: str | None) -
         yield from _in_processes(job, frames, workers)
 
 
-def _in_processes(job: Job, frames: list[int], workers: int) -> Iterator[Record]:
+def _in_processes(job: Job, frames: list[int], workers: int) -> Iterator[FrameRecord]:
     # spawn: a forked child of a process that ran kernels is left with one thread
     context = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(min(workers, len(frames)), context, _start_worker, (workers,))
-    pending: set[Future[Record]] = set()
+    pending: set[Future[FrameRecord]] = set()
     queue = iter(frames)
     try:
         while True:
-            # Children start as tasks come. Interrupts are the parent's: they would otherwise each print a traceback.
-            # A mask is inherited; an interrupt that came meanwhile is delivered after.
-            before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-            try:
+            with _interrupts_deferred():  # submit() starts children
                 while len(pending) < 2 * workers and (frame := next(queue, None)) is not None:
                     pending.add(pool.submit(make_frame, job, frame))
-            finally:
-                signal.pthread_sigmask(signal.SIG_SETMASK, before)
             if not pending:
                 return
             finished, pending = wait(pending, return_when=FIRST_COMPLETED)
@@ -117,27 +125,49 @@ def _in_processes(job: Job, frames: list[int], workers: int) -> Iterator[Record]
                 yield future.result()
     except BrokenProcessPool:
         raise InputError(
-            f"{job.directory}: a worker process died (out of memory?); run the same command again to go on, "
-            "with fewer --workers"
+            f"{job.directory}: a worker process died (out of memory?); run the same command again, "
+            "with fewer --workers, to resume"
         ) from None
     finally:
         pool.shutdown(cancel_futures=True)
 
 
+@contextmanager
+def _interrupts_deferred() -> Iterator[None]:
+    """Deliver an interrupt (SIGINT) after this block; child processes started in it never receive one.
+
+    Children inherit the blocked signal, so that only the parent handles an interrupt and no child prints a traceback.
+    The handler is needed beside the mask: a mask holds for this thread alone, another thread may receive the signal,
+    and Python then runs the handler in the main thread, in the middle of starting a child.
+    """
+    received = threading.Event()
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    handler = signal.signal(signal.SIGINT, lambda *_: received.set()) if in_main_thread else None
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        if handler is not None:
+            signal.signal(signal.SIGINT, handler)
+    if received.is_set():
+        signal.raise_signal(signal.SIGINT)
+
+
 def _start_worker(workers: int) -> None:
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    threading.Thread(target=_exit_with_parent, daemon=True).start()
     share_cores(workers)
 
 
-def _end_with_parent() -> None:
-    """Where the parent is killed, nobody would ever tell its children to stop."""
+def _exit_with_parent() -> None:
+    """Exit when the parent process dies."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
         os._exit(1)
 
 
-def _on_cluster(job: Job, frames: Iterable[int], address: str) -> Iterator[Record]:
+def _on_cluster(job: Job, frames: Iterable[int], address: str) -> Iterator[FrameRecord]:
     try:
         from dask.distributed import Client, as_completed
     except ImportError:
@@ -145,7 +175,7 @@ def _on_cluster(job: Job, frames: Iterable[int], address: str) -> Iterator[Recor
     try:
         client = Client(address, timeout="10s")
     except (OSError, ValueError) as error:
-        raise InputError(f"--scheduler {address}: no scheduler answers: {error}") from None
+        raise InputError(f"--scheduler {address}: no answer from a scheduler: {error}") from None
     with client:
         futures = client.map(lambda frame: make_frame(job, frame), list(frames), pure=False)
         for future in as_completed(futures):
@@ -159,6 +189,7 @@ def _provenance(plan: Plan) -> dict[str, Any]:
     return {
         "recipe": recipe,
         "scene": plan.scene.settings.model_dump(mode="json"),
+        "data_version": DATA_VERSION,
         "versions": {
             "vlcrender": __version__,
             **{package: version(package) for package in ("mitsuba", "drjit", "numpy", "OpenEXR")},
@@ -167,14 +198,14 @@ def _provenance(plan: Plan) -> dict[str, Any]:
     }
 
 
-def _check_same(path: Path, provenance: dict[str, Any], what: str) -> None:
+def _check_same(path: Path, provenance: dict[str, Any], other: str) -> None:
     try:
         tree = json.loads(path.read_text(encoding="utf-8"))
         same = tree["provenance"] == json.loads(json.dumps(provenance))
     except (ValueError, KeyError, TypeError, OSError):
-        raise InputError(f"{path}: is damaged; delete {path.parent} or choose another --out") from None
+        raise InputError(f"{path}: damaged; delete {path.parent} or choose another --out") from None
     if not same:
-        raise InputError(f"{path.parent}: holds {what}; nothing was changed; choose another --out or delete it")
+        raise InputError(f"{path.parent}: holds {other}; nothing was changed; choose another --out or delete it")
 
 
 def _prepare(directory: Path, provenance: dict[str, Any], recipe: Recipe) -> None:
@@ -182,44 +213,46 @@ def _prepare(directory: Path, provenance: dict[str, Any], recipe: Recipe) -> Non
     if plan_file.exists():
         _check_same(plan_file, provenance, "an unfinished dataset of another recipe, scene or version")
     elif directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
-        raise InputError(f"{directory}: is not empty and not a dataset; nothing was changed; choose another --out")
-    for name in [FRAMES, *folders_of(recipe.expected, recipe.processed is not None)]:
+        raise InputError(f"{directory}: neither empty nor a dataset; nothing was changed; choose another --out")
+    for name in [FRAMES, *extra_folders(recipe.expected, recipe.processed is not None)]:
         (directory / name).mkdir(parents=True, exist_ok=True)
     for leftover in directory.rglob("*.partial"):
         leftover.unlink()
     write_json(plan_file, {"provenance": provenance})
 
 
-def _journal(directory: Path, recipe: Recipe) -> dict[int, Record]:
-    """Frames that an interrupted run finished and whose files are still intact."""
+def _journal(directory: Path, recipe: Recipe) -> dict[int, FrameRecord]:
+    """Frames that an interrupted run finished and whose files are still intact; the journal then holds these alone."""
     path = directory / "journal.jsonl"
     if not path.exists():
         return {}
-    done: dict[int, Record] = {}
-    for line in path.read_text(encoding="utf-8").splitlines():
+    done: dict[int, FrameRecord] = {}
+    lines = path.read_text(encoding="utf-8").splitlines()
+    for line in lines:
         try:
-            record = json.loads(line)
-            file = directory / record["device"]["file"]
-            if file.is_file() and sha256_of(file) == record["device"]["sha256"]:
-                done[int(record["frame"])] = record
-        except (ValueError, KeyError, TypeError):
-            continue  # the line a crash cut short: that frame is made again
-    folders = folders_of(recipe.expected, recipe.processed is not None)
+            record = FrameRecord.model_validate_json(line)
+        except ValidationError:
+            continue  # a line that a crash truncated: its frame is made again
+        file = directory / record.device.file
+        if file.is_file() and sha256_of(file) == record.device.sha256:
+            done[record.frame] = record
+    folders = extra_folders(recipe.expected, recipe.processed is not None)
     for frame in missing_files(directory, folders, list(done)):
         del done[frame]
-    write_partial = path.with_suffix(".partial")
-    write_partial.write_text("".join(json.dumps(record) + "\n" for record in done.values()), encoding="utf-8")
-    os.replace(write_partial, path)
+    if len(done) < len(lines):
+        log.warning("%s: %d frames are damaged or incomplete and are made again", path, len(lines) - len(done))
+    with whole_file(path) as partial:
+        partial.write_text("".join(record.model_dump_json() + "\n" for record in done.values()), encoding="utf-8")
     return done
 
 
-def _finish(plan: Plan, directory: Path, provenance: dict[str, Any], records: list[Record]) -> None:
+def _finish(plan: Plan, directory: Path, provenance: dict[str, Any], records: list[FrameRecord]) -> None:
     recipe, scene = plan.recipe, plan.scene
-    write_table(directory / "frames.parquet", [record["device"] for record in records], FRAMES_SCHEMA)
-    write_table(directory / "truth.parquet", [record["truth"] for record in records], TRUTH_SCHEMA)
+    write_table(directory / "frames.parquet", [record.device for record in records], FrameRow)
+    write_table(directory / "truth.parquet", [record.truth for record in records], TruthRow)
     dataset = DatasetFile(
         format="vlcrender-dataset",
-        version=3,
+        version=FORMAT_VERSION,
         name=recipe.name,
         frame_count=len(records),
         cameras={mounted.name: camera_entry(mounted) for mounted in recipe.cameras},

@@ -1,4 +1,4 @@
-"""Where the camera stands in each frame."""
+"""Poses of the frames: aimed at random, listed, or on a grid."""
 
 from typing import Annotated, Literal, Self
 
@@ -15,26 +15,33 @@ from vlcrender.scene.visibility import leds_in_view
 
 Tilt = Annotated[float, Field(ge=-85, le=85)]
 TRIES = 10_000
-"""Random positions and yaws tried for one frame's tilts before the recipe is called impossible."""
+"""Random positions and yaws tried for the tilts of one frame before the recipe is refused."""
 
 
 class AimedPoses(Settings):
-    """Random poses that look at LEDs.
+    """Random poses aimed at LEDs.
 
-    Tilts are stratified over their ranges, so that few frames already span them. A target among the LEDs, a height
-    and a yaw are drawn, the camera is put where its optical axis meets the target, and the pose is kept if it stands
-    inside the room and sees enough LEDs whole.
+    Tilts are stratified over their ranges, so that few frames already span them. For each frame a target LED, a height
+    and a yaw are drawn. The camera is placed where its optical axis meets the target. The pose is kept if the camera is
+    inside the room and enough LEDs are whole in the image.
     """
 
     kind: Literal["aimed"]
+    """How the poses are given."""
     count: Annotated[int, Field(ge=1, le=10_000_000)]
+    """Number of poses."""
     tilt_x_deg: tuple[Tilt, Tilt]
+    """Range of tilt_x, degrees: [lowest, highest]."""
     tilt_y_deg: tuple[Tilt, Tilt]
+    """Range of tilt_y, degrees: [lowest, highest]."""
     height_m: tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]]
+    """Range of the projection centre's height over the floor, metres: [lowest, highest]."""
     min_leds: Annotated[int, Field(ge=1, le=1000)] = 4
+    """Smallest number of LEDs whole in the image."""
     wall_distance_m: Annotated[float, Field(gt=0, le=100)] = 0.2
+    """Smallest distance of the camera from the walls, metres."""
     border_px: Annotated[float, Field(ge=0, le=10000)] = 20.0
-    """LEDs nearer than this to the image's border do not count."""
+    """LEDs nearer than this to the image's border do not count, pixels."""
 
     @model_validator(mode="after")
     def _ranges_go_up(self) -> Self:
@@ -46,19 +53,25 @@ class AimedPoses(Settings):
 
 
 class PoseEntry(Settings):
-    """One pose as given."""
+    """One pose of a list."""
 
     position_m: tuple[float, float, float]
+    """Projection centre, world, metres."""
     tilt_x_deg: Tilt = 0.0
+    """Tilt about the camera's x axis, degrees."""
     tilt_y_deg: Tilt = 0.0
+    """Tilt about the camera's y axis, degrees."""
     yaw_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
+    """Rotation about the vertical, degrees."""
 
 
 class ListedPoses(Settings):
-    """Poses as given, one a frame."""
+    """Poses in the order of a list."""
 
     kind: Literal["list"]
+    """How the poses are given."""
     pose: Annotated[tuple[PoseEntry, ...], Field(min_length=1)]
+    """The poses, in order."""
 
     @property
     def count(self) -> int:
@@ -67,16 +80,21 @@ class ListedPoses(Settings):
 
 
 class GridPoses(Settings):
-    """Level poses at one height, in the middles of columns (along x) times rows (along y) equal cells of the floor.
+    """Level poses at one height, at the centres of `columns` x `rows` equal cells of the floor.
 
-    Table 1 of Huynh & Yoo 2016 has 350 x 350 at 0 m. A camera has to be inside the room: take a small height.
+    Table 1 of Huynh & Yoo 2016 has 350 x 350 at 0 m. A camera must be inside the room: use a small height.
     """
 
     kind: Literal["grid"]
+    """How the poses are given."""
     columns: Annotated[int, Field(ge=1, le=10_000)]
+    """Number of poses along x."""
     rows: Annotated[int, Field(ge=1, le=10_000)]
+    """Number of poses along y."""
     height_m: Annotated[float, Field(gt=0)]
+    """Height of the projection centre over the floor, metres."""
     yaw_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
+    """Rotation about the vertical, degrees; the same in every pose."""
 
     @property
     def count(self) -> int:
@@ -89,9 +107,9 @@ Poses = Annotated[AnyPoses, Field(discriminator="kind")]
 
 
 def pose_of_frame(poses: AnyPoses, frame: int, seed: int, camera: Camera, scene: Scene) -> Pose:
-    """The pose of one frame; depends on nothing but its arguments. Raises InputError where none can be found."""
+    """The pose with this number; depends on nothing but the arguments. Raises InputError where no pose qualifies."""
     if isinstance(poses, GridPoses):
-        row, column = divmod(frame, poses.columns)  # x goes up fastest
+        row, column = divmod(frame, poses.columns)  # x varies fastest
         x_m, y_m, _ = scene.room_m
         place = (float((column + 0.5) * x_m / poses.columns), float((row + 0.5) * y_m / poses.rows), poses.height_m)
         return Pose(place, yaw_deg=poses.yaw_deg)

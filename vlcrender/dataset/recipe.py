@@ -1,4 +1,4 @@
-"""A recipe: all that a dataset is made from. TOML in, checked model and scene out."""
+"""Recipes: every setting of a dataset. TOML in, checked model and scene out."""
 
 import math
 from collections.abc import Iterable
@@ -31,51 +31,62 @@ class Recipe(Settings):
     """A recipe file."""
 
     format: Literal["vlcrender-recipe"]
+    """Marks the file as a recipe."""
     version: Literal[1]
+    """Version of the recipe format."""
     name: Annotated[str, Field(min_length=1, max_length=100)]
+    """Name of the dataset."""
     description: str = ""
+    """One line about the dataset."""
     scene: str
-    """Path of the scene file, from the recipe's folder."""
+    """Path of the scene file, relative to the recipe's folder."""
     seed: Annotated[int, Field(ge=0, lt=2**63)]
+    """Seed of every random number of the dataset."""
     exposure_s: Annotated[float, Field(gt=0, le=100)] | None = None
+    """Exposure time of every frame, seconds. Give either this or `exposure`."""
     exposure: Metering | None = None
-    """In place of `exposure_s`: how each frame's is chosen."""
+    """Automatic exposure: how the exposure time of each frame is chosen."""
     repeats: Annotated[int, Field(ge=1, le=1_000_000)] = 1
-    """Shots of each pose, one after another; they differ by noise alone."""
+    """Shots of each pose, one after another; they differ in noise alone."""
     expected: bool = False
     """Whether the noise-free images are written too."""
     processed: Processed | None = None
-    """Whether pictures as a phone makes them are written too, and how."""
+    """Settings of processed pictures, as a phone makes them; none are written where not given."""
     bound: bool = False
     """Whether each frame's Cramér-Rao bound is computed: some seconds for a full frame of many LEDs."""
     camera: Camera = Camera()
+    """The camera `main`, for which `poses` are given."""
     sensor: Sensor = Sensor()
+    """The sensor of every camera."""
     accelerometer: Accelerometer = TiltError()
+    """The accelerometer of the rig."""
     poses: Poses
+    """Poses of the camera `main`."""
     regions: LedRegions | None = None
-    """What is read out of the sensor; all of it where not given."""
+    """Regions of interest that are read out; the whole sensor where not given."""
     motion: Motion | None = None
+    """Motion of the rig during each exposure; at rest where not given."""
     rig: tuple[RigCamera, ...] = ()
-    """Cameras beside `main`, which is the one under `camera` and the one that `poses` are for."""
+    """Further cameras, mounted beside `main` and exposed at the same time."""
 
     @model_validator(mode="after")
     def _one_way_to_expose(self) -> Self:
         if (self.exposure_s is None) == (self.exposure is None):
-            raise ValueError("exposure_s: has to be given, or the table exposure in its place, and not both")
+            raise ValueError("exposure_s: give exactly one of exposure_s or [exposure]")
         if self.exposure is not None and self.motion is not None:
-            raise ValueError("exposure: cannot be chosen with motion, whose blur needs the time first; give exposure_s")
+            raise ValueError("exposure: [motion] needs a fixed time; replace [exposure] by exposure_s")
         return self
 
     @model_validator(mode="after")
     def _sensor_is_not_blind(self) -> Self:
         if not any(detector.quantum_efficiency(WAVELENGTHS_NM).any() for detector in detectors(self.sensor)):
-            raise ValueError("sensor.quantum_efficiency: is 0 from 380 to 780 nm, where all the light is")
+            raise ValueError("sensor.quantum_efficiency: is 0 from 380 to 780 nm, the range of all light sources")
         return self
 
     @model_validator(mode="after")
     def _processed_is_of_full_frames(self) -> Self:
         if self.processed is not None and self.regions is not None:
-            raise ValueError("processed: is made of full frames; leave windows out, or it")
+            raise ValueError("processed: [processed] needs full frames: remove [regions] or [processed]")
         return self
 
     @model_validator(mode="after")
@@ -83,17 +94,15 @@ class Recipe(Settings):
         names = [MAIN, *(entry.name for entry in self.rig)]
         for name in names:
             if names.count(name) > 1:
-                raise ValueError(
-                    f"rig: {name!r} is the name of more than one camera (the one under camera is {MAIN!r})"
-                )
+                raise ValueError(f"rig: {name!r} names more than one camera (the camera under [camera] is {MAIN!r})")
         return self
 
     @model_validator(mode="after")
     def _bounds_are_of_noisy_cameras_at_rest(self) -> Self:
         if self.bound and self.motion is not None:
-            raise ValueError("bound = true: is for cameras at rest; leave out [motion]")
+            raise ValueError("bound = true: needs a camera at rest; remove [motion]")
         if self.bound and self.sensor.noise == "none":
-            raise ValueError('bound = true: without noise there is none; sensor.noise must not be "none"')
+            raise ValueError('bound = true: needs noise; sensor.noise must not be "none"')
         return self
 
     @model_validator(mode="after")
@@ -101,8 +110,8 @@ class Recipe(Settings):
         bent = [c.name for c in self.cameras if not c.camera.lens_projection.extends_beyond_sensor]
         if self.regions is not None and self.regions.overscan and bent:
             raise ValueError(
-                f"regions.overscan = true: camera {bent[0]!r} has a distortion, which says nothing of what lies far "
-                "beyond the sensor; leave one of them out"
+                f"regions.overscan = true: camera {bent[0]!r} has a distortion, undefined far beyond the sensor; "
+                "remove overscan or the distortion"
             )
         return self
 
@@ -113,34 +122,34 @@ class Recipe(Settings):
 
     @property
     def frame_count(self) -> int:
-        """One frame for each camera, pose and repeat."""
+        """Number of frames: one for each pose, repeat and camera."""
         return self.poses.count * self.repeats * len(self.cameras)
 
     def time_s(self, view: ExpectedImage) -> float:
-        """Exposure time of a view, seconds."""
+        """Exposure time of an expected image, seconds."""
         if self.exposure is not None:
             return self.exposure.time_s(view, self.sensor.saturation_e)
         assert self.exposure_s is not None  # _one_way_to_expose
         return self.exposure_s
 
     def place_of_frame(self, frame: int) -> tuple[int, int, int]:
-        """Pose, shot and camera of a frame, each counted from 0; frames of one shot, then of one pose, are together."""
+        """Pose, shot and camera of a frame, each counted from 0. The camera varies fastest, the pose slowest."""
         shot, which = divmod(frame, len(self.cameras))
         return shot // self.repeats, shot, which
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A checked recipe with its scene."""
+    """A resolved recipe with its scene."""
 
     recipe: Recipe
     scene: Scene
 
 
 def load_plan(path: Path, assignments: Iterable[str] = (), scale: int = 1, scale_mode: ScaleMode = "binned") -> Plan:
-    """Read a recipe, put in presets and `key=value` assignments, apply `scaled`, and read its scene.
+    """Read a recipe, insert presets and `key=value` assignments, apply `scaled`, and read the scene.
 
-    Raises InputError naming file, key and value.
+    Raises InputError that names file, key and value.
     """
     assignments = list(assignments)
     source = f"{path} with --set" if assignments else str(path)
@@ -148,26 +157,25 @@ def load_plan(path: Path, assignments: Iterable[str] = (), scale: int = 1, scale
     keys = {assignment.partition("=")[0].partition(".")[0].strip() for assignment in assignments}
     for way, other in (("exposure", "exposure_s"), ("exposure_s", "exposure")):
         if way in keys and other not in keys:
-            tree.pop(other, None)  # one way to expose that is assigned replaces the recipe's other
+            tree.pop(other, None)  # the assigned way to expose replaces the recipe's
     recipe = check(with_presets(tree, assignments, source), Recipe, source)
     scene_path = Path(path.parent / recipe.scene)
     if not scene_path.is_file():
-        raise InputError(f"{source}: scene = {recipe.scene!r}: no such file from the recipe's folder")
+        raise InputError(f"{source}: scene = {recipe.scene!r}: no such file, relative to the recipe's folder")
     return Plan(scaled(recipe, scale, scale_mode), load_scene(scene_path))
 
 
 def scaled(recipe: Recipe, by: int, mode: ScaleMode) -> Recipe:
-    """The same recipe with `by` x `by` pixels made one, and all that is given in pixels divided by `by`.
+    """The recipe with `by` x `by` pixels binned into one, and every length in pixels divided by `by`.
 
     "binned" keeps all photons: full well and gain grow with the pixels' area, so that digital numbers keep their range
-    (`Sensor.binned`).
-    "same-photons" shortens the exposure by the pixels' area instead: as many photons in a pixel as before.
-    Raises InputError where `by` does not divide a sensor or the result is no recipe.
+    (`Sensor.binned`). "same-photons" divides the exposure time by the pixels' area: as many photons a pixel as before.
+    Raises InputError where `by` does not divide the size of a sensor or the result is not a valid recipe.
     """
     if by == 1:
         return recipe
     if by < 1:
-        raise InputError(f"--scale {by}: is not 1 or more")
+        raise InputError(f"--scale {by}: must be 1 or more")
     changes: dict[str, object] = {
         "camera": _scaled_camera(recipe.camera, by),
         "rig": tuple(
@@ -182,26 +190,27 @@ def scaled(recipe: Recipe, by: int, mode: ScaleMode) -> Recipe:
     if mode == "same-photons":
         if recipe.exposure_s is not None:
             changes["exposure_s"] = recipe.exposure_s / by**2
-        else:  # what is metered are electrons in a pixel
+        else:  # metering counts the electrons of a pixel, so the longest time alone needs scaling
             changes["exposure"] = recipe.exposure and recipe.exposure.model_copy(
-                update={"longest_s": recipe.exposure.max_s / by**2}
+                update={"max_s": recipe.exposure.max_s / by**2}
             )
     else:
         changes["sensor"] = recipe.sensor.binned(by)
-        if isinstance(
-            recipe.exposure, NoiseLevelMetering
-        ):  # of more electrons; a share of a full well scales by itself
+        # A pixel holds more electrons: a noise level falls; a share of saturation stays.
+        if isinstance(recipe.exposure, NoiseLevelMetering):
             level_db = recipe.exposure.level_db - 10 * math.log10(by**2)
             changes["exposure"] = recipe.exposure.model_copy(update={"level_db": level_db})
     return check(recipe.model_copy(update=changes).model_dump(mode="json"), Recipe, f"--scale {by}")
 
 
 def _scaled_camera(camera: Camera, by: int) -> Camera:
-    """u' = u / by and v' = v / by: focal length, principal point and skew in pixels shrink alike."""
+    """The camera with u' = u / by, v' = v / by: its focal length, principal point and skew in pixels shrink alike."""
     if camera.width_px % by or camera.height_px % by:
         raise InputError(f"--scale {by}: does not divide the camera's {camera.width_px} x {camera.height_px} pixels")
     if camera.psf_kernel is not None:
-        raise InputError(f"--scale {by}: camera.psf_kernel is measured in pixels of the full camera; leave out one")
+        raise InputError(
+            f"--scale {by}: camera.psf_kernel is given in pixels of the full camera; remove --scale or psf_kernel"
+        )
     point = camera.principal_point_px
     return camera.model_copy(
         update={

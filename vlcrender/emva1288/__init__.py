@@ -1,4 +1,4 @@
-"""EMVA 1288 data sheets: photon transfer measured on the sensor model's own frames.
+"""EMVA 1288 data sheets: photon transfer on simulated frames of a sensor.
 
-Measured values stand beside the configured ones, each with its tolerance.
+Each measured value is shown beside the set value, with its tolerance.
 """

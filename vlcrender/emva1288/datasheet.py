@@ -1,9 +1,8 @@
-"""A sensor's data sheet: what its simulated exposures measure, beside what was set.
+"""Data sheet of a sensor: values measured on its simulated exposures, beside the set values.
 
-The bench is the sensor's whole chain (`exposure.expose`) under light of one wavelength, even over all pixels;
-`photon_transfer` measures it as EMVA Standard 1288 has it and sees nothing but digital numbers. A measured value passes
-where it lies within SIGMAS standard errors of what was set. All numbers of frames come from keyed streams: a data sheet
-is the same each time it is made.
+The test bench runs the sensor's whole chain (`signal_chain.expose`) under light of one wavelength, uniform over the
+pixels. `photon_transfer` measures it by EMVA Standard 1288 from digital numbers alone. A measured value passes where it
+lies within SIGMAS standard errors of the set value. Random numbers are keyed: a data sheet is reproducible.
 """
 
 from collections.abc import Callable
@@ -34,7 +33,7 @@ from vlcrender.sensor.sensor import Sensor
 from vlcrender.sensor.signal_chain import expose
 
 SIGMAS = 4.0
-"""Of 15 values one is off by chance on one page in 1000."""
+"""Tolerance in standard errors: with 15 values, about one page in 1000 has a value off by chance."""
 
 
 class _SensorTable(Settings):
@@ -44,18 +43,18 @@ class _SensorTable(Settings):
 LABELS = {
     "K": ("system gain", "DN/e", "slope of variance over mean, up to 70 % of saturation"),
     "QE": ("quantum efficiency", "%", "slope of mean over photons, / K"),
-    "mu_y.dark": ("dark level", "DN", "mean of dark frames at no exposure time"),
-    "sigma_d": ("dark noise", "e", "dark variance at no exposure time, less rounding's 1/12, / K²"),
+    "mu_y.dark": ("dark level", "DN", "mean of dark frames at exposure time 0"),
+    "sigma_d": ("dark noise", "e", "dark variance at exposure time 0, minus 1/12 of rounding, / K²"),
     "mu_I": ("dark current", "e/s", "slope of the dark mean over time, / K"),
-    "T_d": ("doubles every", "°C", "dark current at three temperatures"),
+    "T_d": ("doubling temperature", "°C", "dark current at three temperatures"),
     "DSNU1288": ("dark nonuniformity", "e", "of rows, columns and pixels, in the mean of 64 dark frames"),
-    "DSNU1288.row": ("of rows", "e", "what rows differ by beyond their pixels"),
-    "DSNU1288.col": ("of columns", "e", "what columns differ by beyond their pixels"),
-    "PRNU1288": ("response nonuniformity", "%", "variance at half of saturation less that of DSNU, over the signal"),
-    "full well": ("largest signal", "e", "mean with twice the light of saturation, / K: well or converter full"),
-    "mu_e.sat": ("saturation capacity", "e", "QE times photons of the largest variance"),
+    "DSNU1288.row": ("of rows", "e", "deviation of rows beyond that of their pixels"),
+    "DSNU1288.col": ("of columns", "e", "deviation of columns beyond that of their pixels"),
+    "PRNU1288": ("response nonuniformity", "%", "variance at half of saturation minus DSNU's, over the signal"),
+    "full well": ("largest signal", "e", "mean at twice the light of saturation, / K: well or ADC full"),
+    "mu_e.sat": ("saturation capacity", "e", "QE times photons at the largest variance"),
     "SNR_max": ("largest signal to noise", "dB", "root of mu_e.sat"),
-    "DR": ("dynamic range", "dB", "photons at saturation over photons of a signal to noise of 1"),
+    "DR": ("dynamic range", "dB", "photons at saturation over photons at a signal to noise of 1"),
     "LE": ("linearity error", "%", "mean deviation from a line, 5 to 95 % of saturation"),
 }
 """Name, unit and definition of each row."""
@@ -63,7 +62,7 @@ LABELS = {
 
 @dataclass(frozen=True)
 class Row:
-    """A line of the data sheet. Where nothing is set, 0 is expected."""
+    """A row of the data sheet. A parameter that is not set has the value 0."""
 
     key: str
     name: str
@@ -71,29 +70,29 @@ class Row:
     definition: str
     set_value: float
     measured: float | None
-    """None where it cannot be told."""
+    """None where it cannot be measured."""
     tolerance: float | None
-    """SIGMAS standard errors; with nothing measured, what the value is known to be below."""
+    """SIGMAS standard errors; an upper bound of the value where it cannot be measured."""
     passed: bool | None
 
 
 @dataclass(frozen=True)
 class Datasheet:
-    """A data sheet with what its pictures need."""
+    """A data sheet and the measurement that its plots show."""
 
     title: str
     conditions: tuple[str, ...]
     sensor: Sensor
     efficiency: float
-    """Electrons a photon, as set."""
+    """Electrons per photon, as set."""
     measurement: Measurement
     rows: tuple[Row, ...]
 
 
 def load_sensor(text: str) -> tuple[str, Sensor]:
-    """The sensor that a word on the command line means, and its name: a preset, or a TOML file with a [sensor] table.
+    """Name and settings of a sensor given by a preset's name or by a TOML file with a [sensor] table.
 
-    Raises InputError for what is neither, and for values out of range.
+    Raises InputError for any other text, and for values out of range.
     """
     if text.endswith(".toml"):
         tree = with_presets({key: value for key, value in read_toml(Path(text)).items() if key in KINDS}, [], text)
@@ -104,7 +103,7 @@ def load_sensor(text: str) -> tuple[str, Sensor]:
         try:
             tree = preset("sensors", text)
         except InputError as error:
-            raise InputError(f"{error}; or name a .toml file that has a [sensor] table") from None
+            raise InputError(f"{error}; or give a .toml file with a [sensor] table") from None
         name, source = text, f"preset {text}"
     return name, check({"sensor": tree["sensor"]}, _SensorTable, source).sensor
 
@@ -116,18 +115,18 @@ def make_datasheet(
     side_px: int = 512,
     progress: Callable[[int], None] = lambda frames: None,
 ) -> Datasheet:
-    """Measure a sensor with `side_px` x `side_px` pixels. `progress` is told how many frames have been taken.
+    """Measure a sensor of `side_px` x `side_px` pixels. `progress` is called with the number of frames taken.
 
-    Raises InputError for a sensor that cannot be measured: blind at this wavelength, noiseless, or never full.
+    Raises InputError for a sensor without response at this wavelength, without noise, or without saturation.
     """
     kinds = detectors(sensor)
     detector = kinds[0] if len(kinds) == 1 else kinds[COLOURS.index("green")]
     efficiency = float(detector.quantum_efficiency(np.array([wavelength_nm]))[0])
-    if not efficiency > 1e-6:
-        raise InputError(f"--wavelength-nm {wavelength_nm:g}: the sensor is blind there")
+    if not efficiency > 0:
+        raise InputError(f"--wavelength-nm {wavelength_nm:g}: quantum efficiency is 0 there")
     measured = measure(bench(sensor, efficiency, side_px, progress))
     conditions = (
-        f"light of {wavelength_nm:g} nm, even over the pixels" + (", all of them green" if len(kinds) > 1 else ""),
+        f"light of {wavelength_nm:g} nm, uniform over the pixels" + (", all of them green" if len(kinds) > 1 else ""),
         f"{sensor.temperature_c:g} °C, ISO {sensor.iso:g}, {sensor.bits} bits, noise = {sensor.noise}",
         f"{side_px} x {side_px} pixels, flat fields of {FLAT_EXPOSURE_S * 1000:g} ms",
     )
@@ -137,9 +136,9 @@ def make_datasheet(
 def bench(
     sensor: Sensor, efficiency: float, side_px: int, progress: Callable[[int], None] = lambda frames: None
 ) -> Shoot:
-    """A camera of this sensor under even light: each call is a new exposure with a stream of its own.
+    """A camera of this sensor under uniform light: each call is a new exposure with its own random numbers.
 
-    Another `serial` is another camera, on another day.
+    Fixed patterns and random numbers depend on the sensor's `serial`.
     """
     taken = 0
 
@@ -155,7 +154,7 @@ def bench(
 
 
 def compare(sensor: Sensor, efficiency: float, measured: Measurement) -> tuple[Row, ...]:
-    """Set against measured, a row for each of LABELS."""
+    """Rows of set and measured values, one for each of LABELS."""
     acting, gain = sensor.acting(), 1 / sensor.gain_at_iso_e_per_dn
     dark_e = sensor.dark_electrons(FLAT_EXPOSURE_S) if sensor.noise == "full" else 0.0
     dark_noise_e = float(np.hypot(acting["read_noise_e"], acting["adc_noise_dn"] / gain))
@@ -202,7 +201,7 @@ def _row(key: str, set_value: float, measured: Quantity | None) -> Row:
 
 
 def _root_row(key: str, set_value: float, square: Quantity) -> Row:
-    """For the root of what is measured: squares are compared, since near 0 they alone are normal."""
+    """A row for the root of a measured square. Squares are compared: near 0 their errors are normal, the roots' not."""
     doubt = SIGMAS * square.error
     tolerance = float(np.sqrt(set_value**2 + doubt)) - set_value
     passed = abs(square.value - set_value**2) <= doubt
@@ -210,23 +209,23 @@ def _root_row(key: str, set_value: float, square: Quantity) -> Row:
 
 
 def _hidden_row(key: str, set_value: float, measured: Measurement) -> Row:
-    """Dark noise behind rounding may be anything up to what rounding makes of none."""
+    """Dark noise that rounding hides: bounded by the largest variance of rounded numbers without noise."""
     most = float(np.sqrt(UNDITHERED_DN2)) / measured.gain.value
     return Row(key, *LABELS[key], set_value, None, most, set_value <= most)
 
 
 def _linearity_row(measured: Measurement) -> Row:
-    """The chain is linear: what is found has to be noise's."""
+    """The chain is linear: the linearity error must be that of noise."""
     most = measured.linearity_noise + SIGMAS * measured.linearity_error.error
     found = measured.linearity_error.value
     return Row("LE", *LABELS["LE"], 0.0, found * 100, most * 100, found <= most)
 
 
 def cells(row: Row) -> tuple[str, str, str, str]:
-    """Set, measured, tolerance and verdict of a row in words, to the tolerance's second digit."""
+    """Set value, measured value, tolerance and verdict of a row as text, to the second digit of the tolerance."""
     digits = 3 if not row.tolerance else max(0, 1 - int(np.floor(np.log10(row.tolerance))))
     set_text = f"{row.set_value:.{digits}f}" if row.set_value else "none set"
-    verdict = "cannot be told" if row.passed is None else "pass" if row.passed else "OFF"
+    verdict = "not measurable" if row.passed is None else "pass" if row.passed else "OFF"
     if row.measured is None:
         return set_text, "" if row.tolerance is None else f"< {row.tolerance:.{digits}f}", "", verdict
     return set_text, f"{row.measured:.{digits}f}", f"{row.tolerance:.{digits}f}", verdict

@@ -1,4 +1,4 @@
-"""A data sheet as one HTML page with its plots; it needs no other file and no network."""
+"""HTML page of a data sheet with its plots: one file, no network."""
 
 from collections.abc import Callable, Sequence
 from html import escape
@@ -44,7 +44,7 @@ svg .limit { stroke: #009e73; stroke-dasharray: 5 4; } .key.limit { background: 
 
 
 def page(sheet: Datasheet) -> str:
-    """The whole page."""
+    """The HTML text of the page."""
     conditions = " · ".join(escape(condition) for condition in sheet.conditions)
     return f"""<!doctype html>
 <html lang="en">
@@ -57,16 +57,16 @@ def page(sheet: Datasheet) -> str:
 <body>
 <h1>Data sheet of the sensor {escape(sheet.title)}</h1>
 <p>{conditions}</p>
-<p>Measured from digital numbers as EMVA Standard 1288, Release 4.0 Linear, has it. A value passes where it is within
-four standard errors, the tolerance, of what was set.</p>
+<p>Measured from digital numbers by EMVA Standard 1288, Release 4.0 Linear. A value passes where it lies within the
+tolerance, four standard errors, of the set value.</p>
 <h2>Set and measured</h2>
 <div class="card">{_table(sheet)}</div>
 <h2>Photon transfer</h2>
-<div class="card"><p>Temporal variance over the dark against mean over the dark.
+<div class="card"><p>Temporal variance minus dark variance, against mean minus dark mean.
 {_legend("measured", "set: K times the signal", "saturation")}</p>{_photon_transfer(sheet)}</div>
 <h2>Signal to noise</h2>
-<div class="card"><p>Mean over the dark, over its temporal noise, against photons a pixel.
-{_legend("measured", "set", "as good as light allows")}</p>{_signal_to_noise(sheet)}</div>
+<div class="card"><p>Mean minus dark mean, divided by its temporal noise, against photons per pixel.
+{_legend("measured", "set", "limit of photon noise")}</p>{_signal_to_noise(sheet)}</div>
 </body>
 </html>
 """
@@ -139,7 +139,7 @@ def _signal_to_noise(sheet: Datasheet) -> str:
     set_ratios = electrons / np.sqrt(electrons + dark_e2)
     shown = set_ratios >= 0.1
     parts = [
-        *_axes(decades_x, decades_y, place, "photons a pixel", "signal to noise"),
+        *_axes(decades_x, decades_y, place, "photons per pixel", "signal to noise"),
         _path(*place(curve, np.sqrt(curve)), "limit"),
         _path(*place(curve[shown], set_ratios[shown]), "set"),
         *_dots(*place(photons, ratios)),
@@ -148,7 +148,7 @@ def _signal_to_noise(sheet: Datasheet) -> str:
 
 
 def _steps(end: float) -> Array:
-    """Round numbers from 0 to `end`, five to ten of them."""
+    """Five to ten round numbers from 0 to `end`."""
     power = 10.0 ** np.floor(np.log10(end / 5))
     step = power * max(factor for factor in (1, 2, 5) if factor * power <= end / 5)
     return np.arange(0.0, end, step)
@@ -157,7 +157,7 @@ def _steps(end: float) -> Array:
 def _axes(
     xs: Array, ys: Array, place: Callable[[Array, Array], tuple[Array, Array]], x_name: str, y_name: str
 ) -> list[str]:
-    """Rules and numbers at the values `xs` and `ys`, which begin at the corner."""
+    """Grid lines and numbers at the values `xs` and `ys`; both start at the origin of the plot."""
     parts = []
     across, floor = place(xs, np.full(len(xs), ys[0]))
     for u, v, value in zip(across, floor, xs, strict=True):

@@ -1,14 +1,14 @@
-"""Photon transfer: what a camera is, from its digital numbers alone, as EMVA Standard 1288 measures it.
+"""Photon transfer: parameters of a camera from its digital numbers alone, as in EMVA Standard 1288.
 
-A camera here is a function that takes an exposure. Nothing else is known of it than how long the exposure was, how many
-photons fell on each pixel, and how much warmer than usual the camera was. Definitions: EMVA Standard 1288, Release 4.0
+A camera is a function that takes an exposure. Known are the exposure time, the photons on each pixel, and the
+temperature rise of the camera. Definitions: EMVA Standard 1288, Release 4.0
 Linear (2021), linear photon response and signal-independent dark noise:
 
     mu_y = mu_y.dark + K eta mu_p        sigma_y^2 = sigma_y.dark^2 + K (mu_y - mu_y.dark)
     sigma_y.dark^2 = K^2 sigma_d^2 + 1/12        mu_d = mu_d0 + mu_I t
 
-Standard errors are those of the values measured, from their number: a variance of n numbers has the variance
-2 s^4 / n + k4 / n with k4 the fourth cumulant, for which that of Poisson electrons is taken, K^3 times the signal.
+Standard errors follow from the number of values: a variance of n values has the variance 2 s^4 / n + k4 / n. The fourth
+cumulant k4 is taken from Poisson electrons: K^3 times the signal.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,23 +23,23 @@ from vlcrender.sensor.nonuniformity import UNSEEN_DN2, Patterns, patterns
 
 Array = NDArray[np.float64]
 Shoot = Callable[[float, float, float], NDArray[np.uint32]]
-"""(photons a pixel, exposure_s, degrees warmer than usual) -> digital numbers of a new exposure, (rows, columns)."""
+"""(photons per pixel, exposure_s, temperature rise in deg C) -> digital numbers of a new exposure, (rows, columns)."""
 
 FLAT_EXPOSURE_S = 0.01
-"""Of all flat fields and their dark frames: the light is varied, the time is not."""
+"""Exposure time of all flat fields and their dark frames: the light varies, the time does not."""
 LEVELS = 50
-"""Of light, evenly up to where the noise collapses; the standard asks for 50 at least."""
+"""Number of light levels, evenly spaced up to where the noise collapses; the standard requires 50."""
 STACK = 64
-"""Frames averaged for the fixed patterns."""
+"""Number of frames averaged for the fixed patterns."""
 DARK_TIMES = 6
-"""Exposure times of a series of dark frames; the standard asks for 6 at least."""
+"""Number of exposure times in a series of dark frames; the standard requires 6."""
 MAX_DARK_S = 100.0
 WARMER_C = (0.0, 10.0, 20.0)
 MAX_PHOTONS = 1e9
 ROUNDING_DN2 = 1 / 12
 """Variance of rounding where noise is about half a digital number or more."""
 UNDITHERED_DN2 = 0.25
-"""The most variance that rounding makes of next to no noise: up to here a variance says nothing of the camera.
+"""Largest variance of rounded numbers without noise: a variance up to this tells nothing about the camera.
 
 The standard's limit for sigma_y.dark^2 is 0.24.
 """
@@ -47,7 +47,7 @@ The standard's limit for sigma_y.dark^2 is 0.24.
 
 @dataclass(frozen=True)
 class Point:
-    """Two exposures alike: mean and temporal variance of their digital numbers."""
+    """Two identical exposures: mean and temporal variance of their digital numbers."""
 
     photons: float
     exposure_s: float
@@ -57,20 +57,21 @@ class Point:
 
     @property
     def mean(self) -> Quantity:
-        """The mean. Fixed patterns are no part of its error: they are the same in every mean."""
+        """The mean. Its error excludes fixed patterns: they are the same in every mean."""
         sampling = max(self.variance_dn2, ROUNDING_DN2) / (2 * self.pixels)
         return Quantity(self.mean_dn, float(np.hypot(np.sqrt(sampling), self._rounding_errors()[0])))
 
     def variance(self, fourth_cumulant_dn4: float = 0.0) -> Quantity:
-        """The variance: half of that of differences of variance 2 s^2 and fourth cumulant 2 k4."""
+        """The variance: half that of differences, which have the variance 2 s^2 and the fourth cumulant 2 k4."""
         sampling = (2 * max(self.variance_dn2, ROUNDING_DN2) ** 2 + fourth_cumulant_dn4 / 2) / self.pixels
         return Quantity(self.variance_dn2, float(np.hypot(np.sqrt(sampling), self._rounding_errors()[1])))
 
     def _rounding_errors(self) -> tuple[float, float]:
-        """How rounding may move mean and variance from m and s^2 + 1/12.
+        """Standard errors of mean and variance by rounding, from m and s^2 + 1/12.
 
-        Of normal noise: by exp(-2 pi^2 s^2) times 1 / pi, and times 4 s^2 + 1 / pi^2, at most (Sheppard's corrections,
-        first terms); with next to no noise by 1/2 and 1/4. Within such limits evenly spread: over the root of 3.
+        With normal noise the errors are at most exp(-2 pi^2 s^2) times 1 / pi and times 4 s^2 + 1 / pi^2 (Sheppard's
+        corrections, first terms); without noise at most 1/2 and 1/4. They are uniform within these limits, hence the
+        root of 3.
         """
         if self.variance_dn2 <= UNDITHERED_DN2:
             return 0.5 / 3**0.5, 0.25 / 3**0.5
@@ -81,63 +82,63 @@ class Point:
 
 @dataclass(frozen=True)
 class Measurement:
-    """All that is measured."""
+    """The measured parameters of a camera."""
 
     dark: Point
     """At FLAT_EXPOSURE_S."""
     points: tuple[Point, ...]
-    """From the least to the most light."""
+    """Flat fields in order of increasing light."""
     faint: tuple[Point, ...]
-    """Of light that doubles, from one photon on."""
+    """Flat fields of doubling light, from one photon per pixel."""
     saturation_index: int
-    """Of the point with the largest variance."""
+    """Index of the point with the largest variance."""
     gain: Quantity
-    """K, DN an electron."""
+    """K, DN per electron."""
     quantum_efficiency: Quantity
     dark_level_dn: Quantity
-    """mu_y.dark of no exposure time; its error is also that of the patterns' mean."""
+    """mu_y.dark at exposure time 0; the error includes the error of the pattern's mean."""
     dark_variance_dn2: Quantity
-    """sigma_y.dark^2, without the dark current's."""
+    """sigma_y.dark^2 without the noise of the dark current."""
     dark_current_e_s: Quantity
     doubling_c: Quantity | None
-    """Degrees that double the dark current; None where it is too small to tell."""
+    """Temperature rise that doubles the dark current, deg C; None where the dark current is too small."""
     dark_patterns: Patterns
     bright_patterns: Patterns
-    """At half of saturation."""
+    """Patterns at half of saturation."""
     full_well_e: Quantity
-    """Electrons that a pixel tells from more: beyond, the well or the converter is full."""
+    """Mean electrons of a saturated pixel: the well or the ADC is full."""
     linearity_error: Quantity
     linearity_noise: float
-    """The linearity error that noise alone gives on average."""
+    """Mean linearity error of a linear camera with this noise."""
 
     @property
     def signals_dn(self) -> Array:
-        """Mean over the dark mean of each point."""
+        """Mean of each point minus the dark mean."""
         return np.array([p.mean_dn for p in self.points]) - self.dark.mean_dn
 
     @property
     def saturation_photons(self) -> float:
-        """mu_p.sat: photons where the variance is largest."""
+        """mu_p.sat: photons per pixel at the largest variance."""
         return self.points[self.saturation_index].photons
 
     @property
     def dark_noise_e2(self) -> Quantity:
-        """sigma_d^2, the temporal variance in the dark without dark current and rounding."""
+        """sigma_d^2: temporal variance in the dark without dark current and rounding."""
         noise = self.dark_variance_dn2.plus(Quantity(-ROUNDING_DN2 if self.dark_variance_dn2.value else 0.0, 0.0))
         return noise.over(self.gain).over(self.gain)
 
     @property
     def least_photons(self) -> Quantity:
-        """mu_p.min = (sqrt(sigma_y.dark^2 / K^2 + 1/4) + 1/2) / eta: where the signal is as large as its noise."""
+        """mu_p.min = (sqrt(sigma_y.dark^2 / K^2 + 1/4) + 1/2) / eta: photons at a signal-to-noise ratio of 1."""
         noise_e2 = self.dark_variance_dn2.over(self.gain).over(self.gain)
         root = float(np.sqrt(noise_e2.value + 0.25))
         return Quantity(root + 0.5, noise_e2.error / (2 * root)).over(self.quantum_efficiency)
 
 
 def measure(shoot: Shoot) -> Measurement:
-    """Take flat and dark frames of a camera and measure it.
+    """Take flat and dark frames of a camera and measure its parameters.
 
-    Raises InputError where it shows no noise to go by, or does not saturate at MOST_PHOTONS.
+    Raises InputError where the camera has no noise, or does not saturate at MAX_PHOTONS.
     """
     dark = take_pair(shoot, 0.0)
     most, way = collapse(shoot, dark)
@@ -175,7 +176,7 @@ def measure(shoot: Shoot) -> Measurement:
 
 
 def take_pair(shoot: Shoot, photons: float, exposure_s: float = FLAT_EXPOSURE_S, warmer_c: float = 0.0) -> Point:
-    """Expose twice: mean, and sigma_y^2 = mean((A - B)^2)/2 - (mean A - mean B)^2/2, blind to fixed patterns."""
+    """Expose twice: mean, and sigma_y^2 = mean((A - B)^2)/2 - (mean A - mean B)^2/2, free of fixed patterns."""
     a, b = (shoot(photons, exposure_s, warmer_c).astype(np.float64) for _ in range(2))
     difference = a - b
     variance = float(np.mean(difference**2) / 2 - np.mean(difference) ** 2 / 2)
@@ -183,21 +184,21 @@ def take_pair(shoot: Shoot, photons: float, exposure_s: float = FLAT_EXPOSURE_S,
 
 
 def collapse(shoot: Shoot, dark: Point) -> tuple[float, tuple[Point, ...]]:
-    """Photons a pixel at which the variance is down to half of its largest, the camera full; and the way there.
+    """Photons per pixel at which the variance falls to half of its maximum, and the flat fields measured up to there.
 
-    The way is of doubling light, from one photon on, until the signal does not keep up. Raises InputError where it
-    always does, up to MOST_PHOTONS, and where there is no variance.
+    The flat fields have doubling light, from one photon per pixel until the signal stops growing in proportion. Raises
+    InputError where the signal grows up to MAX_PHOTONS, and where there is no variance.
     """
     way = [take_pair(shoot, 1.0)]
     signal = previous = 0.0
-    while signal < 5 or signal > 1.5 * previous:  # the first numbers are rounding's
+    while signal < 5 or signal > 1.5 * previous:  # below 5 DN the signal is mostly rounding
         if way[-1].photons > MAX_PHOTONS:
-            raise InputError(f"the sensor does not saturate at up to {MAX_PHOTONS:g} photons a pixel")
+            raise InputError(f"the sensor does not saturate at up to {MAX_PHOTONS:g} photons per pixel")
         way.append(take_pair(shoot, 2 * way[-1].photons))
         signal, previous = (point.mean_dn - dark.mean_dn for point in (way[-1], way[-2]))
     largest = max(point.variance_dn2 for point in way)
     if not largest:
-        raise InputError("the sensor has no noise to be measured by")
+        raise InputError("photon transfer needs noise, and the sensor has none")
     low, high = way[-1].photons / 4, way[-1].photons
     for _ in range(9):
         middle = (low + high) / 2
@@ -208,20 +209,20 @@ def collapse(shoot: Shoot, dark: Point) -> tuple[float, tuple[Point, ...]]:
 
 
 def fit_gain(dark: Point, points: Sequence[Point]) -> Quantity:
-    """K: slope through the origin of variance against mean, both over the dark frames'."""
+    """K: slope through the origin of variance against mean, both minus the dark values."""
     x = np.array([p.mean_dn - dark.mean_dn for p in points])
     y = np.array([p.variance_dn2 - dark.variance_dn2 for p in points])
     slope = float(x @ y / (x @ x))
-    # an error of a mean acts as one of the variance of K times its size; the dark frames' are shared by all points
+    # an error of a mean acts as K times that error of the variance; all points share the error of the dark frames
     errors = [np.hypot(p.variance(slope**3 * s).error, slope * p.mean.error) for p, s in zip(points, x, strict=True)]
     shared = np.hypot(dark.variance().error, slope * dark.mean.error)
     return Quantity(slope, float(np.hypot(np.linalg.norm(x * errors), x.sum() * shared) / (x @ x)))
 
 
 def fit_responsivity(dark: Point, points: Sequence[Point], bright: Patterns) -> Quantity:
-    """R, DN a photon: slope through the origin of the mean over the dark against photons.
+    """R, DN per photon: slope through the origin of the mean, minus the dark mean, against photons.
 
-    The mean response of these pixels is off that of all by the nonuniformity over the root of their number.
+    The mean response of these pixels errs by the nonuniformity over the root of their number.
     """
     x = np.array([p.photons for p in points])
     y = np.array([p.mean_dn - dark.mean_dn for p in points])
@@ -233,7 +234,7 @@ def fit_responsivity(dark: Point, points: Sequence[Point], bright: Patterns) -> 
 
 
 def dark_series(shoot: Shoot, swing_dn: float, warmer_c: float) -> list[Point]:
-    """Dark pairs of times from 0 on, evenly up to where the dark signal is a tenth of `swing_dn`, or LONGEST_DARK_S."""
+    """Dark pairs at evenly spaced times from 0 to where the dark signal is a tenth of `swing_dn`, or to MAX_DARK_S."""
     start = float(shoot(0.0, 0.0, warmer_c).mean())
     longest = MAX_DARK_S / 2**14
     while longest < MAX_DARK_S and shoot(0.0, longest, warmer_c).mean() - start < 0.1 * swing_dn:
@@ -242,7 +243,7 @@ def dark_series(shoot: Shoot, swing_dn: float, warmer_c: float) -> list[Point]:
 
 
 def doubling(currents: Sequence[Quantity]) -> Quantity | None:
-    """Degrees that double the dark current, from those at WARMER_C; None where one is below 10 standard errors."""
+    """Temperature rise that doubles the dark current, from the currents at WARMER_C; None below 10 standard errors."""
     if any(current.value < 10 * current.error for current in currents):
         return None
     logs = [Quantity(float(np.log2(c.value)), c.error / c.value / float(np.log(2))) for c in currents]
@@ -250,10 +251,10 @@ def doubling(currents: Sequence[Quantity]) -> Quantity | None:
 
 
 def linearity(dark: Point, points: Sequence[Point]) -> tuple[Quantity, float]:
-    """LE: mean of |y / line - 1| over 5 to 95 % of the last point, the line fitted to least relative deviations.
+    """LE: mean of |y / line - 1| over 5 to 95 % of the last point; the line minimises the relative deviations.
 
-    Also the mean that noise alone gives: normal deviations of standard errors e_i average sqrt(2 / pi) e_i, with a
-    variance of (1 - 2 / pi) e_i^2 each, which is what the error is from.
+    Also the mean by noise alone: absolute normal deviations of standard errors e_i have the mean sqrt(2 / pi) e_i and
+    the variance (1 - 2 / pi) e_i^2, from which the error of LE follows.
     """
     swing = points[-1].mean_dn - dark.mean_dn
     used = [p for p in points if 0.05 * swing <= p.mean_dn - dark.mean_dn <= 0.95 * swing]

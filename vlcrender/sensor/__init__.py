@@ -1,4 +1,4 @@
-"""The sensor: radiometry, quantum efficiency and the EMVA 1288 signal chain; and the accelerometer beside it.
+"""Sensors: radiometry, quantum efficiency, the EMVA 1288 chain from electrons to digital numbers, accelerometers.
 
-Expected electrons in, digital numbers out.
+Every parameter is a key of a recipe's [sensor] or [accelerometer] table.
 """

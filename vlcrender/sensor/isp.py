@@ -1,7 +1,7 @@
-"""A phone's processed image: what its software makes of the raw numbers. To look at, and to see what it costs.
+"""Processed pictures: the image signal processing of a phone's software, for comparison with raw frames.
 
-Black level off, colours from the mosaic, white balance, a tone curve, 8 bits, JPEG. After it the noise is no longer
-that of the sensor: neighbours share it, and the curve makes it depend on the signal in another way.
+Black level subtraction, demosaicing, white balance, tone curve, 8 bits, JPEG. The noise no longer follows the sensor's
+law: demosaicing and JPEG correlate neighbouring pixels, and the curve changes how it depends on the signal.
 """
 
 from pathlib import Path
@@ -17,31 +17,33 @@ from vlcrender.sensor.sensor import Sensor
 
 
 class Processed(Settings):
-    """How the processed image is made."""
+    """Settings of the processed pictures."""
 
     curve: Literal["srgb", "gamma"] = "srgb"
-    """That of IEC 61966-2-1, or a power of 1 / `gamma`."""
+    """Tone curve: that of IEC 61966-2-1 (sRGB), or a power of 1 / `gamma`."""
     gamma: Annotated[float, Field(ge=1, le=5)] = 2.2
+    """Exponent of the "gamma" curve."""
     format: Literal["jpeg", "png"] = "jpeg"
+    """File format."""
     quality: Annotated[int, Field(ge=1, le=95)] = 90
-    """Of JPEG, as libjpeg counts it."""
+    """JPEG quality on libjpeg's scale."""
 
     @property
     def suffix(self) -> str:
-        """Of the file's name."""
+        """Suffix of the file names."""
         return {"jpeg": ".jpg", "png": ".png"}[self.format]
 
     def develop(
         self, image_dn: NDArray[np.uint32], sensor: Sensor, balance: tuple[float, float, float]
     ) -> NDArray[np.uint8]:
-        """The picture of a full frame (rows, columns): 8 bits, (rows, columns), with a mosaic (rows, columns, 3).
+        """The picture of a full frame (rows, columns): 8 bits, (rows, columns), or (rows, columns, 3) with a mosaic.
 
-        White is what the full well or the converter ends at. `balance`: what red, green and blue are multiplied by.
+        White is the sensor's `white_dn`. `balance` multiplies red, green and blue.
         """
         above_black = image_dn.astype(np.float64) - sensor.black_level_dn
         linear = above_black / (sensor.white_dn - sensor.black_level_dn)
         if sensor.mosaic != "none":
-            from colour_demosaicing import demosaicing_CFA_Bayer_Malvar2004  # takes seconds to load
+            from colour_demosaicing import demosaicing_CFA_Bayer_Malvar2004  # loads in seconds
 
             linear = np.asarray(demosaicing_CFA_Bayer_Malvar2004(linear, sensor.mosaic.upper())) * balance
         linear = np.clip(linear, 0.0, 1.0)
@@ -53,6 +55,6 @@ class Processed(Settings):
         return eight_bits
 
     def write(self, path: Path, picture: NDArray[np.uint8]) -> None:
-        """Write a picture that `develop` made."""
+        """Write a picture made by `develop`."""
         options = {"quality": self.quality} if self.format == "jpeg" else {}
         Picture.fromarray(picture).save(path, self.format.upper(), **options)

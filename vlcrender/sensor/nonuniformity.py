@@ -1,4 +1,4 @@
-"""Fixed patterns of a camera: what its exposures have in common, by rows, columns and pixels (EMVA 1288, section 8)."""
+"""Nonuniformity: variances of the fixed patterns of rows, columns and pixels (EMVA 1288, section 8)."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -9,22 +9,23 @@ from numpy.typing import NDArray
 from vlcrender.core.quantity import Quantity
 
 UNSEEN_DN2 = 0.011 / 3**0.5
-"""Where none of half a million numbers moves by rounding, their deviation is below 0.105 DN: 4.77 of it make half a DN.
+"""Standard error of a variance that rounding hides, DN^2.
 
-Its square, which may be anything from 0 on: over the root of 3.
+If none of half a million numbers changes by rounding, their standard deviation is below 0.105 DN: 4.77 standard
+deviations are half a DN. The variance is then uniform from 0 to 0.011 DN^2, hence the root of 3.
 """
 
 
 @dataclass(frozen=True)
 class Patterns:
-    """Variances of a pattern, DN^2, that of each row, column and pixel alone, with standard errors."""
+    """Variances of a fixed pattern, DN^2, separated into rows, columns and pixels, with standard errors."""
 
     mean_dn: float
     row: Quantity
     column: Quantity
     pixel: Quantity
     noise_dn2: float
-    """What temporal noise has left in a pixel of the mean of all frames; the others are without it."""
+    """Temporal noise left in a pixel of the mean of all frames; the variances exclude it."""
     shape: tuple[int, int]
 
     @property
@@ -34,7 +35,7 @@ class Patterns:
 
     @property
     def mean_error(self) -> float:
-        """By how much the patterns' own mean is off 0: it is one of so many rows, columns and pixels."""
+        """Standard error of the pattern's mean over a finite number of rows, columns and pixels."""
         parts = zip((self.row, self.column, self.pixel), (*self.shape, self.pixels), strict=True)
         return float(np.sqrt(sum(max(part.value, 0.0) / number for part, number in parts)))
 
@@ -45,10 +46,10 @@ class Patterns:
 
 
 def patterns(frames: Iterable[NDArray[np.uint32]]) -> Patterns:
-    """The patterns of exposures alike, two or more, each (rows, columns).
+    """The patterns of two or more identical exposures, each (rows, columns).
 
-    Of the mean of L frames: what pixels differ by beyond their row's and column's means has the variance
-    s^2_pixel + sigma^2 / L, rows' means s^2_row + (s^2_pixel + sigma^2 / L) / columns, columns' means alike.
+    In the mean of L frames, deviations of pixels from the means of their row and column have the variance
+    s^2_pixel + sigma^2 / L, means of rows s^2_row + (s^2_pixel + sigma^2 / L) / columns, and means of columns likewise.
     """
     count = 0
     total = squares = np.zeros((1, 1))
@@ -62,7 +63,7 @@ def patterns(frames: Iterable[NDArray[np.uint32]]) -> Patterns:
     by_row, by_column = mean.mean(axis=1, keepdims=True), mean.mean(axis=0, keepdims=True)
     of_rows, of_columns = _variance(by_row - everything, rows - 1), _variance(by_column - everything, columns - 1)
     pixels = _variance(mean - by_row - by_column + everything, (rows - 1) * (columns - 1))
-    # Where noise does not spread a pixel's numbers, up to this is left of rounding in the variance of pixels' means.
+    # Bound of the rounding error in the variance of the pixels' means, where noise does not dither the numbers.
     undithered = float(np.exp(-4 * np.pi**2 * noise * count)) / (2 * np.pi**2) if pixels.value else UNSEEN_DN2
     unseen = Quantity(0.0, 0.0 if pixels.value else UNSEEN_DN2)
     return Patterns(
@@ -76,7 +77,7 @@ def patterns(frames: Iterable[NDArray[np.uint32]]) -> Patterns:
 
 
 def _variance(deviations: NDArray[np.float64], freedom: int) -> Quantity:
-    """Of normal deviations with so many degrees of freedom."""
+    """Variance of normal deviations with this number of degrees of freedom."""
     variance = float(np.sum(deviations**2)) / freedom
     return Quantity(variance, variance * (2 / freedom) ** 0.5)
 
@@ -84,8 +85,8 @@ def _variance(deviations: NDArray[np.float64], freedom: int) -> Quantity:
 def response_variance(dark: Patterns, bright: Patterns) -> Quantity:
     """PRNU1288^2 = (s^2_bright - s^2_dark) / (mu_bright - mu_dark)^2.
 
-    The dark pattern B^2 is in both, but by chance not quite independent of the response's A^2, nor the noise N1^2 and
-    N0^2 of the two means of either: the difference has the variance
+    The dark pattern B^2 is in both means. In a finite sample it correlates with the response pattern A^2, and both
+    correlate with the noise N1^2 and N0^2 of the two means: the difference has the variance
     (2 A^4 + 4 A^2 B^2 + 4 (A^2 + B^2) N1^2 + 2 N1^4 + 4 B^2 N0^2 + 2 N0^4) / n.
     """
     difference = bright.total.value - dark.total.value

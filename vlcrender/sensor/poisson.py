@@ -1,7 +1,7 @@
-"""Poisson draws by counter: each pixel's number depends on the key, the pixel and its mean, and on nothing else.
+"""Counter-based Poisson draws: the count of a pixel depends on the key, the pixel and its mean, and on nothing else.
 
-So a window of a frame gets the draws that the whole frame would, in any order and on any number of threads. Means of 10
-and more: transformed rejection with squeeze (PTRS, W. Hoermann, Insurance: Mathematics and Economics 12 (1993) 39).
+A region therefore gets the draws of the whole frame, in any order and on any number of threads. Means of 10 and more:
+transformed rejection with squeeze (PTRS, W. Hoermann, Insurance: Mathematics and Economics 12 (1993) 39).
 Below: products of uniforms (Knuth). Uniforms: `philox`.
 """
 
@@ -14,16 +14,16 @@ from vlcrender.core.backend import dr, exact_math, mi
 from vlcrender.core.philox import PHILOX, kernel_seed, pixel_indices
 
 MAX_TURNS = 1000
-"""A turn takes a draw with a chance of 0.7 or more, so that none ever gets here; no kernel may run for ever."""
+"""Bound of the loop. A turn accepts with a probability of 0.7 or more, so no draw reaches it."""
 MAX_MEAN = 2.0**22
-"""Beyond it the float32 arithmetic of the kernel would show."""
+"""Beyond it the rounding of float32 in the kernel would bias the draws."""
 
 
 def poisson(means: NDArray[np.float32], key: str, row: int = 0, column: int = 0) -> NDArray[np.uint32]:
-    """Draw Poisson counts for a window of pixels.
+    """Poisson counts of a region of pixels, same shape as `means`.
 
-    means: (rows, columns), finite, 0 to LARGEST_MEAN; the window starts at pixel (row, column), which may be negative,
-    of the frame that `key` names. Raises ValueError for other means.
+    means: (rows, columns), 0 to MAX_MEAN. The region starts at pixel (row, column), which may be negative, of the frame
+    that `key` names. Raises ValueError for other means.
     """
     low, high = float(means.min()), float(means.max())
     if not 0 <= low <= high <= MAX_MEAN:
@@ -38,7 +38,7 @@ def poisson(means: NDArray[np.float32], key: str, row: int = 0, column: int = 0)
 
 @dr.syntax
 def draw(mean: Any, seed: Any, column: Any, row: Any) -> Any:
-    """Poisson counts as Float32, for a kernel: means 0 to LARGEST_MEAN, seed and places as `philox` has them."""
+    """Poisson counts as Float32, for a kernel: means 0 to MAX_MEAN, seed and places as `philox` has them."""
     large = mean >= 10.0
     mu = dr.maximum(mean, 10.0)
     b = 0.931 + 2.53 * dr.sqrt(mu)
@@ -52,7 +52,7 @@ def draw(mean: Any, seed: Any, column: Any, row: Any) -> Any:
     active = mi.Bool(True)
     while active:
         u = PHILOX(seed, column, row, turn, iterations=10).next_float32x4(active)
-        # PTRS takes one pair of uniforms a try; two tries a turn would waste more than they save.
+        # PTRS uses one pair of uniforms a try; two tries a turn take longer.
         centred = u[0] - 0.5
         edge = 0.5 - dr.abs(centred)
         tried = dr.floor((2.0 * a / edge + b) * centred + mu + 0.43)
@@ -74,7 +74,7 @@ def draw(mean: Any, seed: Any, column: Any, row: Any) -> Any:
 
 
 def _log_probability(k: Any, mu: Any) -> Any:
-    """log of mu^k exp(-mu) / k! by C. Loader's saddle point (2000): float32 holds it, and not the factors."""
+    """log of mu^k exp(-mu) / k! by C. Loader's saddle-point form (2000); the factors themselves overflow float32."""
     safe = dr.maximum(k, 1.0)
     inverse = 1.0 / safe
     squared = inverse * inverse

@@ -1,10 +1,10 @@
-"""From photometric units to photoelectrons: cd/m2 at the lens to electrons a second in a pixel.
+"""Radiometry: luminance in cd/m2 to photoelectrons a second in a pixel.
 
 Electrons in a pixel = (pi/4) (D/f_i)^2 cos^4(theta) A_pix t tau * integral of L_lambda QE(lambda) lambda/(h c) dlambda
 with D = f/N and f_i the image distance: D/f_i is one over the working f-number.
 
 Sources: spectra of white LEDs, CIE 15:2018 illuminants LED-B1 to LED-V2; luminous efficiency V(lambda), CIE 1924
-photopic observer; both as tabulated by the package colour-science. Silicon: `silicon_absorption_per_m`.
+photopic observer; both as tabulated by the package colour-science. Absorption of silicon: `silicon`.
 """
 
 from dataclasses import dataclass
@@ -18,71 +18,51 @@ from scipy import constants
 from vlcrender.camera.intrinsics import Camera
 from vlcrender.sensor.quantum_efficiency import COLOURS, QuantumEfficiency
 from vlcrender.sensor.sensor import Sensor
+from vlcrender.sensor.silicon import silicon_absorption_per_m
 
 WAVELENGTHS_NM: NDArray[np.float64] = np.arange(380.0, 781.0, 1.0)
 LUMINOUS_EFFICACY_LM_W = 683.0
-"""Rounded by every photometric table; 683.002 for V(lambda) in standard air."""
+"""The rounded value of photometric tables; 683.002 for V(lambda) in standard air."""
 
 
 class Detector(Protocol):
-    """What turns photons into electrons."""
+    """A quantum efficiency over wavelength."""
 
     def quantum_efficiency(self, wavelengths_nm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Electrons a photon, same shape as the wavelengths."""
+        """Electrons per photon, same shape as the wavelengths."""
 
 
 @dataclass(frozen=True)
 class Tabulated:
-    """A detector of which a table is known; one colour of it, or "values" where there is no mosaic."""
+    """A detector with a tabulated quantum efficiency: one colour of the table, or "values" without a mosaic."""
 
     table: QuantumEfficiency
     colour: str = "values"
 
     def quantum_efficiency(self, wavelengths_nm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Electrons a photon, same shape as the wavelengths."""
+        """Electrons per photon, same shape as the wavelengths."""
         return self.table.at(wavelengths_nm, self.colour)
 
 
 @dataclass(frozen=True)
 class Silicon:
-    """A back-illuminated silicon photodiode: what enters is absorbed in its active depth and collected whole."""
+    """A back-illuminated silicon photodiode at 300 K: every photon absorbed in the active depth gives an electron."""
 
     active_depth_um: float = 3.0
+    """Depth of the photodiode, micrometres."""
     surface_transmittance: float = 0.9
-    temperature_k: float = 300.0
+    """Share of the photons that enter the silicon."""
 
     def quantum_efficiency(self, wavelengths_nm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Electrons a photon, same shape as the wavelengths."""
-        absorbed = -np.expm1(
-            -silicon_absorption_per_m(wavelengths_nm, self.temperature_k) * self.active_depth_um * 1e-6
-        )
+        """Electrons per photon, same shape as the wavelengths."""
+        absorbed = -np.expm1(-silicon_absorption_per_m(wavelengths_nm) * self.active_depth_um * 1e-6)
         qe: NDArray[np.float64] = self.surface_transmittance * absorbed
         return qe
 
 
-def silicon_absorption_per_m(wavelengths_nm: NDArray[np.float64], temperature_k: float = 300.0) -> NDArray[np.float64]:
-    """Absorption coefficient of silicon in 1/m.
-
-    Source: Rajkanan, Singh & Shewchun, Absorption coefficient of silicon for solar cell calculations, Solid-State
-    Electronics 22 (1979) 793: two phonon-assisted indirect gaps and one direct gap.
-    """
-    kt_ev = constants.k * temperature_k / constants.e
-    shift = 7.021e-4 * temperature_k**2 / (temperature_k + 1108.0)
-    photon_ev = constants.h * constants.c / (wavelengths_nm * 1e-9) / constants.e
-    alpha_per_cm = np.zeros_like(photon_ev)
-    for gap_ev, a in ((1.1557 - shift, 3.231e2), (2.5 - shift, 7.237e3)):
-        for phonon_ev, c in ((1.827e-2, 5.5), (5.773e-2, 4.0)):
-            absorbing = np.maximum(photon_ev - gap_ev + phonon_ev, 0) ** 2 / np.expm1(phonon_ev / kt_ev)
-            emitting = np.maximum(photon_ev - gap_ev - phonon_ev, 0) ** 2 / -np.expm1(-phonon_ev / kt_ev)
-            alpha_per_cm = alpha_per_cm + c * a * (absorbing + emitting)
-    alpha_per_cm = alpha_per_cm + 1.052e6 * np.sqrt(np.maximum(photon_ev - (3.2 - shift), 0))
-    alpha_per_m: NDArray[np.float64] = alpha_per_cm * 100.0
-    return alpha_per_m
-
-
 @cache
 def _colour_science(kind: str, name: str) -> NDArray[np.float64]:
-    import colour  # takes a second to load, and only photometry needs it
+    import colour  # loads in a second
 
     table = {"illuminant": colour.SDS_ILLUMINANTS, "efficiency": colour.SDS_LEFS}[kind][name]
     values: NDArray[np.float64] = np.interp(WAVELENGTHS_NM, np.asarray(table.wavelengths), np.asarray(table.values))
@@ -100,14 +80,14 @@ def luminous_efficiency() -> NDArray[np.float64]:
 
 
 def spectral_radiance(luminance_cd_m2: float, spectrum: NDArray[np.float64]) -> NDArray[np.float64]:
-    """L_lambda in W/(m2 sr nm) at WAVELENGTHS_NM of a source of this luminance and relative spectrum."""
+    """L_lambda in W/(m2 sr nm) at WAVELENGTHS_NM of a source with this luminance and relative spectrum."""
     luminous = LUMINOUS_EFFICACY_LM_W * np.trapezoid(spectrum * luminous_efficiency(), WAVELENGTHS_NM)
     radiance: NDArray[np.float64] = luminance_cd_m2 * spectrum / luminous
     return radiance
 
 
 def detectors(sensor: Sensor) -> tuple[Detector, ...]:
-    """A sensor's one detector, or with a mosaic those under each of COLOURS."""
+    """The detector of a sensor, or with a mosaic the detectors of COLOURS in order."""
     table = sensor.quantum_efficiency
     if table == "silicon":
         return (Silicon(),)
@@ -115,7 +95,7 @@ def detectors(sensor: Sensor) -> tuple[Detector, ...]:
 
 
 def electron_rate_per_cd_m2(camera: Camera, spectrum_name: str, detector: Detector) -> float:
-    """Electrons a second in an on-axis pixel that sees 1 cd/m2. The image model of datasets/FORMAT.md's frames."""
+    """Electrons a second in a pixel on the optical axis, per cd/m2 of luminance."""
     watt_per_nm = spectral_radiance(1.0, relative_spectrum(spectrum_name))
     photon_j = constants.h * constants.c / (WAVELENGTHS_NM * 1e-9)
     electrons = np.trapezoid(watt_per_nm * detector.quantum_efficiency(WAVELENGTHS_NM) / photon_j, WAVELENGTHS_NM)

@@ -1,4 +1,4 @@
-"""Where a sensor is full, from its settings: what photon transfer should find."""
+"""Expected results of photon transfer at saturation, from the settings of a sensor."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,9 +10,9 @@ Array = NDArray[np.float64]
 
 
 def full_well_e(sensor: Sensor, dark_e: float) -> float:
-    """Electrons over the dark mean of `dark_e` at which a full pixel stands: the well's limit, or the converter's.
+    """Mean signal of a full pixel, electrons over the dark mean `dark_e`: limited by the well or by the ADC.
 
-    Where both are near each other, the converter clips the noise that is added after the well.
+    Where both limits are close, the ADC clips part of the noise that is added after the well.
     """
     acting, gain = sensor.acting(), sensor.gain_at_iso_e_per_dn
     parts = [acting["read_noise_e"], acting["adc_noise_dn"] * gain, acting["row_offset_e"], acting["column_offset_e"]]
@@ -22,11 +22,11 @@ def full_well_e(sensor: Sensor, dark_e: float) -> float:
 
 
 def saturation_e(sensor: Sensor, dark_e: float, levels_e: Array, pixels: int) -> tuple[float, float]:
-    """Signal, electrons, where the temporal variance is largest, and a standard error of finding it.
+    """Signal of the largest temporal variance, electrons, and the standard error of its measurement.
 
-    It is found as one of `levels_e`, evenly spaced, by variances of `pixels` pixels each, which have
-    a standard error of sqrt(2 / pixels): it may be any whose expected variance is as good as the largest within 4
-    standard errors of a difference, or a neighbour of the best. The farthest of them counts for 4 standard errors.
+    The measurement picks one of `levels_e`, evenly spaced, by variances over `pixels` pixels with a relative standard
+    error of sqrt(2 / pixels). It may pick any level whose expected variance is within 4 standard errors of a difference
+    from the largest, or a neighbour of the best. The farthest of these levels counts as 4 standard errors.
     """
     fine = np.linspace(0.5 * levels_e[-1], levels_e[-1], 2001)
     variances = _temporal_variance_e2(sensor, dark_e, fine)
@@ -37,9 +37,9 @@ def saturation_e(sensor: Sensor, dark_e: float, levels_e: Array, pixels: int) ->
 
 
 def _temporal_variance_e2(sensor: Sensor, dark_e: float, signal_e: Array) -> Array:
-    """Variance at mean signals, shape (n,), averaged over pixels of different response and offset (31 nodes).
+    """Variance at mean signals, shape (n,), averaged over the pixels' responses and offsets (31 nodes).
 
-    The well clips before read noise is added, the converter after.
+    The well clips before read noise is added, the ADC after.
     """
     acting, gain = sensor.acting(), sensor.gain_at_iso_e_per_dn
     after_e2 = acting["read_noise_e"] ** 2 + (acting["adc_noise_dn"] * gain) ** 2
@@ -55,12 +55,12 @@ def _temporal_variance_e2(sensor: Sensor, dark_e: float, signal_e: Array) -> Arr
 
 
 def _adc_e(sensor: Sensor) -> float:
-    """Electrons of the converter's largest number."""
+    """Electrons of the largest number of the ADC."""
     return (sensor.largest_dn - sensor.black_level_dn) * sensor.gain_at_iso_e_per_dn
 
 
 def clipped(mean: Array, deviation: Array, limit: float) -> tuple[Array, Array]:
-    """Mean and variance of normal numbers clipped at a limit.
+    """Mean and variance of normal variables clipped at a limit.
 
     With x standard normal and Q = 1 - Phi: E min(x, z) = z Q - phi and E min(x, z)^2 = Phi - z phi + z^2 Q.
     """

@@ -1,23 +1,23 @@
-"""The sensor: what of electrons becomes digital numbers. The EMVA 1288 camera, all in electrons up to the gain.
+"""The sensor: parameters of an EMVA 1288 camera, in electrons up to the gain, and its quantisation.
 
-The whole chain, in this order (`exposure.expose` runs it):
+The chain, in this order (`signal_chain.expose` runs it):
 
-1. mean photoelectrons of the pixel, `expected_e`
-2. PRNU scales that mean. It is a spread of quantum efficiency: were it to multiply the electrons drawn, a pixel of
-   response 1 + p would have variance (1 + p)^2 mu, and not the (1 + p) mu of a Poisson variable
-3. the mean of the dark current's electrons is added: those of the exposure's time at the sensor's temperature
+1. mean photoelectrons of each pixel, `expected_e`
+2. PRNU scales the mean. It is a spread of quantum efficiency: a pixel of response 1 + p has the Poisson variance
+   (1 + p) mu; multiplying the drawn electrons would give (1 + p)^2 mu
+3. dark current adds its mean electrons for the exposure time at the sensor's temperature
 4. one Poisson draw: the shot noise of light and dark current together
 5. DSNU, a fixed pattern, is added
-6. the full well clips: what a photodiode cannot hold is lost before anything is read
-7. read noise, and the fixed offsets of row and column, are added
-8. the gain divides; the converter's own noise is added, in digital numbers
-9. the number is rounded (not truncated), the black level added, and the sum clipped to 0 and the converter's largest
+6. the full well clips, before anything is read out
+7. read noise and the fixed offsets of row and column are added
+8. the gain divides; ADC noise is added, in digital numbers
+9. the number is rounded (not truncated), the black level is added, and the sum is clipped to 0 and the largest number
 
-`noise = "shot"`, the default, has of all noise the draw alone (1, 4, 6, 8, 9): at 1 e/DN the difference of two
-exposures is exactly Skellam. `noise = "none"` has not even that.
+`noise = "shot"`, the default, has the Poisson draw as its only noise (steps 1, 4, 6, 8, 9): at 1 e/DN the difference of
+two exposures is exactly Skellam. `noise = "none"` has no draw either.
 
-Source: EMVA Standard 1288, Release 4.0 Linear (2021), sections 2 and 3, whose noise model is this one but for the split
-of sigma_d into read and converter noise, and for row and column offsets, which 4.0 splits off DSNU.
+Source: EMVA Standard 1288, Release 4.0 Linear (2021), sections 2 and 3. Differences: sigma_d is split into read and ADC
+noise, and rows and columns have offsets, which Release 4.0 separates from DSNU.
 """
 
 from typing import Annotated, Any, Literal, Self
@@ -37,48 +37,60 @@ Iso = Annotated[float, Field(ge=1, le=1e7)]
 
 
 MAX_WELL_E = 2.0**22
-"""What `poisson` draws at most: beyond it the float32 arithmetic of the kernels would show."""
+"""Largest mean of `poisson`: beyond it the rounding of float32 in the kernels would bias the draws."""
 SPREADS = ("prnu", "dsnu_e", "read_noise_e", "adc_noise_dn", "row_offset_e", "column_offset_e")
-"""Keys of standard deviations."""
+"""Keys that are standard deviations."""
 
 
 class Sensor(Settings):
-    """A sensor. The keys from `prnu` to `serial` act with `noise = "full"` only."""
+    """A sensor. The keys from `prnu` to `serial` have an effect with `noise = "full"` only."""
 
     bits: Literal[8, 10, 12, 14] = 12
+    """Bits of the ADC: digital numbers run from 0 to 2^bits - 1."""
     gain_e_per_dn: Annotated[float, Field(gt=0, le=1e6)] = 1.0
-    """At `base_iso`."""
+    """Electrons per digital number at `base_iso`: 1 / K of EMVA 1288."""
     iso: Iso = 100.0
+    """ISO of the frames. Electrons per digital number fall in proportion: half as many at twice the ISO."""
     base_iso: Iso = 100.0
-    """What gain and converter noise are given for: at twice this ISO a digital number is half as many electrons."""
+    """ISO at which `gain_e_per_dn` is given."""
     full_well_e: Annotated[float, Field(gt=0, le=MAX_WELL_E)] = 6000.0
+    """Electrons that a pixel holds; more are lost."""
     black_level_dn: Annotated[int, Field(ge=0, le=16382)] = 0
+    """Digital number of a pixel without signal; below the largest number."""
     noise: Literal["shot", "none", "full"] = "shot"
+    """"shot": photon noise alone. "full": the whole chain. "none": rounded means."""
     prnu: Annotated[float, Field(ge=0, le=0.5)] = 0.0
-    """Standard deviation of the pixels' response over its mean."""
+    """Photoresponse nonuniformity: standard deviation of the pixels' response over its mean. Fixed pattern."""
     dark_current_e_s: Annotated[float, Field(ge=0, le=1e9)] = 0.0
-    """At `reference_temperature_c`."""
+    """Dark current at `reference_temperature_c`, electrons a second in each pixel."""
     reference_temperature_c: Celsius = 25.0
+    """Temperature at which `dark_current_e_s` is given, deg C."""
     dark_current_doubling_c: Annotated[float, Field(ge=1, le=100)] = 6.0
-    """So many degrees more double the dark current."""
+    """Temperature rise that doubles the dark current, deg C."""
     temperature_c: Celsius = 25.0
+    """Temperature of the sensor during the frames, deg C."""
     dsnu_e: Spread = 0.0
+    """Dark signal nonuniformity: standard deviation of the pixels' offsets, electrons. Fixed pattern."""
     read_noise_e: Spread = 0.0
+    """Standard deviation of the noise before the gain, electrons; new in each frame and pixel."""
     adc_noise_dn: Spread = 0.0
-    """After the gain, so that in electrons it falls with ISO."""
+    """Standard deviation of the noise after the gain, digital numbers; new in each frame and pixel."""
     row_offset_e: Spread = 0.0
+    """Standard deviation of the offsets that whole rows share, electrons. Fixed pattern."""
     column_offset_e: Spread = 0.0
+    """Standard deviation of the offsets that whole columns share, electrons. Fixed pattern."""
     serial: Annotated[int, Field(ge=0, lt=2**63)] = 0
-    """Which individual: the fixed patterns (PRNU, DSNU, offsets) are its own, the same in every frame."""
+    """Number of the individual sensor: its fixed patterns derive from it and are the same in every frame."""
     mosaic: Literal["none", "rggb", "bggr", "grbg", "gbrg"] = "none"
-    """Colours of the pixels (0, 0), (0, 1), (1, 0), (1, 1) as (row, column), and so on everywhere."""
+    """Colours of the pixels (0, 0), (0, 1), (1, 0), (1, 1) as (row, column), repeated over the sensor."""
     quantum_efficiency: SiliconOrTable = "silicon"
+    """Electrons per photon over wavelength: "silicon" (a 3 um deep photodiode), or a table of measured values."""
 
     @model_validator(mode="after")
     def _black_level_leaves_room(self) -> Self:
         if self.black_level_dn >= self.largest_dn:
             raise ValueError(
-                f"black_level_dn = {self.black_level_dn}: has to be below {self.largest_dn}, the largest number "
+                f"black_level_dn = {self.black_level_dn}: must be below {self.largest_dn}, the largest number "
                 f"of {self.bits} bits"
             )
         return self
@@ -88,7 +100,7 @@ class Sensor(Settings):
         noise_e = float(np.hypot(self.dark_noise_e, self.dsnu_e))
         if self.full_well_e <= noise_e:
             raise ValueError(
-                f"full_well_e = {self.full_well_e:g}: has to exceed the noise of {noise_e:.4g} e in the dark "
+                f"full_well_e = {self.full_well_e:g}: must exceed the noise of {noise_e:.4g} e in the dark "
                 "(read_noise_e, adc_noise_dn and dsnu_e together)"
             )
         return self
@@ -98,47 +110,47 @@ class Sensor(Settings):
         coloured = self.quantum_efficiency != "silicon" and self.quantum_efficiency.coloured
         if (self.mosaic != "none") != coloured:
             raise ValueError(
-                f'mosaic = "{self.mosaic}": quantum_efficiency needs red, green and blue with a mosaic, and only then'
+                f'mosaic = "{self.mosaic}": give quantum_efficiency red, green and blue with a mosaic, values without'
             )
         return self
 
     @property
     def largest_dn(self) -> int:
-        """The digital number at which the converter saturates."""
+        """Largest number of the ADC."""
         return int(2**self.bits - 1)
 
     @property
     def white_dn(self) -> int:
-        """The digital number of a full well, or the converter's largest where that is less."""
+        """Digital number of a full well, or the largest number of the ADC where that is less."""
         return min(self.largest_dn, round(self.full_well_e / self.gain_at_iso_e_per_dn) + self.black_level_dn)
 
     @property
     def saturation_e(self) -> float:
-        """Electrons at which a pixel saturates: the full well, or the converter's end where that comes first."""
+        """Electrons at which a pixel saturates: the full well, or the upper limit of the ADC where that is less."""
         return min(self.full_well_e, (self.largest_dn - self.black_level_dn) * self.gain_at_iso_e_per_dn)
 
     @property
     def gain_at_iso_e_per_dn(self) -> float:
-        """Electrons a digital number at the sensor's ISO: 1 / K of EMVA 1288."""
+        """Electrons per digital number at the ISO of the frames: 1 / K of EMVA 1288."""
         return self.gain_e_per_dn * (self.base_iso / self.iso)
 
     @property
     def dark_noise_e(self) -> float:
         """Temporal noise of a pixel in the dark without dark current, electrons: sigma_d of EMVA 1288.
 
-        Read noise and the converter's, both normal and of every frame anew; rounding (1/12 DN^2) not counted.
+        Read and ADC noise, both normal and new in each frame; without the 1/12 DN^2 of rounding.
         """
         return float(np.hypot(self.read_noise_e, self.adc_noise_dn * self.gain_at_iso_e_per_dn))
 
     def dark_electrons(self, exposure_s: float) -> float:
-        """Mean electrons of the dark current: doubles every `dark_current_doubling_c` (EMVA 1288, 2.6)."""
+        """Mean electrons of the dark current; double every `dark_current_doubling_c` (EMVA 1288, 2.6)."""
         doublings = (self.temperature_c - self.reference_temperature_c) / self.dark_current_doubling_c
         return float(self.dark_current_e_s * 2.0**doublings * exposure_s)
 
     def acting(self) -> dict[str, Any]:
-        """What acts on frames, as dataset.json tells of it: at the ISO and temperature of the frames.
+        """Sensor parameters in effect at the ISO, temperature and noise mode of the frames, as in dataset.json.
 
-        Standard deviations are 0 where `noise` leaves them out.
+        Dark current and standard deviations are 0 unless `noise` is "full".
         """
         full = self.noise == "full"
         return {
@@ -153,9 +165,9 @@ class Sensor(Settings):
         }
 
     def quantise(self, electrons: Electrons) -> NDArray[np.uint32]:
-        """Convert electrons: round(e / gain) + black level, within 0 and the converter's largest number."""
+        """Digital numbers: round(e / gain) + black level, clipped to 0 and the largest number of the ADC."""
         gain = self.gain_at_iso_e_per_dn
-        if gain == 1.0 and electrons.dtype == np.uint32:  # counts are numbers already
+        if gain == 1.0 and electrons.dtype == np.uint32:  # electrons are the digital numbers
             counts = np.minimum(electrons, np.uint32(self.largest_dn - self.black_level_dn))
             counts += np.uint32(self.black_level_dn)
             return counts.astype(np.uint32, copy=False)
@@ -164,10 +176,10 @@ class Sensor(Settings):
         return clipped
 
     def binned(self, by: int) -> "Sensor":
-        """The sensor whose pixels are sums of `by` x `by` of this one's, digital numbers keeping their range.
+        """The sensor with `by` x `by` pixels summed into one; digital numbers keep their range.
 
-        Means grow with the area, independent noise with its root, a row's offset with the root of the rows beside the
-        columns that share it.
+        Means grow by by^2, independent noise by `by`, and a row offset by by^1.5: `by` columns share each of `by`
+        independent row offsets.
         """
         means = {key: getattr(self, key) * by**2 for key in ("gain_e_per_dn", "full_well_e", "dark_current_e_s")}
         noise = {key: getattr(self, key) * by for key in ("dsnu_e", "read_noise_e")}
@@ -177,7 +189,7 @@ class Sensor(Settings):
 
 
 def clip_full_well(electrons: Electrons, full_well_e: float) -> Electrons:
-    """Clip at the full well: what a photodiode cannot hold is lost."""
+    """Clip electrons at the full well."""
     if electrons.dtype == np.uint32:
         return np.minimum(electrons, np.uint32(min(full_well_e, 2**32 - 1)))
     return np.minimum(electrons, full_well_e)

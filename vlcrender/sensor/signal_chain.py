@@ -1,4 +1,4 @@
-"""The whole chain from expected electrons to digital numbers, in the order that `sensor` gives."""
+"""Exposure: expected electrons to digital numbers, through the chain that `sensor` describes step by step."""
 
 from typing import Any
 
@@ -12,12 +12,12 @@ from vlcrender.sensor.poisson import MAX_MEAN, draw, poisson
 from vlcrender.sensor.sensor import Electrons, Sensor, clip_full_well
 
 
-def variance_e2(sensor: Sensor, expected_e: NDArray[np.float32], exposure_s: float = 0.0) -> NDArray[np.float64]:
-    """Variance of each pixel's digital number in electrons squared, same shape; inf where it is saturated.
+def variance_e2(sensor: Sensor, expected_e: NDArray[np.float32], exposure_s: float) -> NDArray[np.float64]:
+    """Variance of each pixel's digital number in electrons squared, same shape; inf where the pixel is saturated.
 
-    The fixed patterns count: who does not know them cannot tell them from noise (that a row or a column shares its
-    offset is left aside). Saturated are pixels whose mean is at the full well or at the converter's end. Rounding adds
-    gain^2 / 12 but where digital numbers are the electrons counted.
+    Fixed patterns count as noise, independent in each pixel: an estimator does not know them. A pixel is saturated
+    where its mean is at the full well or the upper limit of the ADC. Rounding adds gain^2 / 12, except where digital
+    numbers are counts of electrons.
     """
     gain, full = sensor.gain_at_iso_e_per_dn, sensor.noise == "full"
     mean = expected_e.astype(np.float64)
@@ -38,14 +38,15 @@ def expose(
     key: str,
     row: int = 0,
     column: int = 0,
-    exposure_s: float = 0.0,
+    *,
+    exposure_s: float,
     camera: str = "main",
 ) -> NDArray[np.uint32]:
-    """Turn expected electrons (rows, columns), finite and >= 0, into digital numbers of the same shape.
+    """Digital numbers of expected electrons (rows, columns), finite and >= 0; same shape.
 
-    `key` names the stream of random numbers of this exposure; the window starts at pixel (row, column) of the frame,
-    and its noise is that of the whole frame's pixels there. With `noise = "full"` the dark current gathers electrons
-    for `exposure_s`, and the fixed patterns are those of the sensor's `serial` in the camera of this name.
+    `key` names the random numbers of this exposure. The region starts at pixel (row, column) of the frame and gets the
+    noise that the whole frame has there. With `noise = "full"`, dark current collects electrons for `exposure_s`, and
+    the fixed patterns derive from the sensor's `serial` and the name of the camera. Raises ValueError for other means.
     """
     expected_e = np.minimum(expected_e, np.float32(MAX_MEAN))
     if sensor.noise == "full":
@@ -62,12 +63,12 @@ def _full_chain(
     start: tuple[int, int],
     exposure_s: float,
 ) -> NDArray[np.uint32]:
-    """The steps of `sensor`'s docstring, by their numbers, in one kernel."""
+    """Steps 2 to 9 of the chain in the docstring of `sensor`, in one kernel."""
     low, high = float(expected_e.min()), float(expected_e.max())
     if not 0 <= low <= high:
         raise ValueError(f"means from {low} to {high} electrons; 0 and more are allowed")
 
-    def number(value: float) -> Any:  # as data: as a literal it would make a kernel of each sensor
+    def number(value: float) -> Any:  # as data: each literal would compile a kernel of its own
         return dr.opaque(mi.Float, value)
 
     with exact_math():
@@ -79,7 +80,7 @@ def _full_chain(
         electrons = draw(mean, kernel_seed(key), column, row)  # 4
         electrons = electrons + number(sensor.dsnu_e) * offset  # 5
         electrons = dr.minimum(electrons, number(sensor.full_well_e))  # 6
-        # 7 and 8: read and converter noise are normal and both are added beyond the clip, so that one draw is both.
+        # 7 and 8: read and ADC noise are normal and both follow the clip, so one draw has the sum of their variances.
         noise, _ = normals(kernel_seed(key, "read"), column, row)
         of_row, _ = normals(kernel_seed(individual, "rows"), mi.UInt32(0), row)
         of_column, _ = normals(kernel_seed(individual, "columns"), column, mi.UInt32(0))

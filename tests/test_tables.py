@@ -1,0 +1,112 @@
+"""Tables of a dataset: their columns are those of FORMAT.md, rows survive the disk bit for bit, damage is named."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from vlcrender.dataset.schema import FRAMES_SCHEMA, TRUTH_SCHEMA, FrameRecord, FrameRow, LedTruth, SpotRow, TruthRow
+from vlcrender.dataset.tables import read_table, write_table
+from vlcrender.errors import InputError
+
+SPOT = [("led", pa.int64()), ("u_px", pa.float64()), ("v_px", pa.float64())]
+
+
+def test_the_columns_are_those_of_the_format() -> None:
+    """FORMAT.md's two tables, written out by hand."""
+    expected = {
+        "frame": pa.int64(),
+        "shot": pa.int64(),
+        "pose": pa.int64(),
+        "file": pa.string(),
+        "sha256": pa.string(),
+        "camera": pa.string(),
+        "exposure_s": pa.float64(),
+        "capturable": pa.bool_(),
+        "accelerometer_m_s2": pa.list_(pa.float64(), 3),
+        "spots": pa.list_(pa.struct(SPOT)),
+    }
+    assert pa.schema(list(expected.items())).equals(FRAMES_SCHEMA)
+    expected = {
+        "frame": pa.int64(),
+        "shot": pa.int64(),
+        "position_m": pa.list_(pa.float64(), 3),
+        "R_cam_world": pa.list_(pa.float64(), 9),
+        "tilt_x_deg": pa.float64(),
+        "tilt_y_deg": pa.float64(),
+        "yaw_deg": pa.float64(),
+        "leds": pa.list_(pa.struct([*SPOT, ("visible_fraction", pa.float64())])),
+        "bound_m2": pa.list_(pa.float64(), 9),
+    }
+    assert pa.schema(list(expected.items())).equals(TRUTH_SCHEMA)
+
+
+def record(rng: np.random.Generator, bound: bool) -> FrameRecord:
+    """A record of doubles with all 53 bits in use, over many magnitudes."""
+
+    def numbers(count: int) -> list[float]:
+        values: list[float] = (rng.standard_normal(count) * 10.0 ** rng.integers(-12, 12, count)).tolist()
+        return values
+
+    u, v, share, exposure, *tilts = numbers(7)
+    device = {
+        "frame": 3,
+        "shot": 2,
+        "pose": 1,
+        "file": "frames/000003.exr",
+        "sha256": "0" * 64,
+        "camera": "main",
+        "exposure_s": exposure,
+        "capturable": True,
+        "accelerometer_m_s2": numbers(3),
+        "spots": (SpotRow(led=7, u_px=u, v_px=v),),
+    }
+    truth = {
+        "frame": 3,
+        "shot": 2,
+        "position_m": numbers(3),
+        "R_cam_world": numbers(9),
+        **dict(zip(("tilt_x_deg", "tilt_y_deg", "yaw_deg"), tilts, strict=True)),
+        "leds": (LedTruth(led=7, u_px=v, v_px=u, visible_fraction=share),),
+        "bound_m2": numbers(9) if bound else None,
+    }
+    return FrameRecord(device=FrameRow.model_validate(device), truth=TruthRow.model_validate(truth))
+
+
+def test_rows_survive_journal_and_table_bit_for_bit(tmp_path: Path, rng: np.random.Generator) -> None:
+    records = [record(rng, bound=bool(number % 2)) for number in range(200)]
+    assert [FrameRecord.model_validate_json(line.model_dump_json()) for line in records] == records
+    write_table(tmp_path / "frames.parquet", [r.device for r in records], FrameRow)
+    write_table(tmp_path / "truth.parquet", [r.truth for r in records], TruthRow)
+    assert read_table(tmp_path / "frames.parquet", FrameRow) == [r.device for r in records]
+    assert read_table(tmp_path / "truth.parquet", TruthRow) == [r.truth for r in records]
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "words"),
+    [
+        ("position_m", None, "row 0: position_m: is empty"),
+        ("tilt_x_deg", float("nan"), "row 0: tilt_x_deg: Input should be a finite number"),
+        ("leds", [{"led": None, "u_px": 1.0, "v_px": 1.0, "visible_fraction": 1.0}], "row 0: leds.0.led: is empty"),
+    ],
+)
+def test_an_empty_or_infinite_cell_is_named(
+    tmp_path: Path, rng: np.random.Generator, column: str, value: object, words: str
+) -> None:
+    row = json.loads(record(rng, bound=True).truth.model_dump_json())
+    table = pa.Table.from_pylist([{**row, column: value}], schema=TRUTH_SCHEMA)
+    pq.write_table(table, tmp_path / "truth.parquet")
+    with pytest.raises(InputError, match=words) as refusal:
+        read_table(tmp_path / "truth.parquet", TruthRow)
+    assert "\n" not in str(refusal.value)
+
+
+def test_other_columns_are_named(tmp_path: Path) -> None:
+    pq.write_table(pa.table({"frame": [0]}), tmp_path / "truth.parquet")
+    with pytest.raises(InputError, match=r"columns differ from FORMAT\.md: .*yaw_deg: double"):
+        read_table(tmp_path / "truth.parquet", TruthRow)
+    with pytest.raises(InputError, match=r"frames\.parquet: is missing"):
+        read_table(tmp_path / "frames.parquet", FrameRow)

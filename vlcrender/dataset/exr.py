@@ -1,0 +1,95 @@
+"""EXR files of frames: regions of a sensor as parts, with the standard attributes of the exposure."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenEXR
+from numpy.typing import NDArray
+
+from vlcrender.camera.intrinsics import Camera
+from vlcrender.camera.roi import Roi
+from vlcrender.dataset.files import sha256_of
+from vlcrender.errors import InputError
+
+RegionPixels = tuple[Roi, NDArray[np.uint32] | NDArray[np.float32]]
+"""A region and its pixels (rows, columns)."""
+
+
+def write_exr(path: Path, images: Sequence[RegionPixels], sensor: Roi, attributes: Mapping[str, Any]) -> str:
+    """Write regions of a sensor, one channel (Y), losslessly, and return the file's SHA-256.
+
+    The file appears whole or not at all. Raises InputError where it cannot be written.
+    """
+    header = {
+        "compression": OpenEXR.PIZ_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
+        "displayWindow": _box(sensor),
+        **attributes,
+    }
+    names = [f"region {number}" for number in range(len(images))] if len(images) > 1 else [""]
+    parts = [
+        OpenEXR.Part({**header, "dataWindow": _box(roi)}, {"Y": np.ascontiguousarray(image)}, name)
+        for name, (roi, image) in zip(names, images, strict=True)
+    ]
+    partial = path.with_suffix(".partial")
+    try:
+        OpenEXR.File(parts).write(str(partial))
+    except RuntimeError as error:  # OpenEXR raises it for a full disk as well
+        partial.unlink(missing_ok=True)
+        raise InputError(f"{path}: cannot be written: {' '.join(str(error).split())}") from None
+    digest = sha256_of(partial)
+    partial.replace(path)
+    return digest
+
+
+def _box(roi: Roi) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """First and last pixel, (column, row) each: EXR's Box2i."""
+    first = np.array([roi.column, roi.row], dtype=np.int32)
+    return first, first + np.array([roi.columns - 1, roi.rows - 1], dtype=np.int32)
+
+
+@dataclass(frozen=True)
+class ExrPart:
+    """One part of an EXR file: its region, the whole sensor, and the type of its pixels."""
+
+    roi: Roi
+    sensor: Roi
+    dtype: np.dtype[Any]
+
+
+def read_exr_parts(path: Path) -> list[ExrPart]:
+    """The parts of a frame's file. Raises InputError where it cannot be read or lacks the channel Y."""
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            return [
+                ExrPart(
+                    _roi(part.header["dataWindow"]),
+                    _roi(part.header["displayWindow"]),
+                    part.channels["Y"].pixels.dtype,
+                )
+                for part in file.parts
+            ]
+    except (RuntimeError, KeyError, ValueError, TypeError) as error:
+        raise InputError(f"{path}: cannot be read as an EXR with a channel Y: {error}") from None
+
+
+def _roi(box: tuple[NDArray[np.int32], NDArray[np.int32]]) -> Roi:
+    (column, row), (last_column, last_row) = (end.tolist() for end in box)
+    return Roi(row, column, last_row - row + 1, last_column - column + 1)
+
+
+def exr_attributes(camera: Camera, camera_name: str, exposure_s: float, frame: int) -> dict[str, Any]:
+    """Standard EXR attributes of a frame; nothing about the pose."""
+    size_mm = np.array([camera.width_px, camera.height_px]) * camera.pixel_pitch_um / 1000
+    return {
+        "expTime": float(exposure_s),
+        "aperture": float(camera.f_number),
+        "nominalFocalLength": float(camera.focal_length_mm),
+        "sensorPhotositePitch": float(camera.pixel_pitch_um),
+        "sensorOverallDimensions": size_mm.astype(np.float32),
+        "vlcrender:frame": str(frame),
+        "vlcrender:camera": camera_name,
+    }

@@ -1,0 +1,51 @@
+"""Parquet tables of row models: written whole or not at all, read back row by row."""
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TypeVar
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+from pydantic import ValidationError
+
+from vlcrender.config.toml_model import Settings
+from vlcrender.dataset.files import first_line, whole_file
+from vlcrender.dataset.schema import arrow_schema
+from vlcrender.errors import InputError
+
+R = TypeVar("R", bound=Settings)
+
+
+def write_table(path: Path, rows: Iterable[R], model: type[R]) -> None:
+    """Write rows as a Parquet table; it appears whole or not at all. Raises InputError where it cannot be written."""
+    table = pa.Table.from_pylist([row.model_dump() for row in rows], schema=arrow_schema(model))
+    with whole_file(path) as partial:
+        pq.write_table(table, partial)
+
+
+def read_table(path: Path, model: type[R]) -> list[R]:
+    """Read a Parquet table of rows of this model.
+
+    Raises InputError where the file is missing or no Parquet, or its columns or cells differ from the model's.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: is missing")
+    try:
+        table = pq.read_table(path)
+    except (pa.ArrowException, OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read as Parquet: {first_line(str(error))}") from None
+    schema = arrow_schema(model)
+    if not table.schema.equals(schema):
+        expected, got = set(map(str, schema)), set(map(str, table.schema))
+        difference = ", ".join(sorted(expected ^ got)) or "their order"
+        raise InputError(f"{path}: columns differ from FORMAT.md: {difference}")
+    rows: list[R] = []
+    for number, row in enumerate(table.to_pylist()):
+        try:
+            rows.append(model.model_validate(row))
+        except ValidationError as error:
+            problem = error.errors(include_url=False)[0]
+            cell = ".".join(map(str, problem["loc"]))
+            state = "is empty" if problem["input"] is None else first_line(problem["msg"])
+            raise InputError(f"{path}: row {number}: {cell}: {state}") from None
+    return rows
