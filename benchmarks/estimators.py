@@ -27,7 +27,7 @@ import numpy as np
 import estimator.spots.correspondences
 from estimator.evaluate.batch import estimate_frame
 from estimator.io.dataset import read_dataset, read_frame
-from estimator.variants.catalogue import VARIANTS
+from estimator.methods.catalogue import VARIANTS
 
 WORKERS = 2
 TRIES = 3

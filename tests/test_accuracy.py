@@ -11,7 +11,7 @@ from estimator.camera.leveling import level, rotation, tilt_from_gravity
 from estimator.io.dataset import Dataset, read_dataset, read_frame
 from estimator.solvers.ranging import law_of_sines, led_ranges
 from estimator.solvers.trilateration import position_from_ranges
-from estimator.variants.catalogue import VARIANTS, variant_named
+from estimator.methods.catalogue import VARIANTS, variant_named
 from vlcrender.camera.intrinsics import Camera
 from vlcrender.dataset.generate import generate
 from vlcrender.dataset.recipe import load_plan

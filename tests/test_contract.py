@@ -12,7 +12,7 @@ from estimator.camera.leveling import level, rotation, tilt_from_gravity
 from estimator.camera.undistort import MAX_FIELD_ANGLE_DEG, pinhole_pixels
 from estimator.io.dataset import Camera as DeviceCamera
 from estimator.io.dataset import DeviceFrame, read_dataset, read_frame
-from estimator.variants.catalogue import VARIANTS
+from estimator.methods.catalogue import VARIANTS
 from vlcrender.camera.distortion import Distortion
 from vlcrender.camera.intrinsics import Camera, Pose, image_of_points, project
 from vlcrender.camera.rig import mounted_cameras

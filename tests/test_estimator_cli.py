@@ -15,7 +15,7 @@ from estimator_synthetic import small_dataset
 from estimator import cli
 from estimator.cli import main
 from estimator.io.estimates import EstimateRow, write_estimates
-from estimator.variants.catalogue import VARIANTS
+from estimator.methods.catalogue import VARIANTS
 
 
 @pytest.fixture(scope="module")

@@ -9,9 +9,9 @@ from estimator_correspondences import device, sighted
 from estimator_synthetic import Array, View, grid, view_of
 
 from estimator.errors import EstimationFailure
-from estimator.variants.gravity_fit import fit_correspondences
-from estimator.variants.pnp import position_from_pixels
-from estimator.variants.variant import Estimate
+from estimator.methods.gravity_fit import fit_correspondences
+from estimator.methods.pnp import position_from_pixels
+from estimator.methods.variant import Estimate
 
 TABLE_1 = np.array([[0.5, 1.5, 3.5], [0.3, 1.9, 3.5], [0.8, 1.2, 3.5], [0.9, 1.1, 3.5]])
 

@@ -12,7 +12,7 @@ from scipy.stats import chi2
 from estimator.camera.leveling import rotation
 from estimator.errors import EstimationFailure
 from estimator.io.dataset import Accelerometer, Camera, DecodedSpot, DeviceFrame, Led, Part, Sensor
-from estimator.variants.maximum_likelihood import ml
+from estimator.methods.maximum_likelihood import ml
 
 Floats = NDArray[np.float64]
 TARGET = (3.5, 3.6, 3.5)

@@ -5,9 +5,9 @@ import itertools
 import pytest
 
 from estimator.errors import InputError
-from estimator.variants.catalogue import VARIANTS, variant_named
-from estimator.variants.huynh2016 import AS_PRINTED, DEFAULTS, STAGES, Huynh2016
-from estimator.variants.options import read_options
+from estimator.methods.catalogue import VARIANTS, variant_named
+from estimator.methods.huynh2016 import AS_PRINTED, DEFAULTS, STAGES, Huynh2016
+from estimator.methods.options import read_options
 
 COLOURS = {"hue": ("red", "blue"), "shade": ("light", "dark")}
 

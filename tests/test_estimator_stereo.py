@@ -11,8 +11,8 @@ from estimator.errors import EstimationFailure
 from estimator.io.dataset import Camera, DeviceFrame, Sensor
 from estimator.solvers.stereo import partner, triangulated
 from estimator.solvers.trilateration import position_from_ranges
-from estimator.variants.catalogue import VARIANTS
-from estimator.variants.kim import position_from_vectors
+from estimator.methods.catalogue import VARIANTS
+from estimator.methods.kim import position_from_vectors
 
 LEDS = grid(4, 3, 0.13, (3, 2, 3.45))
 BASELINE_M = np.array([0.08, -0.06])

@@ -6,14 +6,14 @@ import pytest
 from estimator_correspondences import device, sighted
 from estimator_synthetic import Array, View, grid, view_of
 
-import estimator.variants.up2p
+import estimator.methods.up2p
 from estimator.camera.leveling import level, rotation, tilt_from_gravity
 from estimator.errors import EstimationFailure
 from estimator.solvers.ranging import law_of_sines, led_ranges
 from estimator.solvers.reprojection import observations
 from estimator.solvers.trilateration import position_from_ranges
-from estimator.variants.pnp import position_from_pixels
-from estimator.variants.up2p import fit_correspondences, upright_pose
+from estimator.methods.pnp import position_from_pixels
+from estimator.methods.up2p import fit_correspondences, upright_pose
 
 poselib = pytest.importorskip("poselib")
 
@@ -48,7 +48,7 @@ def test_poselib_s_two_points_alone_give_the_pose() -> None:
         leds = grid(2, 1, 0.3, (3.5, 3.6, 3.5)) + rng.uniform(-0.1, 0.1, (2, 3))
         view = random_view(rng, leds)
         seen = observations(device(view, 0.0), sighted(view, leds))
-        poses = estimator.variants.up2p._from_pairs(seen)
+        poses = estimator.methods.up2p._from_pairs(seen)
         assert min(np.abs(pose.position_m - view.position_m).max() for pose in poses) < 1e-8
         assert min(np.abs(pose.R_cam_world - view.R_cam_world).max() for pose in poses) < 1e-8
 
@@ -79,6 +79,6 @@ def test_the_refinement_frees_the_tilt() -> None:
 
 
 def test_without_poselib_there_is_a_named_failure(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(estimator.variants.up2p, "poselib", None)
+    monkeypatch.setattr(estimator.methods.up2p, "poselib", None)
     with pytest.raises(EstimationFailure, match="up2p: PoseLib is not installed"):
-        estimator.variants.up2p.up2p(device(view_of((3, 2, 2.7), 2.6), 0.1))
+        estimator.methods.up2p.up2p(device(view_of((3, 2, 2.7), 2.6), 0.1))

@@ -15,8 +15,8 @@ from estimator.io.dataset import DeviceFrame, read_dataset, read_frame
 from estimator.io.estimates import EstimateRow
 from estimator.spots.correspondences import centroids_px, correspondences
 from estimator.spots.denoise import DENOISERS
-from estimator.variants.catalogue import VARIANTS, variant_named
-from estimator.variants.variant import Estimate, Variant
+from estimator.methods.catalogue import VARIANTS, variant_named
+from estimator.methods.variant import Estimate, Variant
 
 
 @pytest.fixture(scope="module")

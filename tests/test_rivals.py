@@ -11,7 +11,7 @@ from conftest import ROOT, SMALL
 from estimator.evaluate.batch import estimate_dataset
 from estimator.io.dataset import read_dataset
 from estimator.io.estimates import EstimateRow
-from estimator.variants.catalogue import VARIANTS
+from estimator.methods.catalogue import VARIANTS
 from vlcrender.dataset.generate import generate
 from vlcrender.dataset.recipe import load_plan
 

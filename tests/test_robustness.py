@@ -32,7 +32,7 @@ from estimator.io.dataset import (
 from estimator.io.estimates import EstimateRow
 from estimator.spots.correspondences import correspondences
 from estimator.spots.detect import Readout, detect
-from estimator.variants.catalogue import VARIANTS
+from estimator.methods.catalogue import VARIANTS
 from vlcrender.dataset.generate import generate
 from vlcrender.dataset.recipe import load_plan
 

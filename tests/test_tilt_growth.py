@@ -12,7 +12,7 @@ from estimator.camera.leveling import level, rotation
 from estimator.io.dataset import Dataset, read_dataset, read_frame
 from estimator.solvers.ranging import law_of_sines, led_ranges
 from estimator.solvers.trilateration import position_from_ranges
-from estimator.variants.catalogue import VARIANTS
+from estimator.methods.catalogue import VARIANTS
 
 STEP = 1e-6
 
