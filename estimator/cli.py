@@ -10,7 +10,7 @@ import logging
 import os
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from io import TextIOWrapper
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -76,11 +76,16 @@ def run(
     if workers < 1:
         raise InputError(f"--workers {workers}: is not 1 or more")
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True)) as bar:
-        task = bar.add_task("frames", total=None)
-        rows = estimator.run(
-            dataset, variant, workers, lambda done, total: bar.update(task, completed=done, total=total)
-        )
+    bar = Progress(*columns, console=Console(stderr=True))
+    task = bar.add_task("frames", total=None)
+    with ExitStack() as stack:
+
+        def draw(done: int, total: int) -> None:
+            if done == 0:
+                stack.enter_context(bar)  # not before the dataset is read: an error is one line
+            bar.update(task, completed=done, total=total)
+
+        rows = estimator.run(dataset, variant, workers, draw)
     for name, of_variant in rows.items():
         ok = sum(row.status == "ok" for row in of_variant)
         print(f"{name}: {ok} of {len(of_variant)} frames ok -> {estimates_path(dataset, name)}")

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from estimator_synthetic import Array, View, description
 
-from estimator.io.dataset import Accelerometer, Camera, DeviceFrame, Led, Sensor
+from estimator.io.device import Accelerometer, Camera, DeviceFrame, DiscLed, Sensor
 from estimator.spots.detect import Spot
 from estimator.spots.identify import Correspondence
 
@@ -32,7 +32,7 @@ def device(view: View, error_deg: float, rng: np.random.Generator | None = None)
     )
 
 
-def sighted(
+def simulated(
     view: View, leds_m: Array, sigma_px: float = 0.0, rng: np.random.Generator | None = None
 ) -> list[Correspondence]:
     """Points (n, 3) seen from a view, with normal errors of their pixels where `rng` is given."""
@@ -41,7 +41,7 @@ def sighted(
         pixels = pixels + rng.normal(0, sigma_px, pixels.shape)
     return [
         Correspondence(
-            Led(id=k, position_m=(x, y, z), radius_m=POINT_M, shape="disc"),
+            DiscLed(id=k, position_m=(x, y, z), radius_m=POINT_M),
             Spot(u, v, sigma_px**2 * np.eye(2), u, v, 50, 1000.0, touches_border=False, saturated=False),
         )
         for k, ((x, y, z), (u, v)) in enumerate(zip(leds_m.tolist(), pixels.tolist(), strict=True))

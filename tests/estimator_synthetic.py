@@ -220,7 +220,7 @@ def description(view: View, frame_count: int, leds_m: Array, radius_m: float) ->
     pitch_um = 18000 / view.focal_px
     return {
         "format": "vlcrender-dataset",
-        "version": 3,
+        "version": 4,
         "name": "synthetic <&>",
         "frame_count": frame_count,
         "cameras": {

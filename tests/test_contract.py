@@ -8,7 +8,8 @@ import pyarrow.parquet as pq
 import pytest
 from conftest import ROOT, SMALL
 
-from estimator.camera.leveling import level, rotation, tilt_from_gravity
+from estimator.camera.leveling import level, tilt_from_gravity
+from estimator.camera.pose import rotation
 from estimator.camera.undistort import MAX_FIELD_ANGLE_DEG, pinhole_pixels
 from estimator.io.dataset import Camera as DeviceCamera
 from estimator.io.dataset import DeviceFrame, read_dataset, read_frame

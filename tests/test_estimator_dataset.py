@@ -84,12 +84,12 @@ def test_electrons_undo_the_black_level_and_the_gain(folder: Path) -> None:
 def test_a_full_pixel_is_clipped_at_the_full_well_or_at_the_last_number(folder: Path) -> None:
     change_json(folder, lambda c: c["sensor"].update(full_well_e=4000, gain_e_per_dn=2, black_level_dn=10))
     dataset = read_dataset(folder)
-    assert dataset.sensor.largest_dn() == 2010
+    assert dataset.sensor.saturation_dn() == 2010
     frame = read_frame(dataset, dataset.frames[0])
     (part,) = frame.parts
     np.testing.assert_array_equal(frame.clipped(part), part.image_dn >= 2010)
     change_json(folder, lambda c: c["sensor"].update(bits=10))
-    assert read_dataset(folder).sensor.largest_dn() == 1023
+    assert read_dataset(folder).sensor.saturation_dn() == 1023
 
 
 def test_provenance_is_not_needed_and_not_kept(folder: Path) -> None:
@@ -98,10 +98,12 @@ def test_provenance_is_not_needed_and_not_kept(folder: Path) -> None:
 
 
 def test_only_the_scorer_knows_of_the_truth() -> None:
-    sources = (Path(__file__).parent.parent / "estimator").glob("*.py")
+    package = Path(__file__).parent.parent / "estimator"
     assert [
-        path.name for path in sources if "truth.parquet" in re.sub(r'""".*?"""', "", path.read_text(), flags=re.S)
-    ] == ["score.py"]
+        path.relative_to(package).as_posix()
+        for path in package.rglob("*.py")
+        if "truth.parquet" in re.sub(r'""".*?"""', "", path.read_text(), flags=re.S)
+    ] == ["evaluate/score.py"]
 
 
 JSON_KEYS = ["format", "version", "name", "frame_count", "cameras", "sensor", "accelerometer", "led_map", "room_m"]

@@ -145,4 +145,4 @@ def test_no_denoiser_reaches_further_than_it_says(name: str) -> None:
     other = image.copy()
     other[20, 20] += 500
     changed = np.argwhere(denoiser.apply(image, 0.0) != denoiser.apply(other, 0.0)) - 20
-    assert np.abs(changed).max() == denoiser.reach_px
+    assert np.abs(changed).max() == denoiser.radius_px

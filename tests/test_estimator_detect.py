@@ -6,7 +6,7 @@ import pytest
 from estimator_synthetic import Array, View, grid, poisson, render, view_of
 
 from estimator.errors import EstimationFailure
-from estimator.spots.denoise import REACH_PX, neighbourhood_mean
+from estimator.spots.denoise import NEIGHBOURHOOD_RADIUS_PX, neighbourhood_mean
 from estimator.spots.detect import Readout, Spot, detect
 
 SMALL = (400, 300, 1500.0)
@@ -18,7 +18,9 @@ def spots_of(expected_e: Array, denoised: bool = False) -> list[Spot]:
     image = expected_e.astype(np.float32)
     none_full = np.zeros(image.shape, bool)
     if denoised:
-        return list(detect([Readout(0, 0, neighbourhood_mean(image), image, none_full)], image.size, REACH_PX))
+        return list(
+            detect([Readout(0, 0, neighbourhood_mean(image), image, none_full)], image.size, NEIGHBOURHOOD_RADIUS_PX)
+        )
     return list(detect([Readout(0, 0, image, image, none_full)], image.size, 0))
 
 
@@ -143,7 +145,9 @@ def test_spots_at_the_border_are_flagged_and_others_are_not() -> None:
 def test_saturation_is_told_from_the_raw_image() -> None:
     view = view_of((3, 3, 3), 3.0, size=SMALL)
     image = render(view, np.array([[2.9, 3, 3], [3.1, 3, 3]]), led_e=[900, 1000]).astype(np.float32)
-    spots = detect([Readout(0, 0, neighbourhood_mean(image), image, image >= 1000)], image.size, REACH_PX)
+    spots = detect(
+        [Readout(0, 0, neighbourhood_mean(image), image, image >= 1000)], image.size, NEIGHBOURHOOD_RADIUS_PX
+    )
     assert {spot.u_px > 200: spot.saturated for spot in spots} == {False: False, True: True}
 
 
@@ -174,9 +178,9 @@ def test_windows_give_the_spots_of_the_whole_image(denoised: bool) -> None:
     leds = grid(3, 2, 0.15, (3, 3, 3))
     image = poisson(render(view, leds, led_e=[1000, 2000, 3000, 4000, 2000, 1000]), 3)
     whole = spots_of(image, denoised)
-    reach_px = REACH_PX if denoised else 0
+    radius_px = NEIGHBOURHOOD_RADIUS_PX if denoised else 0
     rois = windows_around(image, view.project(leds), 36, denoised)
-    parts = detect(rois, image.size, reach_px)
+    parts = detect(rois, image.size, radius_px)
     assert len(parts) == len(whole) == 6
     for spot in parts:
         same = min(whole, key=lambda other: np.hypot(other.u_px - spot.u_px, other.v_px - spot.v_px))
@@ -192,7 +196,7 @@ def test_a_lamp_that_fills_its_window_is_found_and_flagged() -> None:
     leds = np.array([[3.0, 3.0, 3.0]])
     image = render(view, leds)
     tight = windows_around(image, view.project(leds), 17, True)  # radius 13.3 px: less than 5 + 2 px of margin
-    (spot,) = detect(tight, image.size, REACH_PX)
+    (spot,) = detect(tight, image.size, NEIGHBOURHOOD_RADIUS_PX)
     assert spot.touches_border
     (raw,) = detect(windows_around(image, view.project(leds), 17, False), image.size, 0)
     assert not raw.touches_border
@@ -219,7 +223,7 @@ def test_a_square_has_its_centroid_over_its_corners_too(yaw_deg: float) -> None:
     exact = np.array([(light * u).sum(), (light * v).sum()]) / light.sum()
     image = expected.astype(np.float32)
     readout = Readout(0, 0, image, image, np.zeros(image.shape, bool))
-    (around,) = detect([readout], image.size, 0, corners=True)
+    (around,) = detect([readout], image.size, 0, any_square=True)
     (without,) = detect([readout], image.size, 0)
     # float32 electrons summed in double precision: what is left is their rounding, 1e-7.
     assert np.hypot(around.u_px - exact[0], around.v_px - exact[1]) < 1e-5

@@ -5,7 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from estimator_correspondences import device, sighted
+from estimator_correspondences import device, simulated
 from estimator_synthetic import Array, View, grid, view_of
 
 from estimator.errors import EstimationFailure
@@ -20,7 +20,7 @@ def draws(view: View, leds_m: Array, sigma_px: float, error_deg: float, count: i
     """Answers to as many draws of centroids' and accelerometer's errors."""
     rng = np.random.default_rng(7)
     return [
-        fit_correspondences(device(view, error_deg, rng), sighted(view, leds_m, sigma_px, rng)) for _ in range(count)
+        fit_correspondences(device(view, error_deg, rng), simulated(view, leds_m, sigma_px, rng)) for _ in range(count)
     ]
 
 
@@ -60,7 +60,7 @@ def test_gravity_decides_between_the_two_poses_of_a_plane() -> None:
     rng = np.random.default_rng(3)
     worst_pnp = 0.0
     for _ in range(20):
-        seen = sighted(view, TABLE_1, 0.02, rng)
+        seen = simulated(view, TABLE_1, 0.02, rng)
         answer = fit_correspondences(device(view, 0.1, rng), seen)
         error = answer.position_m - view.position_m
         assert answer.covariance_m2 is not None
@@ -95,7 +95,7 @@ def test_an_accelerometer_without_error_is_taken_at_its_word() -> None:
     """LEDs on a line give no tilt about it; gravity does, exactly."""
     leds = grid(4, 1, 0.14, (3, 2, 3.0))
     view = view_of((3, 2, 3.0), 2.8, 25, -15, 40)
-    answer = fit_correspondences(device(view, 0.0), sighted(view, leds))
+    answer = fit_correspondences(device(view, 0.0), simulated(view, leds))
     # Pixels are exact; 1e-5 deg is what the reading is taken to be good to.
     np.testing.assert_allclose(answer.position_m, view.position_m, atol=1e-7)
 
@@ -104,14 +104,14 @@ def test_two_leds_are_refused() -> None:
     view = view_of((3, 2, 3.0), 2.8, 25, -15, 40)
     leds = grid(2, 1, 0.14, (3, 2, 3.0))
     with pytest.raises(EstimationFailure, match="position: LEDs identified: 2, needed: 3"):
-        fit_correspondences(device(view, 0.1), sighted(view, leds))
+        fit_correspondences(device(view, 0.1), simulated(view, leds))
 
 
 def test_leds_at_different_heights_are_taken() -> None:
     leds = grid(3, 3, 0.2, (3, 2, 2.7))
     leds[::2, 2] += 0.15
     view = view_of((3, 2, 2.7), 2.5, 25, -30, 40)
-    answer = fit_correspondences(device(view, 0.1), sighted(view, leds))
+    answer = fit_correspondences(device(view, 0.1), simulated(view, leds))
     np.testing.assert_allclose(answer.position_m, view.position_m, atol=1e-8)
 
 
@@ -128,6 +128,6 @@ def test_a_lens_that_cannot_be_taken_out_of_one_spot_costs_that_spot_alone() -> 
     pixels = 1000 * theta[:, None] * across + view.K[:2, 2]
     seen = [
         replace(one, spot=replace(one.spot, u_px=float(u), v_px=float(v)))
-        for one, (u, v) in zip(sighted(view, leds), pixels, strict=True)
+        for one, (u, v) in zip(simulated(view, leds), pixels, strict=True)
     ]
     np.testing.assert_allclose(fit_correspondences(frame, seen).position_m, view.position_m, atol=1e-8)

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from estimator.errors import EstimationFailure
-from estimator.io.dataset import DecodedSpot, Led
+from estimator.io.device import DecodedSpot, DiscLed
 from estimator.spots.detect import Spot
 from estimator.spots.identify import GATE_PX, identify
 
-LEDS = {k: Led(id=k, position_m=(0.1 * k, 0.0, 3.0), radius_m=0.01, shape="disc") for k in range(10)}
+LEDS = {k: DiscLed(id=k, position_m=(0.1 * k, 0.0, 3.0), radius_m=0.01) for k in range(10)}
 
 
 def spot(u_px: float, v_px: float, touches_border: bool = False) -> Spot:

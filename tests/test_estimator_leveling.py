@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from estimator_synthetic import GRAVITY_M_S2, View, grid, view_of
 
-from estimator.camera.leveling import level, leveling_homography, printed_eq6, rotation, tilt_from_gravity, tilt_sigmas
+from estimator.camera.leveling import level, printed_eq6, tilt_from_gravity, tilt_sigmas
+from estimator.camera.pose import rotation
 from estimator.errors import EstimationFailure
-from estimator.io.dataset import Accelerometer
+from estimator.io.device import Accelerometer
 
 K = np.array([[1000.0, 0, 200], [0, 1000.0, 150], [0, 0, 1]])
 
@@ -63,8 +64,10 @@ def test_levelled_pixels_are_those_of_a_level_camera_at_the_same_place(
     np.testing.assert_allclose(leveled, same_place.project(leds), atol=1e-8)
 
 
-def test_the_homography_of_a_level_camera_is_the_identity() -> None:
-    np.testing.assert_allclose(leveling_homography(K, rotation(0, 0)), np.eye(3), atol=1e-15)
+def test_pixels_of_a_level_camera_are_unchanged() -> None:
+    pixels = np.array([[200.0, 150.0], [13.5, 270.25]])
+    # Pixels up to 300, through K^-1 and K: a few roundings of 300 * 1e-16.
+    np.testing.assert_allclose(level(pixels, K, rotation(0, 0)), pixels, atol=1e-12)
 
 
 @pytest.mark.parametrize("v_px", [150.0, 160.0])
@@ -72,12 +75,12 @@ def test_the_horizon_is_refused(v_px: float) -> None:
     """At tilt_x = 90 deg the image's centre looks at the horizon, and its lower half up."""
     upright = rotation(np.pi / 2, 0)
     level(np.array([[200.0, 250.0]]), K, upright)
-    with pytest.raises(EstimationFailure, match=r"rectify: .*horizon"):
+    with pytest.raises(EstimationFailure, match=r"leveling: .*horizon"):
         level(np.array([[200.0, 250.0], [200.0, 300.0 - v_px]]), K, upright)
 
 
 def test_no_gravity_is_refused() -> None:
-    with pytest.raises(EstimationFailure, match=r"rectify: .*gravity"):
+    with pytest.raises(EstimationFailure, match=r"leveling: .*gravity"):
         tilt_from_gravity((0.0, 0.0, 0.0))
 
 

@@ -9,9 +9,9 @@ from estimator_synthetic import View, description, grid, poisson, render, view_o
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from estimator.camera.leveling import rotation
+from estimator.camera.pose import rotation
 from estimator.errors import EstimationFailure
-from estimator.io.dataset import Accelerometer, Camera, DecodedSpot, DeviceFrame, Led, Part, Sensor
+from estimator.io.device import Accelerometer, Camera, DecodedSpot, DeviceFrame, DiscLed, Part, Sensor
 from estimator.methods.maximum_likelihood import ml
 
 Floats = NDArray[np.float64]
@@ -34,7 +34,7 @@ def frame_of(view: View, leds_m: Floats, image_dn: NDArray[np.uint32], error_deg
         accelerometer=Accelerometer(kind="tilt-error", error_deg=error_deg),
         exposure_s=1e-3,
         spots=tuple(DecodedSpot(led=10 + int(k), u_px=pixels[k, 0], v_px=pixels[k, 1]) for k in np.flatnonzero(inside)),
-        leds={10 + k: Led(id=10 + k, position_m=led, radius_m=0.01, shape="disc") for k, led in enumerate(leds_m)},
+        leds={10 + k: DiscLed(id=10 + k, position_m=led, radius_m=0.01) for k, led in enumerate(leds_m)},
     )
 
 

@@ -120,10 +120,10 @@ def test_a_composition_is_taken_with_its_own_summary(install: Install, capsys: p
 def test_a_name_registered_twice_is_not_used(install: Install) -> None:
     install("one", GOOD, {"x": "one:f"})
     install("two", GOOD, {"x": "two:f"})
-    variants, complaints = Registry.read().all()
+    variants, problems = Registry.read().all()
     assert [variant.name for variant in variants] == list(VARIANTS)
-    (complaint,) = complaints
-    assert "'x': not used, registered more than once, as " in complaint
+    (problem,) = problems
+    assert "'x': not used, registered more than once, as " in problem
 
 
 CRASHES = {
@@ -132,7 +132,7 @@ CRASHES = {
     "crashed (RecursionError)": "    return f(frame)",
     "crashed (MemoryError)": "    raise MemoryError",
     "crashed (ValueError)": "    frame.parts[0].image_dn[0, 0] = 0",  # images are read-only
-    "returned something else than an Estimate": "    return [1.0, 2.0, 3.0]",
+    "returned no Estimate": "    return [1.0, 2.0, 3.0]",
 }
 
 

@@ -107,6 +107,6 @@ def test_the_page_pairs_each_variant_with_the_best_and_says_which(tmp_path: Path
 
 
 def test_the_table_of_bounds_is_there_only_where_something_is_in_it(tmp_path: Path) -> None:
-    title = "The bound, and what the variants say of themselves"
+    title = "Cramér-Rao bound and covariance consistency"
     assert title not in page([(tmp_path, scores_of([scored([0.1, 0.2])]))])
     assert title in page([(tmp_path, scores_of([scored([0.1, 0.2], bound_m2=BOUND)]))])

@@ -49,10 +49,10 @@ def test_shares_for_people_never_round_up_to_all() -> None:
 def test_failed_frames_are_infinite_in_the_columns_of_all() -> None:
     rows = [ok(0, TRUTH), failed(1, "a: b"), failed(2, "a: b")]
     cells = dict(zip(ERROR_HEADERS, error_cells(score_variant("x", rows, truths(3), LEDS)), strict=True))
-    assert (cells["ok"], cells["failed"], cells["coverage"]) == ("1", "2", "33.3 %")
+    assert (cells["ok"], cells["failed"], cells["success rate"]) == ("1", "2", "33.3 %")
     assert (cells["median of all"], cells["p95 of all"], cells["median"]) == ("∞", "∞", "0 µm")
     none = dict(zip(ERROR_HEADERS, error_cells(score_variant("x", [], [], LEDS)), strict=True))
-    assert (none["coverage"], none["median of all"], none["time"]) == ("–", "–", "–")
+    assert (none["success rate"], none["median of all"], none["time"]) == ("–", "–", "–")
 
 
 def test_a_covariance_that_is_too_small_is_said_to_be() -> None:
@@ -64,6 +64,6 @@ def test_a_covariance_that_is_too_small_is_said_to_be() -> None:
         dict(zip(LIMIT_HEADERS, limit_cells(score_variant("x", [row], truths(1), LEDS)), strict=True))
         for row in (sure, modest)
     ]
-    assert [c["NEES"] for c in cells] == ["100 (too sure)", "0.0001 (too modest)"]
+    assert [c["NEES"] for c in cells] == ["100 (overconfident)", "0.0001 (conservative)"]
     assert [c["ambiguous"] for c in cells] == ["0", "1 (100 %)"]
     assert cells[0]["efficiency"] == "–"

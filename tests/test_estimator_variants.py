@@ -11,12 +11,13 @@ from estimator_synthetic import grid, small_dataset, view_of, write_dataset
 
 from estimator.errors import EstimationFailure
 from estimator.evaluate.batch import estimate_dataset, estimate_frame
-from estimator.io.dataset import DeviceFrame, read_dataset, read_frame
+from estimator.io.dataset import read_dataset, read_frame
+from estimator.io.device import DeviceFrame
 from estimator.io.estimates import EstimateRow
-from estimator.spots.correspondences import centroids_px, correspondences
-from estimator.spots.denoise import DENOISERS
 from estimator.methods.catalogue import VARIANTS, variant_named
 from estimator.methods.variant import Estimate, Variant
+from estimator.spots.correspondences import centroids_px, find_correspondences
+from estimator.spots.denoise import DENOISERS
 
 
 @pytest.fixture(scope="module")
@@ -139,7 +140,9 @@ def test_the_literal_algorithm_1_shifts_every_spot_up_and_left(noisy: Path) -> N
     truth = pq.read_table(noisy / "truth.parquet", columns=["leds"]).to_pylist()
     literal = DENOISERS["literal"]
     for record, true in zip(dataset.frames, truth, strict=True):
-        seen = correspondences(read_frame(dataset, record), lambda raw_e: literal.apply(raw_e, 0.0), literal.reach_px)
+        seen = find_correspondences(
+            read_frame(dataset, record), lambda raw_e: literal.apply(raw_e, 0.0), literal.radius_px
+        )
         exact = {led["led"]: (led["u_px"], led["v_px"]) for led in true["leds"]}
         off = centroids_px(seen) - [exact[correspondence.led.id] for correspondence in seen]
         assert len(off) > 10

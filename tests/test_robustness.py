@@ -18,21 +18,12 @@ from estimator_synthetic import Array, View, description, grid, poisson, render,
 
 from estimator.errors import InputError
 from estimator.evaluate.batch import estimate_dataset, estimate_frame
-from estimator.io.dataset import (
-    Accelerometer,
-    Camera,
-    DecodedSpot,
-    DeviceFrame,
-    Led,
-    Part,
-    Sensor,
-    read_dataset,
-    read_frame,
-)
+from estimator.io.dataset import read_dataset, read_frame
+from estimator.io.device import Accelerometer, Camera, DecodedSpot, DeviceFrame, DiscLed, Part, Sensor
 from estimator.io.estimates import EstimateRow
-from estimator.spots.correspondences import correspondences
-from estimator.spots.detect import Readout, detect
 from estimator.methods.catalogue import VARIANTS
+from estimator.spots.correspondences import find_correspondences
+from estimator.spots.detect import Readout, detect
 from vlcrender.dataset.generate import generate
 from vlcrender.dataset.recipe import load_plan
 
@@ -86,8 +77,7 @@ def frame_of(
         exposure_s=1e-3,
         spots=tuple(DecodedSpot(led=10 + led, u_px=rough[k, 0], v_px=rough[k, 1]) for k, led in named.items()),
         leds={
-            10 + k: Led(id=10 + k, position_m=tuple(led), radius_m=RADIUS_M, shape="disc")
-            for k, led in enumerate(LEDS.tolist())
+            10 + k: DiscLed(id=10 + k, position_m=tuple(led), radius_m=RADIUS_M) for k, led in enumerate(LEDS.tolist())
         },
     )
 
@@ -270,7 +260,7 @@ def test_the_stated_covariance_covers_the_error(name: str, variant: str) -> None
 def test_spots_that_are_full_are_flagged_with_and_without_the_noise_of_reading() -> None:
     """Lamps at three times the full well: every second one. The others, at 4000 of 6000 electrons, are not."""
     for name in ("saturated", "saturated, read noise"):
-        seen = correspondences(answers(name)[0].frame)
+        seen = find_correspondences(answers(name)[0].frame)
         assert [correspondence.spot.saturated for correspondence in seen] == [False, True] * 6
 
 
@@ -280,7 +270,7 @@ def test_a_full_pixel_is_known_in_the_noise_of_reading() -> None:
     u, v = VIEW.project(LEDS[[1]])[0].astype(int)
     inside = np.s_[v - 4 : v + 5, u - 4 : u + 5]
     assert frame.clipped(frame.parts[0])[inside].all()
-    assert (frame.parts[0].image_dn[inside] < frame.sensor.largest_dn()).any()
+    assert (frame.parts[0].image_dn[inside] < frame.sensor.saturation_dn()).any()
     u, v = VIEW.project(LEDS[[0]])[0].astype(int)
     assert not frame.clipped(frame.parts[0])[v - 4 : v + 5, u - 4 : u + 5].any()
 

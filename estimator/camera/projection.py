@@ -20,10 +20,12 @@ Floats = NDArray[np.float64]
 MIN_DEPTH_SHARE = 1e-3
 # Distortion is inverted to this residual, in units of the image distance: 1e-8 px at 15 000 px to the image distance.
 MAX_RESIDUAL = 1e-12
+# Local magnification of an image by its distortion above which the coefficients describe no lens.
+MAX_MAGNIFICATION = 1e3
 # OpenCV 4 has the form with criteria under a name of its own.
 undistort_points = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)
 # Its fixed-point iteration gains a constant factor a step, which approaches 1 where the lens folds the image.
-UNDISTORT_CRITERIA = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 500, 1e-14)
+UNDISTORT_CRITERIA = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 10_000, 1e-14)
 
 
 class Projection(Protocol):
@@ -85,8 +87,10 @@ class Perspective:
         rays = np.column_stack([plane, np.ones(len(plane))])
         if self.distortion is not None:
             with np.errstate(all="ignore"):
-                residual = np.linalg.norm(self.project(rays)[0] - image, axis=1)
-            rays[~(residual <= MAX_RESIDUAL)] = np.nan
+                again, jacobian = self.project(rays)
+                found = np.linalg.norm(again - image, axis=1) <= MAX_RESIDUAL
+                found &= np.abs(jacobian[:, :, :2]).max(axis=(1, 2)) <= MAX_MAGNIFICATION
+            rays[~found] = np.nan
         return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
     def defocus_depth_m(self, p_cam: Floats) -> Floats:

@@ -58,13 +58,16 @@ Covariance = Annotated[
     tuple[Number, ...], Strict(False), Field(min_length=9, max_length=9), AfterValidator(_check_covariance)
 ]
 
+UNION_TAGS = ("disc", "square")
+
 RowT = TypeVar("RowT", bound=Row)
 
 
 def first_problem(error: ValidationError) -> str:
     """First of pydantic's errors on one line: `where: what is allowed (got value)`."""
     problem = error.errors(include_url=False)[0]
-    where = ".".join(str(part) for part in problem["loc"]) or "the document"
+    # pydantic adds the tag of a tagged union, which is no key.
+    where = ".".join(str(part) for part in problem["loc"] if part not in UNION_TAGS) or "the document"
     value = repr(problem["input"])
     value = value if len(value) <= 60 else value[:57] + "..."
     got = "" if problem["type"] in ("missing", "json_invalid") else f" (got {value})"

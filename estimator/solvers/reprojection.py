@@ -183,10 +183,10 @@ def fit(observations: Observations, start: Pose, loss: Literal["linear", "soft_l
         white = np.einsum("nij,njk->nik", observations.whitening, of_image).reshape(-1, 6)
         return np.vstack([white, _tilt_jacobian(x, observations)])
 
-    vector = Rotation.from_matrix(start.R_cam_world).as_rotvec()
-    x0 = np.concatenate([vector, start.R_cam_world @ (centre - start.position_m)])
     try:
         with np.errstate(all="ignore"):
+            vector = Rotation.from_matrix(start.R_cam_world).as_rotvec()
+            x0 = np.concatenate([vector, start.R_cam_world @ (centre - start.position_m)])
             # MINPACK ("lm") is several times faster, and has no robust loss.
             found = least_squares(
                 residuals,
