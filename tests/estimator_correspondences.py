@@ -1,4 +1,4 @@
-"""Sightings without an image: centroids drawn around where a lamp's image has its own."""
+"""Simulated correspondences: centroids of points with normal errors, without an image."""
 
 import json
 from dataclasses import replace
@@ -11,11 +11,11 @@ from estimator.spots.detect import Spot
 from estimator.spots.identify import Correspondence
 
 POINT_M = 1e-6
-"""A radius whose eccentricity is nothing: at 3 m it lifts an LED by 3e-13 m."""
+"""A radius without eccentricity: at 3 m it lifts an LED by 3e-13 m."""
 
 
 def device(view: View, error_deg: float, rng: np.random.Generator | None = None) -> DeviceFrame:
-    """A frame that shows nothing; with `rng` its accelerometer has the error on both tilts that it states."""
+    """A frame without an image; with `rng` its accelerometer has the error on both tilts that it states."""
     of = description(view, 1, np.zeros((0, 3)), POINT_M)
     off = np.zeros(2) if rng is None else error_deg * rng.standard_normal(2)
     held = replace(view, tilt_x_deg=view.tilt_x_deg + off[0], tilt_y_deg=view.tilt_y_deg + off[1])

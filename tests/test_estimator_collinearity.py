@@ -1,4 +1,4 @@
-"""The collinearity equations: exact from exact images, as uncertain as least squares have to be, refused by name."""
+"""Collinearity equations: exact for exact images, covariance as least squares predict, failures by name."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from estimator.solvers.collinearity import fit_pose, position_by_collinearity
 
 CEILING_M = 2.7
 PANEL = grid(5, 4, 0.14, (3, 2, CEILING_M))
-LAMPS = grid(6, 4, 1.0, (3.5, 2.5, CEILING_M))
+WIDE_GRID = grid(6, 4, 1.0, (3.5, 2.5, CEILING_M))
 TABLE_1 = np.array([[0.5, 1.5, 3.5], [0.3, 1.9, 3.5], [0.8, 1.2, 3.5], [0.9, 1.1, 3.5]])
 TILTS_DEG = [(0, 0), (0.001, 0), (20, 0), (-35, 40), (60, 0), (50, -50), (60, 60)]
 
@@ -45,20 +45,20 @@ def test_exact_images_of_a_normal_lens_give_the_exact_position(
 def test_exact_images_of_a_fish_eye_give_the_exact_position(
     tilt_x_deg: float, tilt_y_deg: float, yaw_deg: float
 ) -> None:
-    """Also of lamps more than 90 deg off the axis: at 60 and -30 deg of tilt there are some."""
+    """Also of LEDs more than 90 deg off the axis: at 60 and -30 deg of tilt there are some."""
     view = view_of((3.5, 2.5, CEILING_M), 1.5, tilt_x_deg, tilt_y_deg, yaw_deg)
-    found = position_by_collinearity(LAMPS, equidistant(view, LAMPS), Equidistant())
+    found = position_by_collinearity(WIDE_GRID, equidistant(view, WIDE_GRID), Equidistant())
     np.testing.assert_allclose(found, view.position_m, atol=1e-10)
 
 
-def test_lamps_at_different_heights_are_no_obstacle() -> None:
-    leds = LAMPS + np.random.default_rng(1).uniform(0, 0.3, LAMPS.shape) * [0, 0, 1]
+def test_leds_at_different_heights_are_used() -> None:
+    leds = WIDE_GRID + np.random.default_rng(1).uniform(0, 0.3, WIDE_GRID.shape) * [0, 0, 1]
     view = view_of((3.5, 2.5, CEILING_M), 1.5, 15, -20, 70)
     found = position_by_collinearity(leds, equidistant(view, leds), Equidistant())
     np.testing.assert_allclose(found, view.position_m, atol=1e-10)
 
 
-def test_leds_nearly_on_a_line_seldom_lead_elsewhere() -> None:
+def test_leds_nearly_on_a_line_rarely_lead_to_a_wrong_pose() -> None:
     """Table 1's, 100 random poses: 0.3 % were measured to, so more than 3 have a chance of 3e-4; from one start 6 %."""
     rng = np.random.default_rng(6)
     lost = 0
@@ -85,7 +85,7 @@ def test_slopes_are_those_of_differences(projection: Projection) -> None:
     ("projection", "project", "view", "leds", "noise"),
     [
         (Perspective(), perspective, view_of((3, 2, CEILING_M), 2.6, 25, -15, 40), PANEL, 0.02 / 15000),
-        (Equidistant(), equidistant, view_of((3.5, 2.5, CEILING_M), 1.5, 10, -20, 40), LAMPS, 0.02 / 1400),
+        (Equidistant(), equidistant, view_of((3.5, 2.5, CEILING_M), 1.5, 10, -20, 40), WIDE_GRID, 0.02 / 1400),
     ],
     ids=["normal", "fish-eye"],
 )
@@ -117,14 +117,14 @@ def test_the_error_is_what_least_squares_predict(
     assert abs(np.mean(squares) - 3) < 5 * np.sqrt(6 / draws) + 0.03
 
 
-def test_a_start_that_leads_nowhere_is_no_pose() -> None:
+def test_a_start_without_images_gives_no_pose() -> None:
     """Facing away from the LEDs, they have no image in a normal lens."""
     view = view_of((3, 2, CEILING_M), 2.6, 10, 5)
     away = np.diag([1.0, -1.0, -1.0])
     assert fit_pose(PANEL, perspective(view, PANEL), Perspective(), Pose(np.array(view.position_m), away)) is None
 
 
-def test_spots_that_no_pose_explains_are_refused_or_explained_badly_but_never_a_crash() -> None:
+def test_spots_that_no_pose_explains_are_refused_or_fitted_without_a_crash() -> None:
     rng = np.random.default_rng(3)
     outcomes = set()
     for _ in range(40):

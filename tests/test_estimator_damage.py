@@ -106,7 +106,7 @@ def test_a_matrix_of_another_size_is_refused(folder: Path, capsys: pytest.Captur
     assert "truth.parquet: row 0.bound_m2: Tuple should have at" in capsys.readouterr().err
 
 
-def test_good_ones_are_taken(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_valid_covariances_are_read(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Two of three frames have a bound, one a covariance."""
     bounds = [GOOD_BOUND.ravel().tolist(), None, GOOD_BOUND.ravel().tolist()]
     change_column(folder / "truth.parquet", "bound_m2", bounds, pa.list_(pa.float64(), 9))
@@ -166,7 +166,7 @@ def test_a_missing_row_is_refused(folder: Path, capsys: pytest.CaptureFixture[st
     assert "2 rows, needed one for each of the 3 frames, in order" in capsys.readouterr().err
 
 
-def test_a_position_of_nan_is_no_way_either(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_position_of_nan_is_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = folder / "estimates/pnp.parquet"
     positions = pq.read_table(path)["position_m"].to_pylist()
     change_column(path, "position_m", [[np.nan] * 3, *positions[1:]], pa.list_(pa.float64()))

@@ -311,11 +311,11 @@ def write_parts(path: Path, boxes: list[tuple[int, int, int, int]]) -> None:
         data = (np.array([column, row], np.int32), np.array([column + columns - 1, row + rows - 1], np.int32))
         header = {"type": OpenEXR.scanlineimage, "displayWindow": display, "dataWindow": data}
         image = np.full((rows, columns), number + 1, np.uint32)
-        parts.append(OpenEXR.Part(header, {"Y": image}, name=f"window {number}"))
+        parts.append(OpenEXR.Part(header, {"Y": image}, name=f"region {number}"))
     OpenEXR.File(parts).write(str(path))
 
 
-def test_windows_are_read_with_their_places(folder: Path) -> None:
+def test_regions_are_read_with_their_positions(folder: Path) -> None:
     write_parts(folder / "frames/000000.exr", [(10, 20, 30, 40), (100, 0, 5, 6), (200, 380, 100, 20)])
     dataset = read_dataset(folder)
     frame = read_frame(dataset, dataset.frames[0].model_copy(update=rehash(folder)))
@@ -327,7 +327,7 @@ def test_windows_are_read_with_their_places(folder: Path) -> None:
     assert [part.image_dn.max() for part in frame.parts] == [1, 2, 3]
 
 
-def test_windows_that_overlap_or_lie_beyond_the_sensor_are_refused(folder: Path) -> None:
+def test_regions_that_overlap_or_lie_beyond_the_sensor_are_refused(folder: Path) -> None:
     path = folder / "frames/000000.exr"
     write_parts(path, [(10, 20, 30, 40), (39, 59, 5, 5)])
     assert "overlaps another" in refused_frame(folder, **rehash(folder))

@@ -1,4 +1,4 @@
-"""The fit with gravity: honest about its errors, and about when two positions look alike."""
+"""MAP fit with gravity: covariance consistency, ambiguity, and observations that are left out."""
 
 from dataclasses import replace
 
@@ -42,7 +42,7 @@ def nees(answers: list[Estimate], view: View) -> Array:
         pytest.param(grid(2, 2, 0.2, (3, 2, 3.0))[:3], 0.02, 0.1, id="three"),
     ],
 )
-def test_the_covariance_is_honest(leds: Array, sigma_px: float, error_deg: float) -> None:
+def test_the_covariance_is_consistent(leds: Array, sigma_px: float, error_deg: float) -> None:
     """Over n draws the squared errors in units of the covariance add up to chi^2 of 3 n degrees: 3 n +- sqrt(6 n).
 
     The errors are small enough for the problem to be all but linear: 0.5 deg is a hundredth, and where it counts
@@ -72,7 +72,7 @@ def test_gravity_decides_between_the_two_poses_of_a_plane() -> None:
     assert worst_pnp > 1.0
 
 
-def test_two_poses_alike_are_flagged_and_gravity_takes_the_flag_away() -> None:
+def test_two_equal_poses_are_ambiguous_and_gravity_resolves_them() -> None:
     """Four LEDs in 6 cm, 3 m away, 0.1 px: perspective over the pattern is 0.06 / 3 sin(15 deg) of its 60 px, 0.3 px,
     so that both of the plane's poses fit. They are 30 deg apart: an accelerometer good to 20 deg cannot tell, one to
     0.5 deg can.
@@ -91,7 +91,7 @@ def test_two_poses_alike_are_flagged_and_gravity_takes_the_flag_away() -> None:
     assert nees(sure, view).max() < 30.7
 
 
-def test_an_accelerometer_without_error_is_taken_at_its_word() -> None:
+def test_an_accelerometer_without_error_is_exact() -> None:
     """LEDs on a line give no tilt about it; gravity does, exactly."""
     leds = grid(4, 1, 0.14, (3, 2, 3.0))
     view = view_of((3, 2, 3.0), 2.8, 25, -15, 40)
@@ -115,7 +115,7 @@ def test_leds_at_different_heights_are_taken() -> None:
     np.testing.assert_allclose(answer.position_m, view.position_m, atol=1e-8)
 
 
-def test_a_lens_that_cannot_be_taken_out_of_one_spot_costs_that_spot_alone() -> None:
+def test_a_spot_that_cannot_be_undistorted_is_left_out() -> None:
     """A fish-eye, and a spot 85 deg off its axis: the others give the position."""
     leds = grid(3, 3, 0.2, (3, 2, 2.7))
     view = view_of((3, 2, 2.7), 2.5, size=(4000, 3000, 1000.0))

@@ -37,7 +37,7 @@ def test_nothing_is_matched_beyond_the_gate() -> None:
 
 @pytest.mark.parametrize("second_u_px", [111.0, 130.0])
 def test_two_identities_with_one_spot_are_both_left_out(second_u_px: float) -> None:
-    """Two lamps melted into one: the spot may lie much nearer to the brighter one, and is still neither's."""
+    """A merged blob of two LEDs may lie much nearer to the brighter one, and is assigned to no LED."""
     spots = [spot(100, 50), spot(300, 50)]
     assert matches(spots, [claim(1, 95, 50), claim(2, second_u_px, 50), claim(3, 300, 50)]) == {3: 300}
 

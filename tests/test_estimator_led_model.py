@@ -149,7 +149,7 @@ def test_rims_have_the_faces_area_and_go_round_once() -> None:
         assert len(np.unique(points.round(9), axis=0)) == 32
 
 
-def test_light_over_a_face_dims_away_from_the_axis() -> None:
+def test_illumination_falls_away_from_the_axis() -> None:
     """cos^4 of a pinhole: the gradient of -4 log(1 + t^2) / 2 by t is -4 t / (1 + t^2), t the tangent off the axis."""
     view = view_of(TARGET, 3.0, 0.0, 0.0, 0.0, size=(80, 60, 4000.0))
     one = DiscLed(id=1, position_m=(TARGET[0] + 0.9, TARGET[1], TARGET[2]), radius_m=0.012)
@@ -158,7 +158,7 @@ def test_light_over_a_face_dims_away_from_the_axis() -> None:
     assert footprints.illumination_slope[0] == pytest.approx([-4 * 0.3 / 1.09 / 4000, 0.0], rel=1e-3, abs=1e-9)
 
 
-def test_leds_that_are_not_seen_are_nowhere() -> None:
+def test_leds_that_are_not_imaged_have_no_footprint() -> None:
     lens = camera()
     pose = here(lens)
     behind = DiscLed(id=1, position_m=(3.5, 3.6, -5.0), radius_m=0.01)

@@ -42,7 +42,7 @@ def test_the_printed_eq_6_is_right_for_tilt_x_alone() -> None:
     assert np.count_nonzero(np.abs(wrong) > 1e-15) == 2
 
 
-def test_raising_tilt_x_moves_a_lamp_overhead_down_and_tilt_y_moves_it_left() -> None:
+def test_raising_tilt_x_moves_an_led_overhead_down_and_tilt_y_moves_it_left() -> None:
     """So a pixel at v = cy + f tan(30 deg) is overhead for tilt_x = 30 deg, and u = cx - f tan(30 deg) for tilt_y."""
     tangent = np.tan(np.pi / 6)
     overhead = [[200.0, 150.0]]
@@ -52,7 +52,7 @@ def test_raising_tilt_x_moves_a_lamp_overhead_down_and_tilt_y_moves_it_left() ->
 
 @pytest.mark.parametrize("yaw_deg", [0.0, 70.0])
 @pytest.mark.parametrize(("tilt_x_deg", "tilt_y_deg"), [(20, 0), (0, 20), (-35, 40), (60, 60)])
-def test_levelled_pixels_are_those_of_a_level_camera_at_the_same_place(
+def test_leveled_pixels_are_those_of_a_level_camera_at_the_same_place(
     tilt_x_deg: float, tilt_y_deg: float, yaw_deg: float
 ) -> None:
     leds = grid(3, 3, 0.2, (3, 3, 3))
@@ -84,7 +84,7 @@ def test_no_gravity_is_refused() -> None:
         tilt_from_gravity((0.0, 0.0, 0.0))
 
 
-def test_a_real_part_is_less_sure_of_tilt_x_the_more_it_is_tilted_the_other_way() -> None:
+def test_the_error_of_a_real_part_in_tilt_x_grows_with_tilt_y() -> None:
     """Gravity in camera axes is (-sin y, sin x cos y, cos x cos y): raising tilt_x turns it by cos(tilt_y) alone."""
     real, papers = (Accelerometer(kind=kind, error_deg=1.0) for kind in ("imu", "tilt-error"))
     level, aside = (np.degrees(tilt_sigmas(real, np.radians(tilt))) for tilt in (0.0, 60.0))

@@ -82,7 +82,7 @@ def test_amplitudes_are_those_drawn_also_near_to_full(full_well_e: float) -> Non
     assert len(pixels.leds) == 6
 
 
-def test_a_true_led_looks_like_itself_and_a_shifted_one_does_not() -> None:
+def test_a_true_led_is_explained_and_a_shifted_one_is_not() -> None:
     frame = drawn(4000.0, 4)
     pixels, photometry = explained(frame)
     assert (excess_chi2(pixels, pixels.rendered, photometry) < 0).all()
@@ -93,7 +93,7 @@ def test_a_true_led_looks_like_itself_and_a_shifted_one_does_not() -> None:
     assert (excess_chi2(shifted, shifted.rendered, photometry) > 0).all()
 
 
-def test_leds_whose_place_is_not_sure_wait() -> None:
+def test_leds_whose_image_is_uncertain_are_left_out() -> None:
     frame = drawn(4000.0, 5)
     moves = project(SIX, true_pose(frame), frame.camera).slopes[:, :, 5]
     spread = SURE.copy()

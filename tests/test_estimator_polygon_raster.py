@@ -54,7 +54,7 @@ def test_a_circle_covers_what_its_chords_say(radius: float) -> None:
     assert np.abs(found - circle_in_pixels(u, v, radius, size)).max() < MAX_EDGE_PX**2 / (12 * radius) + 2e-5
 
 
-def test_a_window_shows_its_part_of_the_whole() -> None:
+def test_a_region_holds_its_part_of_the_whole() -> None:
     points = circle(20.4, 18.8, 12.5)
     whole = covered(roi(0, 0, 40, 40), points)
     for row, column, height, width in ((12, 15, 9, 30), (0, 0, 12, 12), (25, 25, 3, 3), (15, 30, 4, 8)):
@@ -65,8 +65,8 @@ def test_a_window_shows_its_part_of_the_whole() -> None:
         np.testing.assert_allclose(part, expected, atol=1e-12)
 
 
-def test_windows_do_not_reach_into_each_other() -> None:
-    """The second outline lies beyond its window's right border, the first within its own."""
+def test_regions_do_not_affect_each_other() -> None:
+    """The second outline lies beyond its region's right border, the first within its own."""
     first, second = circle(10.3, 10.1, 5.0), circle(42.6, 9.0, 6.0)
     rois = RoiStack(np.array([0, 2]), np.array([2, 30]), np.array([20, 15]), np.array([15, 12]))
     points = np.concatenate([first, second])
@@ -77,7 +77,7 @@ def test_windows_do_not_reach_into_each_other() -> None:
     np.testing.assert_allclose(rois.roi(both, 1), covered(roi(2, 30, 15, 12), second), atol=1e-12)
 
 
-def test_corners_on_the_lines_between_pixels_lose_nothing() -> None:
+def test_vertices_on_the_lines_between_pixels_keep_the_area() -> None:
     along = np.arange(0, 4, 0.5)
     square = np.concatenate(
         [

@@ -40,7 +40,7 @@ def test_a_pinhole_images_points_where_the_format_says() -> None:
     np.testing.assert_allclose(project(POINTS, pose(lens), lens).pixels, VIEW.project(POINTS), atol=1e-9)
 
 
-def test_lenses_bend_as_the_format_says() -> None:
+def test_distortion_and_fish_eye_are_the_format_s() -> None:
     """One point by hand: (a, b) = (0.2, -0.1) and theta = atan(sqrt(0.05))."""
     level = Pose(np.zeros(3), np.eye(3))
     point = np.array([[0.4, -0.2, 2.0]])
@@ -80,7 +80,7 @@ def test_light_of_a_fish_eye_is_that_of_its_solid_angles() -> None:
     np.testing.assert_allclose(seen.relative_illumination, np.cos(theta) * np.sin(theta) / theta, rtol=1e-9)
 
 
-def test_what_a_lens_does_not_image_has_no_pixel() -> None:
+def test_a_point_outside_the_valid_range_has_no_pixel() -> None:
     level = Pose(np.zeros(3), np.eye(3))
     behind, folded = np.array([[0.1, 0.1, -1.0]]), np.array([[3.0, 0.0, 1.0]])
     assert np.isnan(project(behind, level, camera()).pixels).all()

@@ -71,7 +71,7 @@ def test_an_edge_is_blurred_as_a_disc_does(disc_px: float) -> None:
 
 def test_the_airy_patterns_light_is_where_its_closed_form_says() -> None:
     """Encircled energy 1 - J0^2 - J1^2 (Born & Wolf 8.5.2, Eq. 18) at the first dark ring is 83.8 %; the kernel leaves
-    out the 2 % beyond its reach, and pixels of 1/25 of the ring's diameter cut its rim by less than 1 %.
+    out the 2 % beyond its radius, and pixels of 1/25 of the ring's diameter cut its rim by less than 1 %.
     """
     lens_camera = camera(psf="diffraction", f_number=22.0)
     scale = airy_scale_px(lens_camera)
@@ -84,7 +84,7 @@ def test_the_airy_patterns_light_is_where_its_closed_form_says() -> None:
     assert inside == pytest.approx((1 - j0(x) ** 2 - j1(x) ** 2) / 0.98, abs=0.01)
 
 
-def test_a_measured_kernel_is_taken_as_it_is() -> None:
+def test_a_measured_kernel_is_used_unchanged() -> None:
     """On factor pixels it has nothing between whole ones."""
     rows = [[0.0, 0.1, 0.0], [0.2, 0.4, 0.1], [0.0, 0.2, 0.0]]
     lens = LensBlur(camera(psf="measured", psf_kernel=rows), np.array([3.0]))

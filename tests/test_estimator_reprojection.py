@@ -1,4 +1,4 @@
-"""Where a lamp's image has its centroid, and what a fit does of it."""
+"""Reprojection fit: eccentricity of LED images, and poses and covariances of fits."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -125,9 +125,7 @@ BARREL = Distortion(k1=-0.12, k2=0.0, k3=0.0, p1=0.0, p2=0.0)
         pytest.param(barrel, {"distortion": BARREL}, id="barrel"),
     ],
 )
-def test_what_a_lens_bends_within_a_spot_is_taken_off(
-    lens: Callable[[Array], Array], changes: dict[str, object]
-) -> None:
+def test_eccentricity_by_a_lens_is_corrected(lens: Callable[[Array], Array], changes: dict[str, object]) -> None:
     """Centroids on the sensor, summed up over discs of 2 cm, 2 m away, by the light that a cosine of the axis times a
     solid angle gathers. What is left goes with (r / h)^4 = 1e-8 of 2 m, which the pattern makes some hundred times
     more: 2 um. Left alone, (r / h)^2 = 1e-4 of a plane that is bent by a tenth makes some tens of micrometres.

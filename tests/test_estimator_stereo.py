@@ -118,7 +118,7 @@ def turned(degrees: float) -> Array:
     return np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
 
 
-def test_of_several_mates_the_parallel_one_furthest_beside_is_the_partner() -> None:
+def test_the_partner_is_the_parallel_camera_with_the_longest_baseline() -> None:
     near, far = frame_of((0.05, 0, 0)), frame_of((-0.2, 0.1, 0))
     behind, askew = frame_of((1.0, 0, 0.3)), frame_of((1.0, 0, 0), turned(5))
     other, baseline_m = stereo_partner(replace(frame_of(), other_cameras=(near, behind, far, askew)))
