@@ -2,8 +2,8 @@
 
     python benchmarks/denoise.py [ROUNDS]
 
-Everything is timed in turn, round after round, and the fastest of each counts: on a shared machine the rest is other
-programs' time. Machines differ: compare multiples, and only within one run.
+All are timed in turn, round after round, and the fastest time of each counts: on a shared machine other programs take
+the rest. Compare multiples, and only within one run.
 """
 
 import sys
@@ -16,7 +16,7 @@ from estimator.spots.denoise import DENOISERS, NEIGHBOURHOOD_PX
 
 HEIGHT_PX, WIDTH_PX = 3000, 4000
 ALLOWED = 6.0
-"""The most that `corrected`, which every frame of `huynh2016` pays, may cost."""
+"""Upper limit of the cost of `corrected`, which `huynh2016` applies to every frame."""
 
 
 def main() -> None:

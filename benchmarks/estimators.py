@@ -1,15 +1,14 @@
 """Speed of the estimators: where a frame's time goes, and frames a second of two processes.
 
     vlcrender generate datasets/quickstart.toml --out full
-    vlcrender generate datasets/quickstart.toml --out windows --set poses.count=60 \
-        --set 'windows={kind="leds",margin_px=20}'
-    python benchmarks/estimators.py windows full
+    vlcrender generate datasets/quickstart.toml --out regions --set poses.count=60 \
+        --set 'regions={kind="leds",margin_px=20}'
+    python benchmarks/estimators.py regions full
 
-For each dataset and variant: milliseconds of one core for a frame (the median over frames, each the best of TRIES) to
-read it, to find its spots (`detect`, the denoiser not counted) and for all else, their shares, and the estimate's time
-over the first variant's; then frames a second, reading counted, of WORKERS processes by the clock on the wall, which a
-busy machine slows. The last line says what an 11 x 11 box filter of 12 Mpx took meanwhile. Machines differ and are
-shared: compare within one run only.
+For each dataset and variant, times of one core for a frame in milliseconds (the median over frames, each the best of
+TRIES): to read it, to detect its spots (`detect`, without the denoiser), and the rest; their shares; and the estimate's
+time over the first variant's. Then frames a second, reading included, of WORKERS processes in wall time, which depends
+on the load of the machine. The last line is the time of an 11 x 11 box filter of 12 Mpx. Compare within one run only.
 """
 
 import sys
@@ -27,7 +26,7 @@ import numpy as np
 import estimator.spots.correspondences
 from estimator.evaluate.batch import estimate_frame
 from estimator.io.dataset import read_dataset, read_frame
-from estimator.variants.catalogue import VARIANTS
+from estimator.methods.catalogue import VARIANTS
 
 WORKERS = 2
 TRIES = 3
@@ -35,7 +34,7 @@ MAX_FRAMES = 20
 
 
 class Clock:
-    """Seconds spent in a function."""
+    """Processor time spent in a function."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         """Count calls of this function."""
@@ -104,7 +103,7 @@ def main() -> None:
 
 
 def box_ms() -> float:
-    """A yardstick that others have too."""
+    """Time of a reference operation."""
     image = np.ones((3000, 4000), dtype=np.float32)
     tries = []
     for _ in range(5):

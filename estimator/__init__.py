@@ -1,1 +1,80 @@
-"""Estimates camera positions from images of ceiling LEDs, and judges estimates, from a dataset on disk."""
+"""Estimation of camera positions from images of ceiling LEDs, and scores of the estimates.
+
+A dataset is a folder in the format of datasets/FORMAT.md. Errors of input raise InputError, frames without a position
+EstimationFailure. Submodules are loaded on first use; `import estimator` loads none of them.
+
+    import estimator as est
+
+    dataset = est.read_dataset("out/quickstart")
+    answer = est.estimate(est.read_frame(dataset, 0), "ml")
+    est.run("out/quickstart", ["ml", "gravity-fit"])
+    table = est.score("out/quickstart").to_pandas()
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from estimator.errors import EstimationFailure, InputError
+    from estimator.evaluate.run import run
+    from estimator.evaluate.score import Scores, score
+    from estimator.io.dataset import Dataset, read_dataset, read_frame
+    from estimator.io.device import DeviceFrame, frame
+    from estimator.methods.registry import estimate, variants
+    from estimator.methods.variant import Estimate, Variant
+
+    __version__: str
+
+__all__ = [
+    "Dataset",
+    "DeviceFrame",
+    "Estimate",
+    "EstimationFailure",
+    "InputError",
+    "Scores",
+    "Variant",
+    "__version__",
+    "estimate",
+    "frame",
+    "read_dataset",
+    "read_frame",
+    "run",
+    "score",
+    "variants",
+]
+
+_MODULES = {
+    "Dataset": "estimator.io.dataset",
+    "DeviceFrame": "estimator.io.device",
+    "Estimate": "estimator.methods.variant",
+    "EstimationFailure": "estimator.errors",
+    "InputError": "estimator.errors",
+    "Scores": "estimator.evaluate.score",
+    "Variant": "estimator.methods.variant",
+    "estimate": "estimator.methods.registry",
+    "frame": "estimator.io.device",
+    "read_dataset": "estimator.io.dataset",
+    "read_frame": "estimator.io.dataset",
+    "run": "estimator.evaluate.run",
+    "score": "estimator.evaluate.score",
+    "variants": "estimator.methods.registry",
+}
+
+
+def __getattr__(name: str) -> object:
+    """Load a public name on first use."""
+    if name == "__version__":
+        from importlib.metadata import version
+
+        value: object = version("vlcrender")
+    elif name in _MODULES:
+        value = getattr(import_module(_MODULES[name]), name)
+    else:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    """Public names."""
+    return sorted(__all__)

@@ -1,39 +1,29 @@
-"""The commands `estimator variants | run | score | compare | report`. Errors are one line on stderr and exit code 2."""
+"""Command line `estimator variants | run | score | compare | report`, a thin client of the package's functions.
 
+Errors are one line on stderr and exit code 2. A command loads the modules that it needs when it runs, so that
+`estimator --help` loads neither OpenCV nor SciPy.
+"""
+
+from __future__ import annotations
+
+import logging
 import os
 import sys
-from collections.abc import Sequence
-from importlib.metadata import version
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from io import TextIOWrapper
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, CycloptsError, Parameter
-from rich.console import Console
-from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from rich.table import Table
 
+import estimator
 from estimator.errors import InputError
-from estimator.evaluate.comparison import compare as compare_variants
-from estimator.evaluate.score import Scores, read_or_score, score_dataset
-from estimator.evaluate.score_table import (
-    ERROR_HEADERS,
-    ERROR_NOTE,
-    LIMIT_HEADERS,
-    LIMIT_NOTE,
-    PAIR_HEADERS,
-    PAIR_NOTE,
-    error_cells,
-    limit_cells,
-    pair_cells,
-)
-from estimator.evaluate.workers import estimate_with_workers
-from estimator.io.atomic import write_atomically
-from estimator.io.dataset import read_dataset
-from estimator.io.estimates import write_estimates
-from estimator.report.report import page
-from estimator.variants.registry import Registry
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from estimator.evaluate.score import Scores
 
 INTERNAL_ERROR = 1
 USER_ERROR = 2
@@ -42,7 +32,7 @@ INTERRUPTED = 130
 app = App(
     name="estimator",
     help="Estimate camera positions from images of ceiling LEDs, and judge the estimates.",
-    version=lambda: version("vlcrender"),
+    version=lambda: estimator.__version__,
     exit_on_error=False,
     print_error=False,
     suppress_keyboard_interrupt=False,
@@ -52,15 +42,15 @@ app = App(
 
 @app.command
 def variants() -> None:
-    """List the named pipelines, a line each; those of other packages say whose they are."""
-    registry = Registry.read()
-    usable, complaints = registry.all()
+    """List the variants, a line each, with the package of those that other packages register."""
+    from estimator.methods.registry import Registry
+
+    registry, usable = Registry.read(), estimator.variants()
     width = max(len(variant.name) for variant in usable)
     for variant in usable:
         source = registry.source(variant.name)
-        summary = " ".join(variant.summary.split())  # one of a plug-in may have several lines
+        summary = " ".join(variant.summary.split())  # a plug-in's may have several lines
         print(f"{variant.name:{width}}  {summary}{source and f' (external: {source})'}")
-    _warn(complaints)
 
 
 @app.command
@@ -74,22 +64,31 @@ def run(
     dataset
         Folder of a dataset.
     variant
-        Pipeline to run, may be given several times; all of them when left out.
+        Variant to run; may be given several times. Default: all variants.
     workers
-        Processes to share the frames among; the answers are the same for any number.
+        Number of processes; the estimates do not depend on it.
     """
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from estimator.io.estimates import estimates_path
+
     if workers < 1:
         raise InputError(f"--workers {workers}: is not 1 or more")
-    names = _choose(variant)
-    content = read_dataset(dataset)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True)) as progress:
-        task = progress.add_task("frames", total=len(content.frames))
-        rows = estimate_with_workers(content, names, workers, on_frame=lambda: progress.advance(task))
+    bar = Progress(*columns, console=Console(stderr=True))
+    task = bar.add_task("frames", total=None)
+    with ExitStack() as stack:
+
+        def draw(done: int, total: int) -> None:
+            if done == 0:
+                stack.enter_context(bar)  # not before the dataset is read: an error is one line
+            bar.update(task, completed=done, total=total)
+
+        rows = estimator.run(dataset, variant, workers, draw)
     for name, of_variant in rows.items():
-        path = write_estimates(dataset, name, of_variant)
         ok = sum(row.status == "ok" for row in of_variant)
-        print(f"{name}: {ok} of {len(of_variant)} frames ok -> {path}")
+        print(f"{name}: {ok} of {len(of_variant)} frames ok -> {estimates_path(dataset, name)}")
 
 
 @app.command
@@ -103,7 +102,7 @@ def score(dataset: Path, /, *, json: Annotated[bool, Parameter(negative=())] = F
     json
         Print scores.json instead of a table.
     """
-    scores = score_dataset(dataset)
+    scores = estimator.score(dataset)
     if json:
         print(scores.model_dump_json(indent=1))
     else:
@@ -112,7 +111,7 @@ def score(dataset: Path, /, *, json: Annotated[bool, Parameter(negative=())] = F
 
 @app.command
 def compare(dataset: Path, a: str, b: str, /, *, json: Annotated[bool, Parameter(negative=())] = False) -> None:
-    """Compare two variants frame by frame, scoring the dataset where needed.
+    """Compare two variants frame by frame, scoring the dataset if needed.
 
     Parameters
     ----------
@@ -121,10 +120,14 @@ def compare(dataset: Path, a: str, b: str, /, *, json: Annotated[bool, Parameter
     a
         A variant.
     b
-        Another one.
+        Another variant.
     json
         Print JSON instead of a table.
     """
+    from estimator.evaluate.comparison import compare as compare_variants
+    from estimator.evaluate.score import read_or_score
+    from estimator.evaluate.score_table import PAIR_HEADERS, PAIR_NOTE, pair_cells
+
     if a == b:
         raise InputError(f"{a} and {b}: needed two different variants")
     scores = {of_variant.variant: of_variant for of_variant in read_or_score(dataset).variants}
@@ -144,7 +147,7 @@ def compare(dataset: Path, a: str, b: str, /, *, json: Annotated[bool, Parameter
 
 @app.command
 def report(*datasets: Annotated[Path, Parameter(required=True)], out: Path) -> None:
-    """Write one self-contained HTML page about the datasets' scores, scoring them where needed.
+    """Write one self-contained HTML page of the datasets' scores, scoring them if needed.
 
     Parameters
     ----------
@@ -153,6 +156,10 @@ def report(*datasets: Annotated[Path, Parameter(required=True)], out: Path) -> N
     out
         The page to write.
     """
+    from estimator.evaluate.score import read_or_score
+    from estimator.io.atomic import write_atomically
+    from estimator.report.report import page
+
     if out.is_dir():
         raise InputError(f"--out {out}: is a folder, needed the name of a file")
     write_atomically(out, page([(folder, read_or_score(folder)) for folder in datasets]).encode())
@@ -160,16 +167,17 @@ def report(*datasets: Annotated[Path, Parameter(required=True)], out: Path) -> N
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line and return its exit code; errors of the user's are one line on stderr, never a traceback."""
+    """Run the command line and return its exit code; an error is one line on stderr, without a traceback."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
-            # A terminal without a micro sign gets a question mark, not an error.
+            # A terminal without a micro sign prints a question mark.
             stream.reconfigure(errors="replace")
     try:
-        app(arguments)
+        with _log_on_stderr():
+            app(arguments)
         sys.stdout.flush()
     except BrokenPipeError:
-        # Who read our output has gone (`| head`): end quietly, and keep Python from flushing into the closed pipe.
+        # The reader of the output has exited (`| head`): end without a message, and do not flush into the closed pipe.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except (InputError, CycloptsError) as error:
@@ -179,7 +187,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return _complain("interrupted", INTERRUPTED)
     except Exception as error:
-        # A fault of this program's own; still not a traceback for somebody who cannot use one.
+        # A defect of this program: report it in one line as well.
         return _complain(f"internal error, please report it: {type(error).__name__}: {error}", INTERNAL_ERROR)
     return 0
 
@@ -189,28 +197,41 @@ def _complain(message: str, code: int) -> int:
     return code
 
 
-def _choose(names: Sequence[str] | None) -> list[str]:
-    """The variants named, once each; for None all that can be used, with a warning about each that cannot."""
-    registry = Registry.read()
-    if names is None:
-        usable, complaints = registry.all()
-        _warn(complaints)
-    else:
-        usable = [registry.named(name) for name in names]
-    return list(dict.fromkeys(variant.name for variant in usable))
+class _LineHandler(logging.Handler):
+    """Writes a log record as one line on the current stderr."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write the record."""
+        print(f"estimator: {record.levelname.lower()}:", " ".join(record.getMessage().split()), file=sys.stderr)
 
 
-def _warn(complaints: Sequence[str]) -> None:
-    for complaint in complaints:
-        print("estimator: warning:", " ".join(complaint.split()), file=sys.stderr)
+@contextmanager
+def _log_on_stderr() -> Iterator[None]:
+    """Show the package's warnings on stderr."""
+    handler = _LineHandler(logging.WARNING)
+    logger = logging.getLogger("estimator")
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
 
 
 def _print_scores(scores: Scores) -> None:
+    from estimator.evaluate.score_table import (
+        ERROR_HEADERS,
+        ERROR_NOTE,
+        LIMIT_HEADERS,
+        LIMIT_NOTE,
+        error_cells,
+        limit_cells,
+    )
+
     rows = [(of_variant.variant, error_cells(of_variant), limit_cells(of_variant)) for of_variant in scores.variants]
     errors = _table(f"{scores.dataset}: errors", ERROR_HEADERS, [(name, *cells) for name, cells, _ in rows])
     _print_table(errors, ERROR_NOTE)
     if any(of_variant.against_bound or of_variant.nees or of_variant.ambiguous for of_variant in scores.variants):
-        title = "the bound, and what the variants say of themselves"
+        title = "Cramér-Rao bound and covariance consistency"
         limits = _table(title, LIMIT_HEADERS, [(name, *cells) for name, _, cells in rows])
         _print_table(limits, LIMIT_NOTE)
     for of_variant in scores.variants:
@@ -219,6 +240,9 @@ def _print_scores(scores: Scores) -> None:
 
 
 def _table(title: str, headers: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
+    from rich.markup import escape
+    from rich.table import Table
+
     table = Table(title=escape(title), title_justify="left")
     table.add_column("variant", no_wrap=True)
     for header in headers:
@@ -229,9 +253,11 @@ def _table(title: str, headers: Sequence[str], rows: Sequence[Sequence[str]]) ->
 
 
 def _print_table(table: Table, note: str) -> None:
+    from rich.console import Console
+
     console = Console()
     if not console.is_terminal:
-        # Nothing has to be squeezed into a terminal's width.
+        # A file or pipe has no width to fit into.
         console = Console(width=Console(width=10_000).measure(table).maximum)
     console.print(table)
     console.print(note, markup=False, highlight=False)

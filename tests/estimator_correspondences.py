@@ -1,4 +1,4 @@
-"""Sightings without an image: centroids drawn around where a lamp's image has its own."""
+"""Simulated correspondences: centroids of points with normal errors, without an image."""
 
 import json
 from dataclasses import replace
@@ -6,16 +6,16 @@ from dataclasses import replace
 import numpy as np
 from estimator_synthetic import Array, View, description
 
-from estimator.io.dataset import Accelerometer, Camera, DeviceFrame, Led, Sensor
+from estimator.io.device import Accelerometer, Camera, DeviceFrame, DiscLed, Sensor
 from estimator.spots.detect import Spot
 from estimator.spots.identify import Correspondence
 
 POINT_M = 1e-6
-"""A radius whose eccentricity is nothing: at 3 m it lifts an LED by 3e-13 m."""
+"""A radius without eccentricity: at 3 m it lifts an LED by 3e-13 m."""
 
 
 def device(view: View, error_deg: float, rng: np.random.Generator | None = None) -> DeviceFrame:
-    """A frame that shows nothing; with `rng` its accelerometer has the error on both tilts that it states."""
+    """A frame without an image; with `rng` its accelerometer has the error on both tilts that it states."""
     of = description(view, 1, np.zeros((0, 3)), POINT_M)
     off = np.zeros(2) if rng is None else error_deg * rng.standard_normal(2)
     held = replace(view, tilt_x_deg=view.tilt_x_deg + off[0], tilt_y_deg=view.tilt_y_deg + off[1])
@@ -32,7 +32,7 @@ def device(view: View, error_deg: float, rng: np.random.Generator | None = None)
     )
 
 
-def sighted(
+def simulated(
     view: View, leds_m: Array, sigma_px: float = 0.0, rng: np.random.Generator | None = None
 ) -> list[Correspondence]:
     """Points (n, 3) seen from a view, with normal errors of their pixels where `rng` is given."""
@@ -41,7 +41,7 @@ def sighted(
         pixels = pixels + rng.normal(0, sigma_px, pixels.shape)
     return [
         Correspondence(
-            Led(id=k, position_m=(x, y, z), radius_m=POINT_M, shape="disc"),
+            DiscLed(id=k, position_m=(x, y, z), radius_m=POINT_M),
             Spot(u, v, sigma_px**2 * np.eye(2), u, v, 50, 1000.0, touches_border=False, saturated=False),
         )
         for k, ((x, y, z), (u, v)) in enumerate(zip(leds_m.tolist(), pixels.tolist(), strict=True))

@@ -94,9 +94,9 @@ def render(
 
         def inside(u: Array, v: Array, led: Array = led) -> NDArray[np.bool_]:
             x, y, z = np.tensordot(to_plane, np.stack([u, v, np.ones_like(u)]), axes=1)
-            reach = (led[2] - view.position_m[2]) / z
+            distance = (led[2] - view.position_m[2]) / z
             return np.asarray(
-                (x * reach + view.position_m[0] - led[0]) ** 2 + (y * reach + view.position_m[1] - led[1]) ** 2
+                (x * distance + view.position_m[0] - led[0]) ** 2 + (y * distance + view.position_m[1] - led[1]) ** 2
                 <= radius_m**2
             )
 
@@ -220,7 +220,7 @@ def description(view: View, frame_count: int, leds_m: Array, radius_m: float) ->
     pitch_um = 18000 / view.focal_px
     return {
         "format": "vlcrender-dataset",
-        "version": 3,
+        "version": 4,
         "name": "synthetic <&>",
         "frame_count": frame_count,
         "cameras": {

@@ -7,11 +7,12 @@ import pyarrow.parquet as pq
 import pytest
 from conftest import ROOT
 
-from estimator.camera.leveling import level, rotation, tilt_from_gravity
+from estimator.camera.leveling import level, tilt_from_gravity
+from estimator.camera.pose import rotation
 from estimator.io.dataset import Dataset, read_dataset, read_frame
+from estimator.methods.catalogue import VARIANTS, variant_named
 from estimator.solvers.ranging import law_of_sines, led_ranges
 from estimator.solvers.trilateration import position_from_ranges
-from estimator.variants.catalogue import VARIANTS, variant_named
 from vlcrender.camera.intrinsics import Camera
 from vlcrender.dataset.generate import generate
 from vlcrender.dataset.recipe import load_plan
@@ -82,7 +83,7 @@ def test_without_noise_huynh2016_errs_only_by_what_a_pixel_can_explain(ideal: Pa
                     r,
                     position,
                     np.array(dataset.leds[led].position_m),
-                    dataset.leds[led].radius_m,
+                    dataset.leds[led].half_width_m,
                 )
                 for led in ids
             ]

@@ -8,11 +8,12 @@ import pyarrow.parquet as pq
 import pytest
 from conftest import ROOT, SMALL
 
-from estimator.camera.leveling import level, rotation, tilt_from_gravity
+from estimator.camera.leveling import level, tilt_from_gravity
+from estimator.camera.pose import rotation
 from estimator.camera.undistort import MAX_FIELD_ANGLE_DEG, pinhole_pixels
 from estimator.io.dataset import Camera as DeviceCamera
 from estimator.io.dataset import DeviceFrame, read_dataset, read_frame
-from estimator.variants.catalogue import VARIANTS
+from estimator.methods.catalogue import VARIANTS
 from vlcrender.camera.distortion import Distortion
 from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.posed_camera import PosedCamera

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from estimator_synthetic import small_dataset
 
-from estimator import cli
+import estimator
 from estimator.cli import main
 from estimator.io.estimates import EstimateRow, write_estimates
-from estimator.variants.catalogue import VARIANTS
+from estimator.methods.catalogue import VARIANTS
 
 
 @pytest.fixture(scope="module")
@@ -199,7 +199,7 @@ def raises(error: BaseException) -> object:
         (ZeroDivisionError("a\nb"), 1, "internal error, please report it: ZeroDivisionError: a b"),
     ],
 )
-def test_no_traceback_reaches_anybody(
+def test_every_exception_is_one_line_without_a_traceback(
     dataset: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -207,7 +207,7 @@ def test_no_traceback_reaches_anybody(
     code: int,
     words: str,
 ) -> None:
-    monkeypatch.setattr(cli, "score_dataset", raises(error))
+    monkeypatch.setattr(estimator, "score", raises(error))
     assert main(["score", str(dataset)]) == code
     assert capsys.readouterr().err == f"estimator: {words}\n"
 

@@ -1,15 +1,17 @@
-"""The collinearity equations: exact from exact images, as uncertain as least squares have to be, refused by name."""
+"""Collinearity equations: exact for exact images, covariance as least squares predict, failures by name."""
 
 import numpy as np
 import pytest
 from estimator_synthetic import Array, View, grid, view_of
 
+from estimator.camera.pose import Pose
+from estimator.camera.projection import Equidistant, Perspective, Projection
 from estimator.errors import EstimationFailure
-from estimator.solvers.collinearity import Projection, gauss_newton, image_of, position_by_collinearity
+from estimator.solvers.collinearity import fit_pose, position_by_collinearity
 
 CEILING_M = 2.7
 PANEL = grid(5, 4, 0.14, (3, 2, CEILING_M))
-LAMPS = grid(6, 4, 1.0, (3.5, 2.5, CEILING_M))
+WIDE_GRID = grid(6, 4, 1.0, (3.5, 2.5, CEILING_M))
 TABLE_1 = np.array([[0.5, 1.5, 3.5], [0.3, 1.9, 3.5], [0.8, 1.2, 3.5], [0.9, 1.1, 3.5]])
 TILTS_DEG = [(0, 0), (0.001, 0), (20, 0), (-35, 40), (60, 0), (50, -50), (60, 60)]
 
@@ -33,7 +35,7 @@ def test_exact_images_of_a_normal_lens_give_the_exact_position(
     leds: Array, tilt_x_deg: float, tilt_y_deg: float, yaw_deg: float
 ) -> None:
     view = view_of(leds.mean(axis=0), 2.6, tilt_x_deg, tilt_y_deg, yaw_deg)
-    found = position_by_collinearity(leds, perspective(view, leds), "perspective")
+    found = position_by_collinearity(leds, perspective(view, leds), Perspective())
     # 1e-16 of rounding; Table 1's LEDs, 0.065 m wide at up to 10 m, magnify it some (10 / 0.065)^3 times.
     np.testing.assert_allclose(found, view.position_m, atol=1e-8)
 
@@ -43,47 +45,47 @@ def test_exact_images_of_a_normal_lens_give_the_exact_position(
 def test_exact_images_of_a_fish_eye_give_the_exact_position(
     tilt_x_deg: float, tilt_y_deg: float, yaw_deg: float
 ) -> None:
-    """Also of lamps more than 90 deg off the axis: at 60 and -30 deg of tilt there are some."""
+    """Also of LEDs more than 90 deg off the axis: at 60 and -30 deg of tilt there are some."""
     view = view_of((3.5, 2.5, CEILING_M), 1.5, tilt_x_deg, tilt_y_deg, yaw_deg)
-    found = position_by_collinearity(LAMPS, equidistant(view, LAMPS), "equidistant")
+    found = position_by_collinearity(WIDE_GRID, equidistant(view, WIDE_GRID), Equidistant())
     np.testing.assert_allclose(found, view.position_m, atol=1e-10)
 
 
-def test_lamps_at_different_heights_are_no_obstacle() -> None:
-    leds = LAMPS + np.random.default_rng(1).uniform(0, 0.3, LAMPS.shape) * [0, 0, 1]
+def test_leds_at_different_heights_are_used() -> None:
+    leds = WIDE_GRID + np.random.default_rng(1).uniform(0, 0.3, WIDE_GRID.shape) * [0, 0, 1]
     view = view_of((3.5, 2.5, CEILING_M), 1.5, 15, -20, 70)
-    found = position_by_collinearity(leds, equidistant(view, leds), "equidistant")
+    found = position_by_collinearity(leds, equidistant(view, leds), Equidistant())
     np.testing.assert_allclose(found, view.position_m, atol=1e-10)
 
 
-def test_leds_nearly_on_a_line_seldom_lead_elsewhere() -> None:
+def test_leds_nearly_on_a_line_rarely_lead_to_a_wrong_pose() -> None:
     """Table 1's, 100 random poses: 0.3 % were measured to, so more than 3 have a chance of 3e-4; from one start 6 %."""
     rng = np.random.default_rng(6)
     lost = 0
     for _ in range(100):
         tilt_x, tilt_y = rng.uniform(-60, 60, 2)
         view = view_of(TABLE_1.mean(axis=0), rng.uniform(1, 2.6), tilt_x, tilt_y, rng.uniform(-180, 180))
-        found = position_by_collinearity(TABLE_1, perspective(view, TABLE_1), "perspective")
+        found = position_by_collinearity(TABLE_1, perspective(view, TABLE_1), Perspective())
         lost += np.linalg.norm(found - view.position_m) > 1e-6
     assert lost <= 3
 
 
-@pytest.mark.parametrize("projection", ["perspective", "equidistant"])
+@pytest.mark.parametrize("projection", [Perspective(), Equidistant()])
 def test_slopes_are_those_of_differences(projection: Projection) -> None:
     """On the axis too, and beside it. Central differences of step h are off by h^2, and by rounding over h: 1e-9."""
     points = np.array([[0.3, -0.2, 1.1], [0.0, 0.0, 2.0], [1e-7, 0.0, 2.0], [1e-5, 2e-5, 0.7], [-2.0, 1.0, 0.4]])
-    _, slopes = image_of(points, projection)
+    _, slopes = projection.project(points)
     for axis in range(3):
         step = 1e-5 * np.eye(3)[axis]
-        ahead, behind = image_of(points + step, projection)[0], image_of(points - step, projection)[0]
+        ahead, behind = projection.project(points + step)[0], projection.project(points - step)[0]
         np.testing.assert_allclose(slopes[:, :, axis], (ahead - behind) / 2e-5, atol=1e-8)
 
 
 @pytest.mark.parametrize(
     ("projection", "project", "view", "leds", "noise"),
     [
-        ("perspective", perspective, view_of((3, 2, CEILING_M), 2.6, 25, -15, 40), PANEL, 0.02 / 15000),
-        ("equidistant", equidistant, view_of((3.5, 2.5, CEILING_M), 1.5, 10, -20, 40), LAMPS, 0.02 / 1400),
+        (Perspective(), perspective, view_of((3, 2, CEILING_M), 2.6, 25, -15, 40), PANEL, 0.02 / 15000),
+        (Equidistant(), equidistant, view_of((3.5, 2.5, CEILING_M), 1.5, 10, -20, 40), WIDE_GRID, 0.02 / 1400),
     ],
     ids=["normal", "fish-eye"],
 )
@@ -115,20 +117,20 @@ def test_the_error_is_what_least_squares_predict(
     assert abs(np.mean(squares) - 3) < 5 * np.sqrt(6 / draws) + 0.03
 
 
-def test_a_start_that_leads_nowhere_is_no_pose() -> None:
+def test_a_start_without_images_gives_no_pose() -> None:
     """Facing away from the LEDs, they have no image in a normal lens."""
     view = view_of((3, 2, CEILING_M), 2.6, 10, 5)
     away = np.diag([1.0, -1.0, -1.0])
-    assert gauss_newton(PANEL, perspective(view, PANEL), "perspective", (away, np.array(view.position_m))) is None
+    assert fit_pose(PANEL, perspective(view, PANEL), Perspective(), Pose(np.array(view.position_m), away)) is None
 
 
-def test_spots_that_no_pose_explains_are_refused_or_explained_badly_but_never_a_crash() -> None:
+def test_spots_that_no_pose_explains_are_refused_or_fitted_without_a_crash() -> None:
     rng = np.random.default_rng(3)
     outcomes = set()
     for _ in range(40):
         image = rng.normal(0, 0.1, (4, 2)) if rng.uniform() < 0.8 else np.zeros((4, 2))
         try:
-            assert np.isfinite(position_by_collinearity(PANEL[[0, 4, 15, 19]], image, "perspective")).all()
+            assert np.isfinite(position_by_collinearity(PANEL[[0, 4, 15, 19]], image, Perspective())).all()
             outcomes.add("found")
         except EstimationFailure as failure:
             outcomes.add(str(failure))
@@ -139,7 +141,7 @@ def test_spots_that_no_pose_explains_are_refused_or_explained_badly_but_never_a_
 def test_too_few_and_lines_are_refused() -> None:
     view = view_of((3, 2, CEILING_M), 2.6, 10, 5)
     with pytest.raises(EstimationFailure, match="position: LEDs identified: 3, needed: 4"):
-        position_by_collinearity(PANEL[:3], perspective(view, PANEL[:3]), "perspective")
+        position_by_collinearity(PANEL[:3], perspective(view, PANEL[:3]), Perspective())
     line = PANEL[:5]
     with pytest.raises(EstimationFailure, match="position: the LEDs are on one line"):
-        position_by_collinearity(line, perspective(view, line), "perspective")
+        position_by_collinearity(line, perspective(view, line), Perspective())

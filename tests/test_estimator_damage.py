@@ -106,7 +106,7 @@ def test_a_matrix_of_another_size_is_refused(folder: Path, capsys: pytest.Captur
     assert "truth.parquet: row 0.bound_m2: Tuple should have at" in capsys.readouterr().err
 
 
-def test_good_ones_are_taken(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_valid_covariances_are_read(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Two of three frames have a bound, one a covariance."""
     bounds = [GOOD_BOUND.ravel().tolist(), None, GOOD_BOUND.ravel().tolist()]
     change_column(folder / "truth.parquet", "bound_m2", bounds, pa.list_(pa.float64(), 9))
@@ -128,7 +128,7 @@ def first_frame(scores: dict[str, Any]) -> dict[str, Any]:
 SCORES: dict[str, Callable[[dict[str, Any]], Any]] = {
     "not an object": lambda s: [],
     "no version": lambda s: {},
-    "a version to come": lambda s: s | {"version": 3},
+    "a version to come": lambda s: s | {"version": 4},
     "another format": lambda s: s | {"format": "x"},
     "no room": lambda s: s | {"room_m": [0, 1, 1]},
     "frames out of order": lambda s: s["variants"][0]["rows"].reverse(),
@@ -136,7 +136,7 @@ SCORES: dict[str, Callable[[dict[str, Any]], Any]] = {
     "ok without an error": lambda s: first_frame(s).update(error_3d_m=None),
     "failed with an error": lambda s: first_frame(s).update(status="failed"),
     "a negative error": lambda s: first_frame(s).update(error_3d_m=-1.0),
-    "coverage of 2": lambda s: s["variants"][0].update(coverage=2.0),
+    "success rate of 2": lambda s: s["variants"][0].update(success_rate=2.0),
 }
 
 
@@ -152,21 +152,21 @@ def test_scores_against_their_format_are_refused(folder: Path, capsys: pytest.Ca
     assert error.count("\n") == 1
 
 
-def test_scores_of_the_version_before_are_made_again(folder: Path) -> None:
+def test_scores_of_an_older_version_are_computed_again(folder: Path) -> None:
     path = folder / "scores.json"
-    path.write_text('{"format": "estimator-scores", "version": 1}')
+    path.write_text('{"format": "estimator-scores", "version": 2}')
     assert main(["report", str(folder), "--out", str(folder / "x.html")]) == 0
-    assert json.loads(path.read_text())["version"] == 2
+    assert json.loads(path.read_text())["version"] == 3
 
 
-def test_a_row_less_is_no_way_to_leave_a_frame_out(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_missing_row_is_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = folder / "estimates/pnp.parquet"
     pq.write_table(pq.read_table(path).slice(0, 2), path)
     assert main(["score", str(folder)]) == 2
     assert "2 rows, needed one for each of the 3 frames, in order" in capsys.readouterr().err
 
 
-def test_a_position_of_nan_is_no_way_either(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_position_of_nan_is_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = folder / "estimates/pnp.parquet"
     positions = pq.read_table(path)["position_m"].to_pylist()
     change_column(path, "position_m", [[np.nan] * 3, *positions[1:]], pa.list_(pa.float64()))

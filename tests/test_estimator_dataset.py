@@ -84,12 +84,12 @@ def test_electrons_undo_the_black_level_and_the_gain(folder: Path) -> None:
 def test_a_full_pixel_is_clipped_at_the_full_well_or_at_the_last_number(folder: Path) -> None:
     change_json(folder, lambda c: c["sensor"].update(full_well_e=4000, gain_e_per_dn=2, black_level_dn=10))
     dataset = read_dataset(folder)
-    assert dataset.sensor.largest_dn() == 2010
+    assert dataset.sensor.saturation_dn() == 2010
     frame = read_frame(dataset, dataset.frames[0])
     (part,) = frame.parts
     np.testing.assert_array_equal(frame.clipped(part), part.image_dn >= 2010)
     change_json(folder, lambda c: c["sensor"].update(bits=10))
-    assert read_dataset(folder).sensor.largest_dn() == 1023
+    assert read_dataset(folder).sensor.saturation_dn() == 1023
 
 
 def test_provenance_is_not_needed_and_not_kept(folder: Path) -> None:
@@ -98,10 +98,12 @@ def test_provenance_is_not_needed_and_not_kept(folder: Path) -> None:
 
 
 def test_only_the_scorer_knows_of_the_truth() -> None:
-    sources = sorted((Path(__file__).parent.parent / "estimator").rglob("*.py"))
+    package = Path(__file__).parent.parent / "estimator"
     assert [
-        path.name for path in sources if "truth.parquet" in re.sub(r'""".*?"""', "", path.read_text(), flags=re.S)
-    ] == ["score.py"]
+        path.relative_to(package).as_posix()
+        for path in package.rglob("*.py")
+        if "truth.parquet" in re.sub(r'""".*?"""', "", path.read_text(), flags=re.S)
+    ] == ["evaluate/score.py"]
 
 
 JSON_KEYS = ["format", "version", "name", "frame_count", "cameras", "sensor", "accelerometer", "led_map", "room_m"]
@@ -309,11 +311,11 @@ def write_parts(path: Path, boxes: list[tuple[int, int, int, int]]) -> None:
         data = (np.array([column, row], np.int32), np.array([column + columns - 1, row + rows - 1], np.int32))
         header = {"type": OpenEXR.scanlineimage, "displayWindow": display, "dataWindow": data}
         image = np.full((rows, columns), number + 1, np.uint32)
-        parts.append(OpenEXR.Part(header, {"Y": image}, name=f"window {number}"))
+        parts.append(OpenEXR.Part(header, {"Y": image}, name=f"region {number}"))
     OpenEXR.File(parts).write(str(path))
 
 
-def test_windows_are_read_with_their_places(folder: Path) -> None:
+def test_regions_are_read_with_their_positions(folder: Path) -> None:
     write_parts(folder / "frames/000000.exr", [(10, 20, 30, 40), (100, 0, 5, 6), (200, 380, 100, 20)])
     dataset = read_dataset(folder)
     frame = read_frame(dataset, dataset.frames[0].model_copy(update=rehash(folder)))
@@ -325,7 +327,7 @@ def test_windows_are_read_with_their_places(folder: Path) -> None:
     assert [part.image_dn.max() for part in frame.parts] == [1, 2, 3]
 
 
-def test_windows_that_overlap_or_lie_beyond_the_sensor_are_refused(folder: Path) -> None:
+def test_regions_that_overlap_or_lie_beyond_the_sensor_are_refused(folder: Path) -> None:
     path = folder / "frames/000000.exr"
     write_parts(path, [(10, 20, 30, 40), (39, 59, 5, 5)])
     assert "overlaps another" in refused_frame(folder, **rehash(folder))

@@ -36,8 +36,8 @@ def test_it_is_c_minus_the_mean_difference() -> None:
 def test_at_the_border_the_mean_is_over_the_neighbours_there_are() -> None:
     image = np.random.default_rng(3).poisson(50, (14, 17)).astype(np.float32)
     result = neighbourhood_mean(image)
-    corner = np.delete(image[:6, :6].ravel(), 0)
-    np.testing.assert_allclose(result[0, 0], corner.mean(), rtol=3e-7)
+    first = np.delete(image[:6, :6].ravel(), 0)
+    np.testing.assert_allclose(result[0, 0], first.mean(), rtol=3e-7)
     side = np.delete(image[3:14, 11:].ravel(), 5 * 6 + 5)
     np.testing.assert_allclose(result[8, 16], side.mean(), rtol=3e-7)
 
@@ -51,7 +51,7 @@ def test_a_flat_image_stays_flat_and_the_input_stays_as_it_was() -> None:
 def test_shot_noise_shrinks_to_1_in_120() -> None:
     image = np.random.default_rng(4).poisson(100, (400, 400)).astype(np.float32)
     inner = neighbourhood_mean(image)[5:-5:12, 5:-5:12]
-    # 33 x 33 windows that do not overlap: independent means with variance 100 / 120. The sample variance of n normal
+    # 33 x 33 squares that do not overlap: independent means with variance 100 / 120. The sample variance of n normal
     # values has a relative standard error of sqrt(2 / (n - 1)).
     n = inner.size
     assert abs(inner.var(ddof=1) / (100 / 120) - 1) < 5 * np.sqrt(2 / (n - 1))
@@ -71,7 +71,7 @@ def test_the_printed_lines_computed_one_by_one() -> None:
     assert algorithm_1(image)[6, 8] == pytest.approx((sigma**2 + mu) / 2, rel=1e-4, abs=1e-4)
 
 
-def test_the_printed_lines_leave_nothing_of_a_lamp_but_its_edges() -> None:
+def test_the_printed_lines_leave_only_the_edges_of_an_led_image() -> None:
     """Where the pixel is as bright as all around it, mu = SSoID = 0, however bright that is."""
     image = np.zeros((60, 60), np.float32)
     image[15:45, 15:45] = 3000
@@ -101,7 +101,7 @@ def test_the_inverse_is_unbiased_and_the_noise_even(mean_e: float) -> None:
         assert abs(weights @ values**2 - mean**2 - 1) < 0.01
 
 
-def test_read_noise_is_stabilised_and_taken_off_again() -> None:
+def test_read_noise_is_stabilised_and_subtracted() -> None:
     """Poisson and Gaussian noise together, 10 e and 3 e: mean and variance within 5 standard errors of 10 and 1.
 
     The closed form is off by up to 0.02 e, and the variance by a term of order 1 / 19^2.
@@ -139,10 +139,10 @@ def test_every_denoiser_takes_any_image_and_leaves_it(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", DENOISERS)
-def test_no_denoiser_reaches_further_than_it_says(name: str) -> None:
+def test_no_denoiser_exceeds_its_radius(name: str) -> None:
     denoiser = DENOISERS[name]
     image = np.random.default_rng(10).poisson(50, (40, 40)).astype(np.float32)
     other = image.copy()
     other[20, 20] += 500
     changed = np.argwhere(denoiser.apply(image, 0.0) != denoiser.apply(other, 0.0)) - 20
-    assert np.abs(changed).max() == denoiser.reach_px
+    assert np.abs(changed).max() == denoiser.radius_px

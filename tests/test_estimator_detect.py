@@ -6,7 +6,7 @@ import pytest
 from estimator_synthetic import Array, View, grid, poisson, render, view_of
 
 from estimator.errors import EstimationFailure
-from estimator.spots.denoise import REACH_PX, neighbourhood_mean
+from estimator.spots.denoise import NEIGHBOURHOOD_RADIUS_PX, neighbourhood_mean
 from estimator.spots.detect import Readout, Spot, detect
 
 SMALL = (400, 300, 1500.0)
@@ -18,7 +18,9 @@ def spots_of(expected_e: Array, denoised: bool = False) -> list[Spot]:
     image = expected_e.astype(np.float32)
     none_full = np.zeros(image.shape, bool)
     if denoised:
-        return list(detect([Readout(0, 0, neighbourhood_mean(image), image, none_full)], image.size, REACH_PX))
+        return list(
+            detect([Readout(0, 0, neighbourhood_mean(image), image, none_full)], image.size, NEIGHBOURHOOD_RADIUS_PX)
+        )
     return list(detect([Readout(0, 0, image, image, none_full)], image.size, 0))
 
 
@@ -55,7 +57,7 @@ def test_a_uniform_disc_has_its_centroid_at_its_centre(
 ) -> None:
     """Level and noise-free, the image of a disc is a disc around the image of its centre."""
     view = view_of((3, 3, 3), 3.0, size=size)
-    # 16 x 16 samples err by 0.3 / 16^1.5 of the lamp in each of some 2 pi r edge pixels, at a lever of r / sqrt(2).
+    # 16 x 16 samples err by 0.3 / 16^1.5 of the light in each of some 2 pi r edge pixels, at a lever of r / sqrt(2).
     edge = 0.3 / 16**1.5 * np.sqrt(2 * np.pi * radius_px) * radius_px / np.sqrt(2) / (np.pi * radius_px**2)
     for shift in [(0, 0), (0.0007, 0.0003), (-0.004, 0.0021)]:
         led = np.array([[3 + shift[0], 3 + shift[1], 3.0]])
@@ -79,7 +81,7 @@ def test_scatter_agrees_with_the_stated_covariance(denoised: bool, led_e: float,
 
 
 @pytest.mark.parametrize("size", [SMALL, (1200, 900, 4500.0)])
-def test_dim_and_bright_lamps_are_all_found_before_walls_and_panels(size: tuple[int, int, float]) -> None:
+def test_dim_and_bright_leds_are_all_found_before_walls_and_panels(size: tuple[int, int, float]) -> None:
     """Lamps of 4000 to 16000 electrons before a background of 40 to 100 with straight edges in it."""
     view = view_of((3, 3, 3), 3.0, 25, -15, size=size)
     leds = grid(4, 3, 0.16, (3, 3, 3))
@@ -88,12 +90,12 @@ def test_dim_and_bright_lamps_are_all_found_before_walls_and_panels(size: tuple[
     expected[size[1] // 2 :] += 20
     spots = spots_of(poisson(expected, 1))
     assert len(spots) == len(leds)
-    # The wall's edge through a lamp's window pulls by a few hundredths; the rest is shot noise of 0.01 px.
+    # The wall's edge through an LED's region biases by a few hundredths; the rest is shot noise of 0.01 px.
     assert np.abs(by_nearest(spots, view.project(leds))).max() < 0.1
 
 
-def test_a_neighbour_in_the_window_does_not_pull() -> None:
-    """Two lamps whose rims are 7 pixels apart, one 4 times brighter: shared windows are split between them."""
+def test_a_neighbour_in_the_support_does_not_bias() -> None:
+    """Two LEDs whose rims are 7 pixels apart, one 4 times brighter: shared supports are split between them."""
     view = view_of((3, 3, 3), 3.0, size=(80, 60, 1500.0))
     leds = np.array([[2.983, 3.0, 3.0], [3.017, 3.0, 3.0]])
     spots = spots_of(render(view, leds, led_e=[2000, 8000]))
@@ -101,8 +103,8 @@ def test_a_neighbour_in_the_window_does_not_pull() -> None:
     assert np.abs(by_nearest(spots, view.project(leds))).max() < 0.01
 
 
-def test_a_neighbour_s_blurred_light_does_not_pull() -> None:
-    """Rims 10 px apart: the denoiser brings each lamp's light 5 px closer, into the other's window of 7 px."""
+def test_a_neighbour_s_blurred_light_does_not_bias() -> None:
+    """Rims 10 px apart: the denoiser brings each LED's light 5 px closer, into the other's support of 7 px."""
     view = view_of((3, 3, 3), 3.0, size=(400, 300, 7500.0))
     leds = np.array([[2.988, 3.0, 3.0], [3.012, 3.0, 3.0]])
     spots = spots_of(render(view, leds), denoised=True)
@@ -110,7 +112,7 @@ def test_a_neighbour_s_blurred_light_does_not_pull() -> None:
     assert np.abs(by_nearest(spots, view.project(leds))).max() < 0.01
 
 
-def test_lamps_of_one_electron_are_found() -> None:
+def test_leds_of_one_electron_are_found() -> None:
     """Noise level 0 dB: mean 1 electron in the brightest pixel, over discs of 7800 pixels."""
     view = view_of((3, 3, 3), 3.0, size=(900, 700, 15000.0))
     leds = grid(2, 2, 0.08, (3, 3, 3))
@@ -121,7 +123,7 @@ def test_lamps_of_one_electron_are_found() -> None:
 
 
 @pytest.mark.parametrize(("du", "dv"), [(0.01, 0), (0, 0.01)])
-def test_a_lamp_moved_along_x_or_y_moves_right_or_down(du: float, dv: float) -> None:
+def test_an_led_moved_along_x_or_y_moves_right_or_down(du: float, dv: float) -> None:
     view = view_of((3, 3, 3), 3.0, size=SMALL)
     (before,) = spots_of(render(view, np.array([[3.0, 3, 3]])))
     (after,) = spots_of(render(view, np.array([[3 + du, 3 + dv, 3]])))
@@ -143,18 +145,20 @@ def test_spots_at_the_border_are_flagged_and_others_are_not() -> None:
 def test_saturation_is_told_from_the_raw_image() -> None:
     view = view_of((3, 3, 3), 3.0, size=SMALL)
     image = render(view, np.array([[2.9, 3, 3], [3.1, 3, 3]]), led_e=[900, 1000]).astype(np.float32)
-    spots = detect([Readout(0, 0, neighbourhood_mean(image), image, image >= 1000)], image.size, REACH_PX)
+    spots = detect(
+        [Readout(0, 0, neighbourhood_mean(image), image, image >= 1000)], image.size, NEIGHBOURHOOD_RADIUS_PX
+    )
     assert {spot.u_px > 200: spot.saturated for spot in spots} == {False: False, True: True}
 
 
 @pytest.mark.parametrize("background_e", [0.0, 0.01, 40.0])
-def test_an_image_without_lamps_is_a_named_failure(background_e: float) -> None:
+def test_an_image_without_leds_is_a_named_failure(background_e: float) -> None:
     with pytest.raises(EstimationFailure, match="detect: no spot"):
         spots_of(poisson(np.full((300, 400), background_e), 1))
 
 
-def windows_around(image: Array, pixels: Array, half_px: int, denoised: bool) -> list[Readout]:
-    """Square windows of an image around pixels (n, 2), as if nothing else had been read out."""
+def regions_around(image: Array, pixels: Array, half_px: int, denoised: bool) -> list[Readout]:
+    """Square regions of an image around pixels (n, 2), as if nothing else had been read out."""
     readouts = []
     for u, v in pixels.astype(int):
         row, column = max(v - half_px, 0), max(u - half_px, 0)
@@ -165,8 +169,8 @@ def windows_around(image: Array, pixels: Array, half_px: int, denoised: bool) ->
 
 
 @pytest.mark.parametrize("denoised", [False, True])
-def test_windows_give_the_spots_of_the_whole_image(denoised: bool) -> None:
-    """Discs of 12 px radius fill a third of windows of 36 px: not what most pixels are, but what the outermost are, is
+def test_regions_give_the_spots_of_the_full_frame(denoised: bool) -> None:
+    """Discs of 12 px radius fill a third of regions of 36 px: not most pixels, but most of the outermost ones, are
     background. Both medians are off by noise, which moves the half level by a thousandth of itself and with it at most
     a few of the pixels at the support's rim, which hold noise alone: a fraction of the centroid's own sigma.
     """
@@ -174,9 +178,9 @@ def test_windows_give_the_spots_of_the_whole_image(denoised: bool) -> None:
     leds = grid(3, 2, 0.15, (3, 3, 3))
     image = poisson(render(view, leds, led_e=[1000, 2000, 3000, 4000, 2000, 1000]), 3)
     whole = spots_of(image, denoised)
-    reach_px = REACH_PX if denoised else 0
-    rois = windows_around(image, view.project(leds), 36, denoised)
-    parts = detect(rois, image.size, reach_px)
+    radius_px = NEIGHBOURHOOD_RADIUS_PX if denoised else 0
+    rois = regions_around(image, view.project(leds), 36, denoised)
+    parts = detect(rois, image.size, radius_px)
     assert len(parts) == len(whole) == 6
     for spot in parts:
         same = min(whole, key=lambda other: np.hypot(other.u_px - spot.u_px, other.v_px - spot.v_px))
@@ -186,20 +190,20 @@ def test_windows_give_the_spots_of_the_whole_image(denoised: bool) -> None:
         assert not spot.touches_border
 
 
-def test_a_lamp_that_fills_its_window_is_found_and_flagged() -> None:
-    """The denoiser's neighbourhood goes over the window's border, and so does the light for all one can tell."""
+def test_an_led_image_that_fills_its_region_is_found_and_flagged() -> None:
+    """The denoiser's neighbourhood extends beyond the region's border, and so may the light."""
     view = view_of((3, 3, 3), 3.0, size=(900, 700, 4000.0))
     leds = np.array([[3.0, 3.0, 3.0]])
     image = render(view, leds)
-    tight = windows_around(image, view.project(leds), 17, True)  # radius 13.3 px: less than 5 + 2 px of margin
-    (spot,) = detect(tight, image.size, REACH_PX)
+    tight = regions_around(image, view.project(leds), 17, True)  # radius 13.3 px: less than 5 + 2 px of margin
+    (spot,) = detect(tight, image.size, NEIGHBOURHOOD_RADIUS_PX)
     assert spot.touches_border
-    (raw,) = detect(windows_around(image, view.project(leds), 17, False), image.size, 0)
+    (raw,) = detect(regions_around(image, view.project(leds), 17, False), image.size, 0)
     assert not raw.touches_border
 
 
 def square(view: View, led_m: Array, half_m: float) -> Array:
-    """Electrons of a square lamp with sides along x and y, by 2 x 2 points a pixel: coarse, and as good as another."""
+    """Electrons of a square LED with sides along x and y, by 2 x 2 points a pixel: coarse, and as good as another."""
     sub = (np.arange(2 * view.width_px) + 0.5) / 2, (np.arange(2 * view.height_px) + 0.5) / 2
     u, v = np.meshgrid(*sub)
     rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ (view.R_cam_world.T @ np.linalg.inv(view.K)).T
@@ -210,8 +214,8 @@ def square(view: View, led_m: Array, half_m: float) -> Array:
 
 
 @pytest.mark.parametrize("yaw_deg", [0.0, 20.0, 45.0])
-def test_a_square_has_its_centroid_over_its_corners_too(yaw_deg: float) -> None:
-    """The ellipse of a square's moments leaves out its corners, unevenly where they are seen at an angle."""
+def test_the_centroid_of_a_square_includes_its_vertices(yaw_deg: float) -> None:
+    """The ellipse of a square's moments leaves out its vertices, unevenly in a tilted view."""
     view = view_of((3, 3, 3), 3.0, 50.0, 20.0, yaw_deg, size=(400, 320, 9000.0))
     expected = square(view, np.array([3.0003, 2.9998, 3.0]), 0.02)
     v, u = np.mgrid[: view.height_px, : view.width_px] + 0.5
@@ -219,7 +223,7 @@ def test_a_square_has_its_centroid_over_its_corners_too(yaw_deg: float) -> None:
     exact = np.array([(light * u).sum(), (light * v).sum()]) / light.sum()
     image = expected.astype(np.float32)
     readout = Readout(0, 0, image, image, np.zeros(image.shape, bool))
-    (around,) = detect([readout], image.size, 0, corners=True)
+    (around,) = detect([readout], image.size, 0, any_square=True)
     (without,) = detect([readout], image.size, 0)
     # float32 electrons summed in double precision: what is left is their rounding, 1e-7.
     assert np.hypot(around.u_px - exact[0], around.v_px - exact[1]) < 1e-5
@@ -227,7 +231,7 @@ def test_a_square_has_its_centroid_over_its_corners_too(yaw_deg: float) -> None:
 
 
 @pytest.mark.parametrize("blur_px", [3, 12, 24])
-def test_the_light_of_a_blurred_lamp_is_all_taken(blur_px: int) -> None:
+def test_the_support_contains_all_light_of_a_blurred_led(blur_px: int) -> None:
     """A disc seen at 60 deg and out of focus, by a uniform disc: its ellipse at half level is not where its light ends.
     The blur is even and leaves the centroid where it was. What is cut off may move it by a fifth of the shot noise's
     sigma, 4 % of its variance; without a fringe it is up to 1.2 sigma.

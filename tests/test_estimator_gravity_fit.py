@@ -1,17 +1,17 @@
-"""The fit with gravity: honest about its errors, and about when two positions look alike."""
+"""MAP fit with gravity: covariance consistency, ambiguity, and observations that are left out."""
 
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
-from estimator_correspondences import device, sighted
+from estimator_correspondences import device, simulated
 from estimator_synthetic import Array, View, grid, view_of
 
 from estimator.errors import EstimationFailure
-from estimator.variants.gravity_fit import fit_correspondences
-from estimator.variants.pnp import position_from_pixels
-from estimator.variants.variant import Estimate
+from estimator.methods.gravity_fit import fit_correspondences
+from estimator.methods.pnp import position_from_pixels
+from estimator.methods.variant import Estimate
 
 TABLE_1 = np.array([[0.5, 1.5, 3.5], [0.3, 1.9, 3.5], [0.8, 1.2, 3.5], [0.9, 1.1, 3.5]])
 
@@ -20,7 +20,7 @@ def draws(view: View, leds_m: Array, sigma_px: float, error_deg: float, count: i
     """Answers to as many draws of centroids' and accelerometer's errors."""
     rng = np.random.default_rng(7)
     return [
-        fit_correspondences(device(view, error_deg, rng), sighted(view, leds_m, sigma_px, rng)) for _ in range(count)
+        fit_correspondences(device(view, error_deg, rng), simulated(view, leds_m, sigma_px, rng)) for _ in range(count)
     ]
 
 
@@ -42,7 +42,7 @@ def nees(answers: list[Estimate], view: View) -> Array:
         pytest.param(grid(2, 2, 0.2, (3, 2, 3.0))[:3], 0.02, 0.1, id="three"),
     ],
 )
-def test_the_covariance_is_honest(leds: Array, sigma_px: float, error_deg: float) -> None:
+def test_the_covariance_is_consistent(leds: Array, sigma_px: float, error_deg: float) -> None:
     """Over n draws the squared errors in units of the covariance add up to chi^2 of 3 n degrees: 3 n +- sqrt(6 n).
 
     The errors are small enough for the problem to be all but linear: 0.5 deg is a hundredth, and where it counts
@@ -60,7 +60,7 @@ def test_gravity_decides_between_the_two_poses_of_a_plane() -> None:
     rng = np.random.default_rng(3)
     worst_pnp = 0.0
     for _ in range(20):
-        seen = sighted(view, TABLE_1, 0.02, rng)
+        seen = simulated(view, TABLE_1, 0.02, rng)
         answer = fit_correspondences(device(view, 0.1, rng), seen)
         error = answer.position_m - view.position_m
         assert answer.covariance_m2 is not None
@@ -72,7 +72,7 @@ def test_gravity_decides_between_the_two_poses_of_a_plane() -> None:
     assert worst_pnp > 1.0
 
 
-def test_two_poses_alike_are_flagged_and_gravity_takes_the_flag_away() -> None:
+def test_two_equal_poses_are_ambiguous_and_gravity_resolves_them() -> None:
     """Four LEDs in 6 cm, 3 m away, 0.1 px: perspective over the pattern is 0.06 / 3 sin(15 deg) of its 60 px, 0.3 px,
     so that both of the plane's poses fit. They are 30 deg apart: an accelerometer good to 20 deg cannot tell, one to
     0.5 deg can.
@@ -91,11 +91,11 @@ def test_two_poses_alike_are_flagged_and_gravity_takes_the_flag_away() -> None:
     assert nees(sure, view).max() < 30.7
 
 
-def test_an_accelerometer_without_error_is_taken_at_its_word() -> None:
+def test_an_accelerometer_without_error_is_exact() -> None:
     """LEDs on a line give no tilt about it; gravity does, exactly."""
     leds = grid(4, 1, 0.14, (3, 2, 3.0))
     view = view_of((3, 2, 3.0), 2.8, 25, -15, 40)
-    answer = fit_correspondences(device(view, 0.0), sighted(view, leds))
+    answer = fit_correspondences(device(view, 0.0), simulated(view, leds))
     # Pixels are exact; 1e-5 deg is what the reading is taken to be good to.
     np.testing.assert_allclose(answer.position_m, view.position_m, atol=1e-7)
 
@@ -104,18 +104,18 @@ def test_two_leds_are_refused() -> None:
     view = view_of((3, 2, 3.0), 2.8, 25, -15, 40)
     leds = grid(2, 1, 0.14, (3, 2, 3.0))
     with pytest.raises(EstimationFailure, match="position: LEDs identified: 2, needed: 3"):
-        fit_correspondences(device(view, 0.1), sighted(view, leds))
+        fit_correspondences(device(view, 0.1), simulated(view, leds))
 
 
 def test_leds_at_different_heights_are_taken() -> None:
     leds = grid(3, 3, 0.2, (3, 2, 2.7))
     leds[::2, 2] += 0.15
     view = view_of((3, 2, 2.7), 2.5, 25, -30, 40)
-    answer = fit_correspondences(device(view, 0.1), sighted(view, leds))
+    answer = fit_correspondences(device(view, 0.1), simulated(view, leds))
     np.testing.assert_allclose(answer.position_m, view.position_m, atol=1e-8)
 
 
-def test_a_lens_that_cannot_be_taken_out_of_one_spot_costs_that_spot_alone() -> None:
+def test_a_spot_that_cannot_be_undistorted_is_left_out() -> None:
     """A fish-eye, and a spot 85 deg off its axis: the others give the position."""
     leds = grid(3, 3, 0.2, (3, 2, 2.7))
     view = view_of((3, 2, 2.7), 2.5, size=(4000, 3000, 1000.0))
@@ -128,6 +128,6 @@ def test_a_lens_that_cannot_be_taken_out_of_one_spot_costs_that_spot_alone() -> 
     pixels = 1000 * theta[:, None] * across + view.K[:2, 2]
     seen = [
         replace(one, spot=replace(one.spot, u_px=float(u), v_px=float(v)))
-        for one, (u, v) in zip(sighted(view, leds), pixels, strict=True)
+        for one, (u, v) in zip(simulated(view, leds), pixels, strict=True)
     ]
     np.testing.assert_allclose(fit_correspondences(frame, seen).position_m, view.position_m, atol=1e-8)

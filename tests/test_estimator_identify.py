@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from estimator.errors import EstimationFailure
-from estimator.io.dataset import DecodedSpot, Led
+from estimator.io.device import DecodedSpot, DiscLed
 from estimator.spots.detect import Spot
 from estimator.spots.identify import GATE_PX, identify
 
-LEDS = {k: Led(id=k, position_m=(0.1 * k, 0.0, 3.0), radius_m=0.01, shape="disc") for k in range(10)}
+LEDS = {k: DiscLed(id=k, position_m=(0.1 * k, 0.0, 3.0), radius_m=0.01) for k in range(10)}
 
 
 def spot(u_px: float, v_px: float, touches_border: bool = False) -> Spot:
@@ -37,7 +37,7 @@ def test_nothing_is_matched_beyond_the_gate() -> None:
 
 @pytest.mark.parametrize("second_u_px", [111.0, 130.0])
 def test_two_identities_with_one_spot_are_both_left_out(second_u_px: float) -> None:
-    """Two lamps melted into one: the spot may lie much nearer to the brighter one, and is still neither's."""
+    """A merged blob of two LEDs may lie much nearer to the brighter one, and is assigned to no LED."""
     spots = [spot(100, 50), spot(300, 50)]
     assert matches(spots, [claim(1, 95, 50), claim(2, second_u_px, 50), claim(3, 300, 50)]) == {3: 300}
 

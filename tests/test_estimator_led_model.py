@@ -7,10 +7,10 @@ import pytest
 from estimator_synthetic import View, description, view_of
 from numpy.typing import NDArray
 
-from estimator.camera.projection import TiltedPose, pose_of_rotation
-from estimator.io.dataset import Camera, Led
-from estimator.pixels.led_model import LedImages, rim, views
-from estimator.pixels.polygon_raster import Canvas
+from estimator.camera.pose import Pose
+from estimator.io.device import Camera, DiscLed, Led, SquareLed
+from estimator.pixels.led_model import LedImageModel, led_footprints, rim
+from estimator.pixels.polygon_raster import RoiStack
 from estimator.pixels.psf import LensBlur, disc_diameter_px
 
 Floats = NDArray[np.float64]
@@ -26,31 +26,34 @@ def camera(view: View = VIEW, **changes: object) -> Camera:
 
 
 def led(shape: str) -> Led:
-    return Led(id=7, position_m=(TARGET[0] + 0.002, TARGET[1] - 0.003, TARGET[2]), radius_m=0.012, shape=shape)
+    centre = (TARGET[0] + 0.002, TARGET[1] - 0.003, TARGET[2])
+    if shape == "disc":
+        return DiscLed(id=7, position_m=centre, radius_m=0.012)
+    return SquareLed(id=7, position_m=centre, side_m=0.024)
 
 
-def images(lens: Camera, one: Led, pose: TiltedPose) -> LedImages:
-    seen = views([one], pose, lens)
-    first = np.floor(seen.centre - SIZE_PX / 2).astype(np.int64)
+def images(lens: Camera, one: Led, pose: Pose) -> LedImageModel:
+    footprints = led_footprints([one], pose, lens)
+    first = np.floor(footprints.centre - SIZE_PX / 2).astype(np.int64)
     size = np.array([SIZE_PX])
-    canvas = Canvas(first[:, 1], first[:, 0], size, size)
-    return LedImages([one], seen, lens, LensBlur(lens, seen.depth_m), canvas)
+    rois = RoiStack(first[:, 1], first[:, 0], size, size)
+    return LedImageModel([one], footprints, lens, LensBlur(lens, footprints.defocus_depth_m), rois)
 
 
-def here(lens: Camera) -> TiltedPose:
-    return pose_of_rotation(np.array(VIEW.position_m), VIEW.R_cam_world, lens)
+def here(lens: Camera) -> Pose:
+    return Pose(np.array(VIEW.position_m), VIEW.R_cam_world)
 
 
-def share_by_points(one: Led, lens: Camera, canvas: Canvas, blur_px: float = 0.0) -> Floats:
+def share_by_points(one: Led, lens: Camera, rois: RoiStack, blur_px: float = 0.0) -> Floats:
     """Points of the face, each put in its pixel and worth the area of the image it stands for.
 
     Through a lens written out again here; with blur, every pixel's points are smeared over a disc of points.
     """
-    step = one.radius_m / 600
-    x, y = np.meshgrid(*[np.arange(-one.radius_m + step / 2, one.radius_m, step)] * 2)
-    inside = np.hypot(x, y) <= one.radius_m if one.shape == "disc" else np.ones(x.shape, dtype=bool)
+    step = one.half_width_m / 600
+    x, y = np.meshgrid(*[np.arange(-one.half_width_m + step / 2, one.half_width_m, step)] * 2)
+    inside = np.hypot(x, y) <= one.half_width_m if one.shape == "disc" else np.ones(x.shape, dtype=bool)
     face = np.stack([x[inside], y[inside], np.zeros(inside.sum())], axis=1) + np.array(one.position_m)
-    seen = (face - VIEW.position_m) @ VIEW.R_cam_world.T
+    footprints = (face - VIEW.position_m) @ VIEW.R_cam_world.T
 
     def pixels_of(points: Floats) -> Floats:
         a, b = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
@@ -63,10 +66,10 @@ def share_by_points(one: Led, lens: Camera, canvas: Canvas, blur_px: float = 0.0
             )
         return 4000 * np.column_stack([a, b]) + [40, 30]
 
-    pixels = pixels_of(seen)
-    along = [(pixels_of(seen + VIEW.R_cam_world[:, k] * step) - pixels) for k in (0, 1)]
+    pixels = pixels_of(footprints)
+    along = [(pixels_of(footprints + VIEW.R_cam_world[:, k] * step) - pixels) for k in (0, 1)]
     area = np.abs(along[0][:, 0] * along[1][:, 1] - along[0][:, 1] * along[1][:, 0])
-    first = np.array([canvas.columns[0], canvas.rows[0]])
+    first = np.array([rois.columns[0], rois.rows[0]])
     share = np.zeros((SIZE_PX, SIZE_PX))
     shifts = np.zeros((1, 2))
     if blur_px:
@@ -87,9 +90,9 @@ def test_a_sharp_face_covers_what_its_points_do(shape: str, distorted: bool) -> 
     40^(2/3) points of 40^2, 0.7 %, on each of up to five borders (Sierpinski's bound for circles, as an order).
     """
     lens = camera(distortion=DISTORTION if distorted else None)
-    drawn = images(lens, led(shape), here(lens))
-    share = drawn.canvas.roi(drawn.draw(here(lens)).share, 0)
-    expected = share_by_points(led(shape), lens, drawn.canvas)
+    model = images(lens, led(shape), here(lens))
+    share = model.rois.roi(model.render(here(lens)).share, 0)
+    expected = share_by_points(led(shape), lens, model.rois)
     assert share.sum() == pytest.approx(expected.sum(), rel=1e-3)
     inside = (share > 0) & (share < 1)
     assert inside.sum() > 40
@@ -104,15 +107,15 @@ def test_a_defocused_face_is_its_points_spread_over_discs() -> None:
     """
     view = camera(focus_distance_m=1.5)
     one = led("disc")
-    depth = views([one], here(view), view).depth_m
+    depth = led_footprints([one], here(view), view).defocus_depth_m
     f_number = float(disc_diameter_px(view, depth)[0]) * view.f_number / 6.0
     lens = view.model_copy(update={"f_number": f_number})
     assert disc_diameter_px(lens, depth) == pytest.approx([6.0])
-    drawn = images(lens, one, here(lens))
-    share = drawn.canvas.roi(drawn.draw(here(lens)).share, 0)
-    expected = share_by_points(one, lens, drawn.canvas, 6.0)
+    model = images(lens, one, here(lens))
+    share = model.rois.roi(model.render(here(lens)).share, 0)
+    expected = share_by_points(one, lens, model.rois, 6.0)
     assert np.abs(share - expected).max() < 0.012
-    sharp = share_by_points(one, lens, drawn.canvas)
+    sharp = share_by_points(one, lens, model.rois)
     assert np.abs(sharp - expected).max() > 0.3
 
 
@@ -125,12 +128,12 @@ def test_slopes_are_what_differences_give(shape: str, changes: dict[str, object]
     """
     lens = camera(**changes)
     one, pose = led(shape), here(lens)
-    drawn = images(lens, one, pose)
-    cells = np.arange(drawn.canvas.cells())
-    found = drawn.draw(pose).slopes(cells)
+    model = images(lens, one, pose)
+    cells = np.arange(model.rois.cells())
+    found = model.render(pose).slopes(cells)
     for parameter in range(6):
         unit = np.eye(6)[parameter] * (1e-3 / 4000 * (3 if parameter < 3 else 1))
-        ahead, behind = (drawn.draw(pose.moved(sign * unit)).share for sign in (1, -1))
+        ahead, behind = (model.render(pose.moved(sign * unit, lens)).share for sign in (1, -1))
         difference = (ahead - behind) / (2 * unit[parameter])
         largest = np.abs(difference).max()
         tolerance = 0.12 if "f_number" in changes else 0.01
@@ -146,17 +149,17 @@ def test_rims_have_the_faces_area_and_go_round_once() -> None:
         assert len(np.unique(points.round(9), axis=0)) == 32
 
 
-def test_light_over_a_face_dims_away_from_the_axis() -> None:
+def test_illumination_falls_away_from_the_axis() -> None:
     """cos^4 of a pinhole: the gradient of -4 log(1 + t^2) / 2 by t is -4 t / (1 + t^2), t the tangent off the axis."""
     view = view_of(TARGET, 3.0, 0.0, 0.0, 0.0, size=(80, 60, 4000.0))
-    one = Led(id=1, position_m=(TARGET[0] + 0.9, TARGET[1], TARGET[2]), radius_m=0.012, shape="disc")
+    one = DiscLed(id=1, position_m=(TARGET[0] + 0.9, TARGET[1], TARGET[2]), radius_m=0.012)
     lens = camera(view)
-    seen = views([one], pose_of_rotation(np.array(view.position_m), view.R_cam_world, lens), lens)
-    assert seen.dimming[0] == pytest.approx([-4 * 0.3 / 1.09 / 4000, 0.0], rel=1e-3, abs=1e-9)
+    footprints = led_footprints([one], Pose(np.array(view.position_m), view.R_cam_world), lens)
+    assert footprints.illumination_slope[0] == pytest.approx([-4 * 0.3 / 1.09 / 4000, 0.0], rel=1e-3, abs=1e-9)
 
 
-def test_leds_that_are_not_seen_are_nowhere() -> None:
+def test_leds_that_are_not_imaged_have_no_footprint() -> None:
     lens = camera()
     pose = here(lens)
-    behind = Led(id=1, position_m=(3.5, 3.6, -5.0), radius_m=0.01, shape="disc")
-    assert np.isnan(views([behind, led("disc")], pose, lens).centre).any(axis=1).tolist() == [True, False]
+    behind = DiscLed(id=1, position_m=(3.5, 3.6, -5.0), radius_m=0.01)
+    assert np.isnan(led_footprints([behind, led("disc")], pose, lens).centre).any(axis=1).tolist() == [True, False]

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from estimator_synthetic import GRAVITY_M_S2, View, grid, view_of
 
-from estimator.camera.leveling import level, leveling_homography, printed_eq6, rotation, tilt_from_gravity, tilt_sigmas
+from estimator.camera.leveling import level, printed_eq6, tilt_from_gravity, tilt_sigmas
+from estimator.camera.pose import rotation
 from estimator.errors import EstimationFailure
-from estimator.io.dataset import Accelerometer
+from estimator.io.device import Accelerometer
 
 K = np.array([[1000.0, 0, 200], [0, 1000.0, 150], [0, 0, 1]])
 
@@ -41,7 +42,7 @@ def test_the_printed_eq_6_is_right_for_tilt_x_alone() -> None:
     assert np.count_nonzero(np.abs(wrong) > 1e-15) == 2
 
 
-def test_raising_tilt_x_moves_a_lamp_overhead_down_and_tilt_y_moves_it_left() -> None:
+def test_raising_tilt_x_moves_an_led_overhead_down_and_tilt_y_moves_it_left() -> None:
     """So a pixel at v = cy + f tan(30 deg) is overhead for tilt_x = 30 deg, and u = cx - f tan(30 deg) for tilt_y."""
     tangent = np.tan(np.pi / 6)
     overhead = [[200.0, 150.0]]
@@ -51,7 +52,7 @@ def test_raising_tilt_x_moves_a_lamp_overhead_down_and_tilt_y_moves_it_left() ->
 
 @pytest.mark.parametrize("yaw_deg", [0.0, 70.0])
 @pytest.mark.parametrize(("tilt_x_deg", "tilt_y_deg"), [(20, 0), (0, 20), (-35, 40), (60, 60)])
-def test_levelled_pixels_are_those_of_a_level_camera_at_the_same_place(
+def test_leveled_pixels_are_those_of_a_level_camera_at_the_same_place(
     tilt_x_deg: float, tilt_y_deg: float, yaw_deg: float
 ) -> None:
     leds = grid(3, 3, 0.2, (3, 3, 3))
@@ -63,8 +64,10 @@ def test_levelled_pixels_are_those_of_a_level_camera_at_the_same_place(
     np.testing.assert_allclose(leveled, same_place.project(leds), atol=1e-8)
 
 
-def test_the_homography_of_a_level_camera_is_the_identity() -> None:
-    np.testing.assert_allclose(leveling_homography(K, rotation(0, 0)), np.eye(3), atol=1e-15)
+def test_pixels_of_a_level_camera_are_unchanged() -> None:
+    pixels = np.array([[200.0, 150.0], [13.5, 270.25]])
+    # Pixels up to 300, through K^-1 and K: a few roundings of 300 * 1e-16.
+    np.testing.assert_allclose(level(pixels, K, rotation(0, 0)), pixels, atol=1e-12)
 
 
 @pytest.mark.parametrize("v_px", [150.0, 160.0])
@@ -72,16 +75,16 @@ def test_the_horizon_is_refused(v_px: float) -> None:
     """At tilt_x = 90 deg the image's centre looks at the horizon, and its lower half up."""
     upright = rotation(np.pi / 2, 0)
     level(np.array([[200.0, 250.0]]), K, upright)
-    with pytest.raises(EstimationFailure, match=r"rectify: .*horizon"):
+    with pytest.raises(EstimationFailure, match=r"leveling: .*horizon"):
         level(np.array([[200.0, 250.0], [200.0, 300.0 - v_px]]), K, upright)
 
 
 def test_no_gravity_is_refused() -> None:
-    with pytest.raises(EstimationFailure, match=r"rectify: .*gravity"):
+    with pytest.raises(EstimationFailure, match=r"leveling: .*gravity"):
         tilt_from_gravity((0.0, 0.0, 0.0))
 
 
-def test_a_real_part_is_less_sure_of_tilt_x_the_more_it_is_tilted_the_other_way() -> None:
+def test_the_error_of_a_real_part_in_tilt_x_grows_with_tilt_y() -> None:
     """Gravity in camera axes is (-sin y, sin x cos y, cos x cos y): raising tilt_x turns it by cos(tilt_y) alone."""
     real, papers = (Accelerometer(kind=kind, error_deg=1.0) for kind in ("imu", "tilt-error"))
     level, aside = (np.degrees(tilt_sigmas(real, np.radians(tilt))) for tilt in (0.0, 60.0))

@@ -1,4 +1,4 @@
-"""What readings say of light and pose: against the full information matrix, and amplitudes against what was drawn."""
+"""Likelihood: information and gradient by the full information matrix, and amplitudes of simulated frames."""
 
 import numpy as np
 import pytest
@@ -6,10 +6,11 @@ from estimator_synthetic import grid, poisson, render, view_of
 from numpy.typing import NDArray
 from test_estimator_maximum_likelihood import frame_of
 
-from estimator.camera.projection import TiltedPose, pose_of_rotation, project
-from estimator.io.dataset import DeviceFrame
-from estimator.pixels.likelihood import LedLight, Noise, led_light, misfit, score
-from estimator.pixels.measurements import CERTAIN_PX, Measurements, gather
+from estimator.camera.pose import Pose
+from estimator.camera.projection import project
+from estimator.io.device import DeviceFrame
+from estimator.pixels.led_pixels import MAX_IMAGE_SIGMA_PX, LedPixels, gather_led_pixels
+from estimator.pixels.likelihood import Noise, PhotometricFit, excess_chi2, fit_photometry, score
 
 Floats = NDArray[np.float64]
 TARGET = (3.5, 3.6, 3.5)
@@ -18,8 +19,8 @@ SIX = grid(3, 2, 0.14, TARGET)
 SURE = np.eye(6) * 1e-12
 
 
-def true_pose(frame: DeviceFrame) -> TiltedPose:
-    return pose_of_rotation(np.array(VIEW.position_m), VIEW.R_cam_world, frame.camera)
+def true_pose(frame: DeviceFrame) -> Pose:
+    return Pose(np.array(VIEW.position_m), VIEW.R_cam_world)
 
 
 def drawn(led_e: float, seed: int, full_well_e: float = 60000.0) -> DeviceFrame:
@@ -28,40 +29,40 @@ def drawn(led_e: float, seed: int, full_well_e: float = 60000.0) -> DeviceFrame:
     return DeviceFrame(**{**vars(frame), "sensor": frame.sensor.model_copy(update={"full_well_e": full_well_e})})
 
 
-def explained(frame: DeviceFrame) -> tuple[Measurements, LedLight]:
-    measurements = gather(frame, true_pose(frame), SURE)
-    used = np.ones(len(measurements.leds), dtype=bool)
-    light = None
+def explained(frame: DeviceFrame) -> tuple[LedPixels, PhotometricFit]:
+    pixels = gather_led_pixels(frame, true_pose(frame), SURE)
+    used = np.ones(len(pixels.leds), dtype=bool)
+    photometry = None
     for _ in range(4):
-        light = led_light(measurements, measurements.drawing, used, Noise.of(frame), light)
-    assert light is not None
-    return measurements, light
+        photometry = fit_photometry(pixels, pixels.rendered, used, Noise.of(frame), photometry)
+    assert photometry is not None
+    return pixels, photometry
 
 
 def test_information_about_the_pose_is_the_schur_complement_of_all_of_it() -> None:
-    measurements, light = explained(drawn(600.0, 1))
-    readings, edges, groups = len(measurements.electrons), len(measurements.cells), len(measurements.led)
+    pixels, photometry = explained(drawn(600.0, 1))
+    readings, edges, groups = len(pixels.electrons), len(pixels.cells), len(pixels.led)
     design = np.zeros((readings, 6 + 2 * groups))
-    brightness = measurements.weights * light.amplitude[measurements.group[:edges]]
-    design[:edges, :6] = measurements.drawing.slopes(measurements.cells) * brightness[:, None]
-    design[np.arange(readings), 6 + measurements.group] = measurements.pixels
-    design[np.arange(readings), 6 + groups + measurements.group] = light.light
-    full = design.T @ (design * light.weight[:, None])
+    brightness = pixels.weights * photometry.amplitude[pixels.group[:edges]]
+    design[:edges, :6] = pixels.rendered.slopes(pixels.cells) * brightness[:, None]
+    design[np.arange(readings), 6 + pixels.group] = pixels.pixel_counts
+    design[np.arange(readings), 6 + groups + pixels.group] = photometry.light
+    full = design.T @ (design * photometry.weight[:, None])
     scale = np.sqrt(np.diag(full))
     covariance = np.linalg.inv(full / np.outer(scale, scale)) / np.outer(scale, scale)
-    information, gradient = score(measurements, measurements.drawing, light)
+    information, gradient = score(pixels, pixels.rendered, photometry)
     found = np.linalg.inv(information)
     np.testing.assert_allclose(found, covariance[:6, :6], rtol=1e-6, atol=1e-6 * np.abs(found).max())
-    residual = design.T @ (light.weight * (measurements.electrons - light.expected))
+    residual = design.T @ (photometry.weight * (pixels.electrons - photometry.expected))
     np.testing.assert_allclose(gradient, residual[:6], rtol=1e-9)
 
 
 def test_every_led_in_view_has_its_readings() -> None:
-    measurements, _ = explained(drawn(4000.0, 2))
-    assert sorted(led.id for led in measurements.leds) == [10, 11, 12, 13, 14, 15]
-    assert not measurements.more
+    pixels, _ = explained(drawn(4000.0, 2))
+    assert sorted(led.id for led in pixels.leds) == [10, 11, 12, 13, 14, 15]
+    assert not pixels.more
     # An ellipse of 5 px semi-axes, its edge 2 px of margin either way, its ring 8 px more: some hundred and a thousand.
-    counts = np.bincount(measurements.group, measurements.pixels)
+    counts = np.bincount(pixels.group, pixels.pixel_counts)
     assert (counts > 400).all()
     assert (counts < 1200).all()
 
@@ -73,28 +74,30 @@ def test_amplitudes_are_those_drawn_also_near_to_full(full_well_e: float) -> Non
     Where a face is as bright as a full pixel, half of its pixels are cut off: to leave out only those would take 0.8
     standard deviations of a pixel off, 43 e.
     """
-    measurements, light = explained(drawn(2950.0, 3, full_well_e))
-    sigma = light.amplitude / light.signal_to_noise
-    off = light.amplitude - 2910.0
+    pixels, photometry = explained(drawn(2950.0, 3, full_well_e))
+    sigma = photometry.amplitude / photometry.signal_to_noise
+    off = photometry.amplitude - 2910.0
     assert (np.abs(off) < 5 * sigma).all()
     assert abs((off / sigma**2).sum()) < 4 * np.sqrt((1 / sigma**2).sum())
-    assert len(measurements.leds) == 6
+    assert len(pixels.leds) == 6
 
 
-def test_a_true_led_looks_like_itself_and_a_shifted_one_does_not() -> None:
+def test_a_true_led_is_explained_and_a_shifted_one_is_not() -> None:
     frame = drawn(4000.0, 4)
-    measurements, light = explained(frame)
-    assert (misfit(measurements, measurements.drawing, light) < 0).all()
-    shifted = gather(frame, true_pose(frame).moved(np.array([0.0, 0.0, 0.0, 0.5 / 1500, 0.0, 0.0])), SURE)
-    light = led_light(shifted, shifted.drawing, np.ones(6, dtype=bool), Noise.of(frame))
-    assert (misfit(shifted, shifted.drawing, light) > 0).all()
+    pixels, photometry = explained(frame)
+    assert (excess_chi2(pixels, pixels.rendered, photometry) < 0).all()
+    shifted = gather_led_pixels(
+        frame, true_pose(frame).moved(np.array([0.0, 0.0, 0.0, 0.5 / 1500, 0.0, 0.0]), frame.camera), SURE
+    )
+    photometry = fit_photometry(shifted, shifted.rendered, np.ones(6, dtype=bool), Noise.of(frame))
+    assert (excess_chi2(shifted, shifted.rendered, photometry) > 0).all()
 
 
-def test_leds_whose_place_is_not_sure_wait() -> None:
+def test_leds_whose_image_is_uncertain_are_left_out() -> None:
     frame = drawn(4000.0, 5)
     moves = project(SIX, true_pose(frame), frame.camera).slopes[:, :, 5]
     spread = SURE.copy()
-    spread[5, 5] = (CERTAIN_PX / np.median(np.linalg.norm(moves, axis=1))) ** 2
-    measurements = gather(frame, true_pose(frame), spread)
-    assert len(measurements.leds) == 3
-    assert measurements.more
+    spread[5, 5] = (MAX_IMAGE_SIGMA_PX / np.median(np.linalg.norm(moves, axis=1))) ** 2
+    pixels = gather_led_pixels(frame, true_pose(frame), spread)
+    assert len(pixels.leds) == 3
+    assert pixels.more

@@ -9,10 +9,10 @@ from estimator_synthetic import View, description, grid, poisson, render, view_o
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from estimator.camera.leveling import rotation
+from estimator.camera.pose import rotation
 from estimator.errors import EstimationFailure
-from estimator.io.dataset import Accelerometer, Camera, DecodedSpot, DeviceFrame, Led, Part, Sensor
-from estimator.variants.maximum_likelihood import ml
+from estimator.io.device import Accelerometer, Camera, DecodedSpot, DeviceFrame, DiscLed, Part, Sensor
+from estimator.methods.maximum_likelihood import ml
 
 Floats = NDArray[np.float64]
 TARGET = (3.5, 3.6, 3.5)
@@ -34,7 +34,7 @@ def frame_of(view: View, leds_m: Floats, image_dn: NDArray[np.uint32], error_deg
         accelerometer=Accelerometer(kind="tilt-error", error_deg=error_deg),
         exposure_s=1e-3,
         spots=tuple(DecodedSpot(led=10 + int(k), u_px=pixels[k, 0], v_px=pixels[k, 1]) for k in np.flatnonzero(inside)),
-        leds={10 + k: Led(id=10 + k, position_m=led, radius_m=0.01, shape="disc") for k, led in enumerate(leds_m)},
+        leds={10 + k: DiscLed(id=10 + k, position_m=led, radius_m=0.01) for k, led in enumerate(leds_m)},
     )
 
 
@@ -56,7 +56,7 @@ SIX = grid(3, 2, 0.14, TARGET)
 
 
 @pytest.mark.parametrize("tilt_deg", [(0.0, 0.0, 10.0), (30.0, -20.0, 40.0), (60.0, 0.0, 100.0)])
-def test_without_noise_it_errs_by_rounding_alone(tilt_deg: tuple[float, float, float]) -> None:
+def test_without_noise_the_error_is_rounding(tilt_deg: tuple[float, float, float]) -> None:
     """The reference's edges err by 0.3 / 150^1.5 of 4000 e, and numbers round by 0.3 e: 0.7 e, where the dimmest edges
     have a noise of 6 e. A tenth of the standard deviation that is reported, in each of three dimensions, and where all
     LEDs fall alike on their pixels their errors are alike too.
@@ -101,7 +101,7 @@ FULL: dict[str, object] = {
 
 @pytest.mark.parametrize("leds", [6, 2])
 @pytest.mark.parametrize("sensor", [SHOT, FULL], ids=["shot", "full"])
-def test_errors_are_as_large_as_it_says(sensor: dict[str, object], leds: int) -> None:
+def test_errors_agree_with_the_covariance(sensor: dict[str, object], leds: int) -> None:
     """The sum of normalised squared errors is chi2 with three degrees a draw: within its 99.9 % interval.
 
     Two LEDs need the reading of gravity, and their discs' shapes say more of the tilt than it does: far from linear.
@@ -114,7 +114,7 @@ def test_errors_are_as_large_as_it_says(sensor: dict[str, object], leds: int) ->
     assert low < total < high
 
 
-def test_read_noise_makes_it_less_sure() -> None:
+def test_read_noise_increases_the_covariance() -> None:
     view = view_of(TARGET, 3.0, 25.0, -15.0, 30.0, size=(320, 240, 1500.0))
     image = poisson(render(view, SIX, 0.01, 3000.0), 1)
     quiet = frame_of(view, SIX, image)
@@ -126,7 +126,7 @@ def test_read_noise_makes_it_less_sure() -> None:
     assert 1.5 < np.trace(unsure) / np.trace(sure) < 10
 
 
-def test_leds_cut_by_the_border_take_part() -> None:
+def test_leds_cut_by_the_border_are_used() -> None:
     """Twelve whole, eight cut in the middle by the left and right borders: with them the position is better known."""
     view = view_of(TARGET, 3.0, size=(281, 300, 1500.0))
     leds_m = grid(3, 4, 0.281, TARGET)
@@ -146,7 +146,7 @@ def test_leds_cut_by_the_border_take_part() -> None:
     assert error @ np.linalg.solve(with_cut.covariance_m2, error) < chi2.ppf(0.9999, 3)
 
 
-def test_saturated_leds_tell_by_their_dim_edges() -> None:
+def test_saturated_leds_are_used_by_their_unsaturated_edges() -> None:
     """All LEDs three times over the full well: their edges below it are still where they are, and known less well."""
     view = view_of(TARGET, 3.0, 25.0, -15.0, 30.0)
     expected = render(view, SIX, 0.01, 9000.0, samples=SAMPLES)
@@ -160,7 +160,7 @@ def test_saturated_leds_tell_by_their_dim_edges() -> None:
     assert np.linalg.norm(error) < 1e-3
 
 
-def test_leds_that_do_not_look_like_themselves_are_left_out() -> None:
+def test_leds_that_the_model_does_not_explain_are_left_out() -> None:
     """One dark, one half hidden: the answer is that of the others."""
     view = view_of(TARGET, 3.0, 25.0, -15.0, 30.0)
     leds_m = grid(4, 3, 0.14, TARGET)
@@ -191,7 +191,7 @@ def test_gravity_and_two_leds_fix_a_position_and_one_does_not() -> None:
         ml(one)
 
 
-def test_exact_gravity_is_taken_at_its_word() -> None:
+def test_exact_gravity_is_exact() -> None:
     """Said to be without error, a reading that is off by 0.1 deg moves the answer by 3 m times that, 5 mm."""
     view = view_of(TARGET, 3.0, 10.0, 5.0, 30.0)
     frame = exact(view, SIX)
@@ -204,7 +204,7 @@ def test_exact_gravity_is_taken_at_its_word() -> None:
     assert 3e-3 < off_m(wrong, view) < 8e-3
 
 
-def test_windows_are_as_good_as_the_whole() -> None:
+def test_regions_give_the_position_of_the_full_frame() -> None:
     view = view_of(TARGET, 3.0, 25.0, -15.0, 30.0)
     whole = frame_of(view, SIX, poisson(render(view, SIX, 0.01, samples=SAMPLES), 4))
     image = whole.parts[0].image_dn
@@ -215,7 +215,7 @@ def test_windows_are_as_good_as_the_whole() -> None:
     assert np.linalg.norm(ml(replace(whole, parts=tuple(parts))).position_m - ml(whole).position_m) < 1e-6
 
 
-def test_a_mosaic_has_a_light_of_its_own_in_each_colour() -> None:
+def test_each_colour_of_a_mosaic_has_its_amplitude() -> None:
     view = view_of(TARGET, 3.0, 25.0, -15.0, 30.0)
     expected = render(view, SIX, 0.01, 4000.0, samples=SAMPLES)
     passed = np.array([[0.9, 1.0], [1.0, 0.8]])

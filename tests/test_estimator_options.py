@@ -5,9 +5,9 @@ import itertools
 import pytest
 
 from estimator.errors import InputError
-from estimator.variants.catalogue import VARIANTS, variant_named
-from estimator.variants.huynh2016 import AS_PRINTED, DEFAULTS, STAGES, Huynh2016
-from estimator.variants.options import read_options
+from estimator.methods.catalogue import VARIANTS, variant_named
+from estimator.methods.huynh2016 import AS_PRINTED, DEFAULTS, STAGES, Huynh2016
+from estimator.methods.options import read_options
 
 COLOURS = {"hue": ("red", "blue"), "shade": ("light", "dark")}
 
@@ -27,7 +27,7 @@ def test_stages_are_read_in_any_order() -> None:
         ("paint:hue=dark", "variant paint:hue=dark: hue='dark' is unknown; allowed: red, blue"),
         ("paint:hue=red=blue", "variant paint:hue=red=blue: hue='red=blue' is unknown; allowed: red, blue"),
         ("paint:hue=../../red", "variant paint:hue=../../red: hue='../../red' is unknown; allowed: red, blue"),
-        ("paint:hue=red,hue=red", "variant paint:hue=red,hue=red: hue is chosen twice"),
+        ("paint:hue=red,hue=red", "variant paint:hue=red,hue=red: hue is given twice"),
     ],
 )
 def test_what_is_wrong_is_named(name: str, message: str) -> None:

@@ -6,7 +6,7 @@ import pytest
 from estimator_synthetic import Array, grid, view_of
 
 from estimator.errors import EstimationFailure
-from estimator.variants.pnp import position_from_pixels
+from estimator.methods.pnp import position_from_pixels
 
 TABLE_1 = np.array([[0.5, 1.5, 3.5], [0.3, 1.9, 3.5], [0.8, 1.2, 3.5], [0.9, 1.1, 3.5]])
 TRIANGLE = np.array([[0.0, 0, 4], [3.0, 0, 4], [0, 3.0, 4]])

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from estimator.pixels.polygon_raster import MAX_EDGE_PX, Canvas, Outlines, cover
+from estimator.pixels.polygon_raster import MAX_EDGE_PX, Outlines, RoiStack, cover
 
 Floats = NDArray[np.float64]
 
 
-def roi(row: int, column: int, height: int, width: int) -> Canvas:
-    return Canvas(np.array([row]), np.array([column]), np.array([height]), np.array([width]))
+def roi(row: int, column: int, height: int, width: int) -> RoiStack:
+    return RoiStack(np.array([row]), np.array([column]), np.array([height]), np.array([width]))
 
 
 def circle(u: float, v: float, radius: float) -> Floats:
@@ -27,8 +27,8 @@ def outlines(points: Floats, slopes: Floats | None = None) -> Outlines:
     return Outlines(points, np.roll(np.arange(count), -1), np.zeros(count, dtype=np.int64), free)
 
 
-def covered(canvas: Canvas, points: Floats) -> Floats:
-    return canvas.roi(cover(canvas, outlines(points))[0], 0)
+def covered(rois: RoiStack, points: Floats) -> Floats:
+    return rois.roi(cover(rois, outlines(points))[0], 0)
 
 
 def circle_in_pixels(u: float, v: float, radius: float, size: int) -> Floats:
@@ -54,7 +54,7 @@ def test_a_circle_covers_what_its_chords_say(radius: float) -> None:
     assert np.abs(found - circle_in_pixels(u, v, radius, size)).max() < MAX_EDGE_PX**2 / (12 * radius) + 2e-5
 
 
-def test_a_window_shows_its_part_of_the_whole() -> None:
+def test_a_region_holds_its_part_of_the_whole() -> None:
     points = circle(20.4, 18.8, 12.5)
     whole = covered(roi(0, 0, 40, 40), points)
     for row, column, height, width in ((12, 15, 9, 30), (0, 0, 12, 12), (25, 25, 3, 3), (15, 30, 4, 8)):
@@ -65,19 +65,19 @@ def test_a_window_shows_its_part_of_the_whole() -> None:
         np.testing.assert_allclose(part, expected, atol=1e-12)
 
 
-def test_windows_do_not_reach_into_each_other() -> None:
-    """The second outline lies beyond its window's right border, the first within its own."""
+def test_regions_do_not_affect_each_other() -> None:
+    """The second outline lies beyond its region's right border, the first within its own."""
     first, second = circle(10.3, 10.1, 5.0), circle(42.6, 9.0, 6.0)
-    canvas = Canvas(np.array([0, 2]), np.array([2, 30]), np.array([20, 15]), np.array([15, 12]))
+    rois = RoiStack(np.array([0, 2]), np.array([2, 30]), np.array([20, 15]), np.array([15, 12]))
     points = np.concatenate([first, second])
     following = np.concatenate([np.roll(np.arange(len(p)), -1) + s for p, s in ((first, 0), (second, len(first)))])
     belongs = np.repeat([0, 1], [len(first), len(second)])
-    both, _ = cover(canvas, Outlines(points, following, belongs, np.zeros((len(points), 2, 0))))
-    np.testing.assert_allclose(canvas.roi(both, 0), covered(roi(0, 2, 20, 15), first), atol=1e-12)
-    np.testing.assert_allclose(canvas.roi(both, 1), covered(roi(2, 30, 15, 12), second), atol=1e-12)
+    both, _ = cover(rois, Outlines(points, following, belongs, np.zeros((len(points), 2, 0))))
+    np.testing.assert_allclose(rois.roi(both, 0), covered(roi(0, 2, 20, 15), first), atol=1e-12)
+    np.testing.assert_allclose(rois.roi(both, 1), covered(roi(2, 30, 15, 12), second), atol=1e-12)
 
 
-def test_corners_on_the_lines_between_pixels_lose_nothing() -> None:
+def test_vertices_on_the_lines_between_pixels_keep_the_area() -> None:
     along = np.arange(0, 4, 0.5)
     square = np.concatenate(
         [
@@ -97,12 +97,12 @@ def test_slopes_are_what_moving_the_outline_gives() -> None:
     points = circle(13.37, 12.81, 8.0)
     padded = points - np.array([13.37, 12.81])
     moves = np.stack([np.tile([1.0, 0.0], (len(points), 1)), np.tile([0.0, 1.0], (len(points), 1)), padded], axis=2)
-    canvas = roi(0, 0, 26, 26)
-    _, pieces = cover(canvas, outlines(points, moves))
-    cells = canvas.cell(pieces.roi, pieces.row, pieces.column)
+    rois = roi(0, 0, 26, 26)
+    _, pieces = cover(rois, outlines(points, moves))
+    cells = rois.cell(pieces.roi, pieces.row, pieces.column)
     for parameter in range(3):
-        found = np.bincount(cells, pieces.slopes[:, parameter], canvas.cells())
+        found = np.bincount(cells, pieces.slopes[:, parameter], rois.cells())
         step = 1e-5 * moves[:, :, parameter]
-        ahead, behind = (cover(canvas, outlines(points + sign * step))[0] for sign in (1, -1))
+        ahead, behind = (cover(rois, outlines(points + sign * step))[0] for sign in (1, -1))
         # Growing, an edge's ends move by 1 % of a pixel differently: within an edge the middle stands for it.
         np.testing.assert_allclose(found, (ahead - behind) / 2e-5, atol=0.02 if parameter == 2 else 1e-4)

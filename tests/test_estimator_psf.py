@@ -8,7 +8,7 @@ from estimator_synthetic import description, view_of
 from numpy.typing import NDArray
 from scipy.special import j0, j1
 
-from estimator.io.dataset import Camera
+from estimator.io.device import Camera
 from estimator.pixels.psf import LensBlur, airy_scale_px, disc_diameter_px
 
 Floats = NDArray[np.float64]
@@ -33,13 +33,13 @@ def edge_of_disc(diameter: float, offsets: Floats) -> Floats:
     return np.array([(strips * np.clip(t - x + 0.5, 0, 1)).sum() for x in offsets]) / strips.sum()
 
 
-def edge_of_kernel(kernel: Floats, finer: int, offsets: Floats) -> Floats:
-    """The same by the kernel, on pixels `finer` times finer whose means are then taken."""
+def edge_of_kernel(kernel: Floats, factor: int, offsets: Floats) -> Floats:
+    """The same by the kernel, on pixels `factor` times factor whose means are then taken."""
     line = kernel.sum(axis=0)
-    away = (np.arange(len(line)) - len(line) // 2) / finer
-    within = (np.arange(finer) + 0.5) / finer - 0.5
+    away = (np.arange(len(line)) - len(line) // 2) / factor
+    within = (np.arange(factor) + 0.5) / factor - 0.5
     at = offsets[:, None, None] + within[:, None] - away
-    return np.asarray((np.clip(0.5 - at * finer, 0, 1) @ line).mean(axis=1))
+    return np.asarray((np.clip(0.5 - at * factor, 0, 1) @ line).mean(axis=1))
 
 
 def test_defocus_by_hand() -> None:
@@ -52,7 +52,7 @@ def test_defocus_by_hand() -> None:
 
 def test_a_sharp_lens_has_no_kernels() -> None:
     lens = LensBlur(camera(), np.array([3.0, 5.0]))
-    assert (lens.kernels, lens.slope_kernels, lens.reach_px, lens.finer.tolist()) == ([], [], 0, [1, 1])
+    assert (lens.kernels, lens.slope_kernels, lens.radius_px, lens.factors.tolist()) == ([], [], 0, [1, 1])
 
 
 @pytest.mark.parametrize("disc_px", [1.0, 2.0, 3.0, 5.0, 8.0, 20.0])
@@ -61,17 +61,17 @@ def test_an_edge_is_blurred_as_a_disc_does(disc_px: float) -> None:
     across a disc: 0.9 % with 8. Of a disc of 1 px there are but 4, and then pixels of four of them are averaged.
     """
     lens = LensBlur(focused_for(disc_px, 3.0), np.array([3.0]))
-    (fine,), (finer,) = lens.kernels, lens.finer.tolist()
+    (fine,), (factor,) = lens.kernels, lens.factors.tolist()
     assert fine.sum() == pytest.approx(1)
     for phase in np.arange(0, 1, 0.125):
         offsets = np.arange(-15, 16) + phase
-        found, expected = edge_of_kernel(fine, finer, offsets), edge_of_disc(disc_px, offsets)
+        found, expected = edge_of_kernel(fine, factor, offsets), edge_of_disc(disc_px, offsets)
         assert np.abs(found - expected).max() < 0.008
 
 
 def test_the_airy_patterns_light_is_where_its_closed_form_says() -> None:
     """Encircled energy 1 - J0^2 - J1^2 (Born & Wolf 8.5.2, Eq. 18) at the first dark ring is 83.8 %; the kernel leaves
-    out the 2 % beyond its reach, and pixels of 1/25 of the ring's diameter cut its rim by less than 1 %.
+    out the 2 % beyond its radius, and pixels of 1/25 of the ring's diameter cut its rim by less than 1 %.
     """
     lens_camera = camera(psf="diffraction", f_number=22.0)
     scale = airy_scale_px(lens_camera)
@@ -84,18 +84,18 @@ def test_the_airy_patterns_light_is_where_its_closed_form_says() -> None:
     assert inside == pytest.approx((1 - j0(x) ** 2 - j1(x) ** 2) / 0.98, abs=0.01)
 
 
-def test_a_measured_kernel_is_taken_as_it_is() -> None:
-    """On finer pixels it has nothing between whole ones."""
+def test_a_measured_kernel_is_used_unchanged() -> None:
+    """On factor pixels it has nothing between whole ones."""
     rows = [[0.0, 0.1, 0.0], [0.2, 0.4, 0.1], [0.0, 0.2, 0.0]]
     lens = LensBlur(camera(psf="measured", psf_kernel=rows), np.array([3.0]))
-    assert lens.finer.tolist() == [1]
+    assert lens.factors.tolist() == [1]
     np.testing.assert_allclose(lens.kernels[0], rows)
     blurred = focused_for(2.0, 3.0).model_copy(update={"psf": "measured", "psf_kernel": tuple(map(tuple, rows))})
     both = LensBlur(blurred, np.array([3.0]))
-    finer = int(both.finer[0])
-    assert finer == 16
+    factor = int(both.factors[0])
+    assert factor == 16
     fine, size = both.kernels[0], len(both.kernels[0])
-    v, u = (np.mgrid[:size, :size] - size // 2) / finer
+    v, u = (np.mgrid[:size, :size] - size // 2) / factor
     # Its mean is the measured one's: (0.1 - 0.2, 0.2 - 0.1).
     assert (fine * u).sum() == pytest.approx(-0.1)
     assert (fine * v).sum() == pytest.approx(0.1)

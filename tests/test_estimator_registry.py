@@ -16,8 +16,8 @@ import pytest
 from estimator_synthetic import small_dataset
 
 from estimator.cli import main
-from estimator.variants.catalogue import VARIANTS
-from estimator.variants.registry import GROUP, Registry
+from estimator.methods.catalogue import VARIANTS
+from estimator.methods.registry import GROUP, Registry
 
 DOCUMENT = Path(__file__).parent.parent / "docs/own_variant.md"
 
@@ -80,7 +80,7 @@ BAD_PLUGINS: dict[str, tuple[str, dict[str, str], str]] = {
     "a number": ("f = 3", {"x": "bad:f"}, "is a int, needed a function or a Variant"),
     "a class": ("class f: pass", {"x": "bad:f"}, "is a type, needed a function or a Variant"),
     "other name": (
-        "from estimator.variants.variant import Variant\nf = Variant('y', '', print)",
+        "from estimator.methods.variant import Variant\nf = Variant('y', '', print)",
         {"x": "bad:f"},
         "is a Variant of another name, 'y'",
     ),
@@ -111,7 +111,7 @@ def test_a_bad_plugin_is_one_line_and_the_others_run(
 
 
 def test_a_composition_is_taken_with_its_own_summary(install: Install, capsys: pytest.CaptureFixture[str]) -> None:
-    source = "from estimator.variants.variant import Variant\nv = Variant('mine', 'Two\\nlines', print)"
+    source = "from estimator.methods.variant import Variant\nv = Variant('mine', 'Two\\nlines', print)"
     install("composed", source, {"mine": "composed:v"})
     assert main(["variants"]) == 0
     assert capsys.readouterr().out.splitlines()[-1].split(maxsplit=1)[1] == "Two lines (external: composed 0.1)"
@@ -120,10 +120,10 @@ def test_a_composition_is_taken_with_its_own_summary(install: Install, capsys: p
 def test_a_name_registered_twice_is_not_used(install: Install) -> None:
     install("one", GOOD, {"x": "one:f"})
     install("two", GOOD, {"x": "two:f"})
-    variants, complaints = Registry.read().all()
+    variants, problems = Registry.read().all()
     assert [variant.name for variant in variants] == list(VARIANTS)
-    (complaint,) = complaints
-    assert "'x': not used, registered more than once, as " in complaint
+    (problem,) = problems
+    assert "'x': not used, registered more than once, as " in problem
 
 
 CRASHES = {
@@ -132,7 +132,7 @@ CRASHES = {
     "crashed (RecursionError)": "    return f(frame)",
     "crashed (MemoryError)": "    raise MemoryError",
     "crashed (ValueError)": "    frame.parts[0].image_dn[0, 0] = 0",  # images are read-only
-    "returned something else than an Estimate": "    return [1.0, 2.0, 3.0]",
+    "returned no Estimate": "    return [1.0, 2.0, 3.0]",
 }
 
 

@@ -52,7 +52,7 @@ def curve_ends(svg: str) -> list[float]:
     return ends
 
 
-def test_a_curve_ends_at_the_share_of_all_frames_that_was_answered() -> None:
+def test_a_curve_ends_at_the_success_rate() -> None:
     """To a tenth of a pixel of 300."""
     variants = [scored([0.1] * 4), scored([0.1, None, None, 0.2]), scored([None] * 4)]
     assert curve_ends(distribution_plot(variants)) == pytest.approx([1.0, 0.5, 0.0], abs=1e-3)
@@ -106,7 +106,7 @@ def test_the_page_pairs_each_variant_with_the_best_and_says_which(tmp_path: Path
     assert "near:" not in table
 
 
-def test_the_table_of_bounds_is_there_only_where_something_is_in_it(tmp_path: Path) -> None:
-    title = "The bound, and what the variants say of themselves"
+def test_the_table_of_bounds_is_left_out_if_it_is_empty(tmp_path: Path) -> None:
+    title = "Cramér-Rao bound and covariance consistency"
     assert title not in page([(tmp_path, scores_of([scored([0.1, 0.2])]))])
     assert title in page([(tmp_path, scores_of([scored([0.1, 0.2], bound_m2=BOUND)]))])

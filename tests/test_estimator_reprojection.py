@@ -1,22 +1,21 @@
-"""Where a lamp's image has its centroid, and what a fit does of it."""
+"""Reprojection fit: eccentricity of LED images, and poses and covariances of fits."""
 
 from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from estimator_correspondences import device, sighted
+from estimator_correspondences import device, simulated
 from estimator_synthetic import Array, grid, view_of
 
+from estimator.camera.pose import Pose
 from estimator.errors import EstimationFailure
-from estimator.io.dataset import Distortion
+from estimator.io.device import Distortion
 from estimator.solvers.reprojection import (
-    SQUARE_TO_DISC,
-    Pose,
+    centroid_images,
     corrected_for_eccentricity,
     fit,
-    observations,
-    projected,
+    observe,
 )
 
 RADIUS_M = 0.03
@@ -48,9 +47,9 @@ def test_the_centroid_of_a_face_is_the_image_of_a_point_above_it(
     cosine = seen[:, 2] / distance
     light = points[:, 2] / distance**3 * cosine**4 / cosine**3
     centroid = (light[:, None] * seen[:, :2] / seen[:, 2:]).sum(axis=0) / light.sum()
-    lift = np.array([RADIUS_M**2 * (SQUARE_TO_DISC if shape == "square" else 1)])
-    pose = Pose(view.R_cam_world, np.array(view.position_m))
-    (found,), _ = projected(pose, LED_M, lift)
+    lift = np.array([RADIUS_M**2 * (4 / 3 if shape == "square" else 1)])
+    pose = Pose(np.array(view.position_m), view.R_cam_world)
+    (found,), _ = centroid_images(pose, LED_M, lift)
     assert np.abs(found - centroid).max() < 2e-7
 
 
@@ -64,8 +63,8 @@ def test_the_light_in_the_test_is_that_of_an_even_image() -> None:
 def test_exact_points_are_fitted_exactly_from_a_rough_start(gravity: bool) -> None:
     leds = grid(5, 4, 0.14, (3, 2, 2.7))
     view = view_of((3, 2, 2.7), 2.6, 30, -20, 140)
-    seen = observations(device(view, 0.1 if gravity else 1e9), sighted(view, leds))
-    start = Pose(view_of((3, 2, 2.7), 2.6, 25, -14, 130).R_cam_world, np.array(view.position_m) + [0.2, -0.1, 0.3])
+    seen = observe(device(view, 0.1 if gravity else 1e9), simulated(view, leds))
+    start = Pose(np.array(view.position_m) + [0.2, -0.1, 0.3], view_of((3, 2, 2.7), 2.6, 25, -14, 130).R_cam_world)
     found = fit(seen, start)
     # Double precision of 2.6 m, made some thousands of times more by the pattern.
     np.testing.assert_allclose(found.pose.position_m, view.position_m, atol=1e-9)
@@ -77,16 +76,16 @@ def test_the_covariance_is_that_of_small_errors() -> None:
     leds = grid(3, 2, 0.2, (3, 2, 2.7))
     view = view_of((3, 2, 2.7), 2.6, 30, -20, 140)
     frame = device(view, 0.2)
-    start = Pose(view.R_cam_world, np.array(view.position_m))
+    start = Pose(np.array(view.position_m), view.R_cam_world)
     sigma_px, share = 0.05, 1e-3
-    spots = sighted(view, leds, sigma_px)
-    seen = observations(frame, spots)
+    spots = simulated(view, leds, sigma_px)
+    seen = observe(frame, spots)
     moved = []
     for k in range(len(leds)):
         for axis in range(2):
-            plane = seen.plane.copy()
+            plane = seen.image.copy()
             plane[k, axis] += share * sigma_px / 1500
-            moved.append(fit(replace(seen, plane=plane), start).pose.position_m)
+            moved.append(fit(replace(seen, image=plane), start).pose.position_m)
     for axis in range(2):
         tilt = seen.tilt_rad.copy()
         tilt[axis] += share * np.radians(0.2)
@@ -99,9 +98,9 @@ def test_the_covariance_is_that_of_small_errors() -> None:
 def test_leds_all_in_one_place_fix_nothing() -> None:
     view = view_of((3, 2, 2.7), 2.6)
     leds = np.tile([[3.0, 2.0, 2.7]], (4, 1))
-    seen = observations(device(view, 0.1), sighted(view, leds, 0.05))
-    with pytest.raises(EstimationFailure, match="position: what is seen does not fix a pose"):
-        fit(seen, Pose(view.R_cam_world, np.array(view.position_m)))
+    seen = observe(device(view, 0.1), simulated(view, leds, 0.05))
+    with pytest.raises(EstimationFailure, match="position: the observations do not determine a pose"):
+        fit(seen, Pose(np.array(view.position_m), view.R_cam_world))
 
 
 def fish_eye(rays: Array) -> Array:
@@ -126,9 +125,7 @@ BARREL = Distortion(k1=-0.12, k2=0.0, k3=0.0, p1=0.0, p2=0.0)
         pytest.param(barrel, {"distortion": BARREL}, id="barrel"),
     ],
 )
-def test_what_a_lens_bends_within_a_spot_is_taken_off(
-    lens: Callable[[Array], Array], changes: dict[str, object]
-) -> None:
+def test_eccentricity_by_a_lens_is_corrected(lens: Callable[[Array], Array], changes: dict[str, object]) -> None:
     """Centroids on the sensor, summed up over discs of 2 cm, 2 m away, by the light that a cosine of the axis times a
     solid angle gathers. What is left goes with (r / h)^4 = 1e-8 of 2 m, which the pattern makes some hundred times
     more: 2 um. Left alone, (r / h)^2 = 1e-4 of a plane that is bent by a tenth makes some tens of micrometres.
@@ -149,10 +146,10 @@ def test_what_a_lens_bends_within_a_spot_is_taken_off(
             led=one.led.model_copy(update={"radius_m": 0.02}),
             spot=replace(one.spot, u_px=float(u), v_px=float(v)),
         )
-        for one, (u, v) in zip(sighted(view, leds, 0.01), pixels, strict=True)
+        for one, (u, v) in zip(simulated(view, leds, 0.01), pixels, strict=True)
     ]
-    observed = observations(frame, seen)
-    start = Pose(view.R_cam_world, np.array(view.position_m))
+    observed = observe(frame, seen)
+    start = Pose(np.array(view.position_m), view.R_cam_world)
     bent = fit(observed, start).pose
     assert np.linalg.norm(bent.position_m - view.position_m) > 1e-5
     straight = fit(corrected_for_eccentricity(observed, bent), start).pose

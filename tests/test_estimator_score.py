@@ -10,12 +10,12 @@ import pytest
 from estimator_synthetic import small_dataset
 
 from estimator.errors import InputError
-from estimator.evaluate.score import Scores, read_or_score, score_dataset, score_variant
-from estimator.io.dataset import Led
+from estimator.evaluate.score import Scores, read_or_score, score, score_variant
+from estimator.io.device import DiscLed
 from estimator.io.estimates import EstimateRow, LedRange, write_estimates
 from estimator.io.truth import TruthRow
 
-LEDS = {10: Led(id=10, position_m=(1.0, 2.0, 3.5), radius_m=0.01, shape="disc")}
+LEDS = {10: DiscLed(id=10, position_m=(1.0, 2.0, 3.5), radius_m=0.01)}
 TRUTH = (1.0, 2.0, 0.5)
 
 
@@ -110,21 +110,21 @@ def test_reported_covariances_and_ambiguity_are_counted() -> None:
     assert (score.ambiguous, score.success_rate) == (1, 1.0)
 
 
-def test_to_fail_the_worst_frames_costs_coverage_and_gains_nothing() -> None:
+def test_failing_the_worst_frames_lowers_the_success_rate_and_no_error_of_all() -> None:
     """The ok frames' own summary falls to a tenth; what counts all frames does not."""
     x, y, z = TRUTH
     rows = [ok(k, (x + (0.01 if k < 15 else 1.0), y, z)) for k in range(20)]
-    honest = score_variant("x", rows, truths(20), LEDS)
+    complete = score_variant("x", rows, truths(20), LEDS)
     dropped = score_variant("x", [*rows[:15], *(failed(k, "a: too hard") for k in range(15, 20))], truths(20), LEDS)
-    assert honest.error_3d is not None
+    assert complete.error_3d is not None
     assert dropped.error_3d is not None
-    assert dropped.error_3d.rmse_m < honest.error_3d.rmse_m / 10
-    assert (honest.success_rate, dropped.success_rate) == (1.0, 0.75)
-    assert honest.of_all is not None
+    assert dropped.error_3d.rmse_m < complete.error_3d.rmse_m / 10
+    assert (complete.success_rate, dropped.success_rate) == (1.0, 0.75)
+    assert complete.of_all is not None
     assert dropped.of_all is not None
     assert dropped.of_all.median_m == pytest.approx(0.01)
-    assert (honest.of_all.p95_m, dropped.of_all.p95_m) == (pytest.approx(1.0), None)
-    assert dropped.frames == honest.frames == len(dropped.rows)
+    assert (complete.of_all.p95_m, dropped.of_all.p95_m) == (pytest.approx(1.0), None)
+    assert dropped.frames == complete.frames == len(dropped.rows)
 
 
 @pytest.fixture(scope="module")
@@ -135,7 +135,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_scores_json_is_plain_json_and_comes_back(dataset: Path) -> None:
-    scores = score_dataset(dataset)
+    scores = score(dataset)
     text = (dataset / "scores.json").read_text()
 
     def refuse(constant: str) -> None:
@@ -147,14 +147,14 @@ def test_scores_json_is_plain_json_and_comes_back(dataset: Path) -> None:
 
 
 def test_every_estimates_file_is_scored_also_of_other_programs(dataset: Path) -> None:
-    assert [score.variant for score in score_dataset(dataset).variants] == ["one"]
+    assert [score.variant for score in score(dataset).variants] == ["one"]
     write_estimates(dataset, "one-b", [failed(frame, "x: y") for frame in range(3)])
-    assert [score.variant for score in score_dataset(dataset).variants] == ["one", "one-b"]
+    assert [score.variant for score in score(dataset).variants] == ["one", "one-b"]
     (dataset / "estimates/one-b.parquet").unlink()
 
 
 def test_scores_are_made_again_only_where_estimates_are_newer_or_other(dataset: Path) -> None:
-    first = score_dataset(dataset)
+    first = score(dataset)
     truth = (dataset / "truth.parquet").read_bytes()
     (dataset / "truth.parquet").unlink()
     assert read_or_score(dataset) == first
@@ -173,7 +173,7 @@ def test_scores_are_made_again_where_the_truth_is_newer(tmp_path: Path) -> None:
     """As when a dataset is made again, with bounds."""
     folder = small_dataset(tmp_path)
     write_estimates(folder, "one", [ok(frame, TRUTH) for frame in range(3)])
-    assert score_dataset(folder).variants[0].rows[0].bound_m is None
+    assert score(folder).variants[0].rows[0].bound_m is None
     table = pq.read_table(folder / "truth.parquet")
     bounds = pa.array([[1e-6, 0, 0, 0, 1e-6, 0, 0, 0, 2e-6]] * 3, table.schema.field("bound_m2").type)
     index = table.schema.get_field_index("bound_m2")
@@ -186,18 +186,18 @@ def test_scores_are_made_again_where_the_truth_is_newer(tmp_path: Path) -> None:
 def test_what_cannot_be_scored_is_named(tmp_path: Path) -> None:
     folder = small_dataset(tmp_path)
     with pytest.raises(InputError, match="no estimates to score"):
-        score_dataset(folder)
+        score(folder)
     write_estimates(folder, "short", [ok(0, TRUTH)])
     with pytest.raises(InputError, match=r"short.parquet: 1 rows, needed one for each of the 3 frames"):
-        score_dataset(folder)
+        score(folder)
     stranger = ok(0, TRUTH, 3.0).model_copy(update={"ranges": (LedRange(led=99, range_m=1.0),)})
     write_estimates(folder, "short", [stranger, ok(1, TRUTH), ok(2, TRUTH)])
     with pytest.raises(InputError, match="a range to LED 99"):
-        score_dataset(folder)
+        score(folder)
     write_estimates(folder, "short", [ok(0, TRUTH), ok(1, TRUTH), ok(2, TRUTH)])
     (folder / "truth.parquet").write_bytes(b"PAR1 and no more")
     with pytest.raises(InputError, match=r"truth.parquet: not a readable Parquet file"):
-        score_dataset(folder)
+        score(folder)
     (folder / "truth.parquet").unlink()
     with pytest.raises(InputError, match=r"truth.parquet: no such file"):
-        score_dataset(folder)
+        score(folder)

@@ -15,7 +15,7 @@ from estimator.evaluate.score_table import (
 from estimator.evaluate.statistics import Interval
 
 
-def test_lengths_for_people() -> None:
+def test_lengths_as_text() -> None:
     lengths = [None, 0.0, 1.234e-5, 0.0123456, 0.5, 0.9999, 12.345, 4.2e7]
     assert [length_text(length) for length in lengths] == [
         "–",
@@ -29,14 +29,14 @@ def test_lengths_for_people() -> None:
     ]
 
 
-def test_intervals_for_people() -> None:
+def test_intervals_as_text() -> None:
     assert interval_text(None) == "–"
     assert interval_text(Interval(low_m=0.0123, high_m=0.5)) == "12.3 to 500 mm"
     assert interval_text(Interval(low_m=0.5, high_m=1.5)) == "500 mm to 1.5 m"
     assert interval_text(Interval(low_m=-2e-6, high_m=1e-6)) == "-2 to 1 µm"
 
 
-def test_shares_for_people_never_round_up_to_all() -> None:
+def test_shares_as_text_never_round_up_to_100() -> None:
     assert [share_text(*counts) for counts in ((0, 3), (1, 3), (3, 3), (9999, 10000), (0, 0))] == [
         "0 %",
         "33.3 %",
@@ -49,14 +49,14 @@ def test_shares_for_people_never_round_up_to_all() -> None:
 def test_failed_frames_are_infinite_in_the_columns_of_all() -> None:
     rows = [ok(0, TRUTH), failed(1, "a: b"), failed(2, "a: b")]
     cells = dict(zip(ERROR_HEADERS, error_cells(score_variant("x", rows, truths(3), LEDS)), strict=True))
-    assert (cells["ok"], cells["failed"], cells["coverage"]) == ("1", "2", "33.3 %")
+    assert (cells["ok"], cells["failed"], cells["success rate"]) == ("1", "2", "33.3 %")
     assert (cells["median of all"], cells["p95 of all"], cells["median"]) == ("∞", "∞", "0 µm")
     none = dict(zip(ERROR_HEADERS, error_cells(score_variant("x", [], [], LEDS)), strict=True))
-    assert (none["coverage"], none["median of all"], none["time"]) == ("–", "–", "–")
+    assert (none["success rate"], none["median of all"], none["time"]) == ("–", "–", "–")
 
 
 def test_a_covariance_that_is_too_small_is_said_to_be() -> None:
-    """Off by ten standard deviations on one frame of one: 100, where 99 % of honest ones are below 12.8."""
+    """Off by ten standard deviations on one frame of one: 100, where 99 % of consistent ones are below 12.8."""
     x, y, z = TRUTH
     sure = ok(0, (x + 0.1, y, z)).model_copy(update={"covariance_m2": (1e-4, 0, 0, 0, 1e-4, 0, 0, 0, 1e-4)})
     modest = ok(0, (x + 1e-4, y, z)).model_copy(update={"covariance_m2": sure.covariance_m2, "ambiguous": True})
@@ -64,6 +64,6 @@ def test_a_covariance_that_is_too_small_is_said_to_be() -> None:
         dict(zip(LIMIT_HEADERS, limit_cells(score_variant("x", [row], truths(1), LEDS)), strict=True))
         for row in (sure, modest)
     ]
-    assert [c["NEES"] for c in cells] == ["100 (too sure)", "0.0001 (too modest)"]
+    assert [c["NEES"] for c in cells] == ["100 (overconfident)", "0.0001 (conservative)"]
     assert [c["ambiguous"] for c in cells] == ["0", "1 (100 %)"]
     assert cells[0]["efficiency"] == "–"

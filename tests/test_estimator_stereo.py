@@ -8,11 +8,11 @@ import pytest
 from estimator_synthetic import Array, View, grid, view_of
 
 from estimator.errors import EstimationFailure
-from estimator.io.dataset import Camera, DeviceFrame, Sensor
-from estimator.solvers.stereo import partner, triangulated
+from estimator.io.device import Camera, DeviceFrame, Sensor
+from estimator.methods.catalogue import VARIANTS
+from estimator.methods.kim import position_from_vectors
+from estimator.solvers.stereo import stereo_partner, triangulated
 from estimator.solvers.trilateration import position_from_ranges
-from estimator.variants.catalogue import VARIANTS
-from estimator.variants.kim import position_from_vectors
 
 LEDS = grid(4, 3, 0.13, (3, 2, 3.45))
 BASELINE_M = np.array([0.08, -0.06])
@@ -64,7 +64,7 @@ def test_depth_is_the_baseline_over_the_disparity_and_nothing_across_it_counts()
 
 @pytest.mark.parametrize("disparity", [0.0, -0.01, np.nan])
 def test_a_disparity_that_is_none_is_refused(disparity: float) -> None:
-    with pytest.raises(EstimationFailure, match="stereo: an LED is no further off"):
+    with pytest.raises(EstimationFailure, match="stereo: the disparity of an LED is not positive"):
         triangulated(np.array([[0.2, 0.0]]), np.array([[0.2 - disparity, 0.0]]), np.array([0.1, 0.0]))
 
 
@@ -118,10 +118,10 @@ def turned(degrees: float) -> Array:
     return np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
 
 
-def test_of_several_mates_the_parallel_one_furthest_beside_is_the_partner() -> None:
+def test_the_partner_is_the_parallel_camera_with_the_longest_baseline() -> None:
     near, far = frame_of((0.05, 0, 0)), frame_of((-0.2, 0.1, 0))
     behind, askew = frame_of((1.0, 0, 0.3)), frame_of((1.0, 0, 0), turned(5))
-    other, baseline_m = partner(replace(frame_of(), other_cameras=(near, behind, far, askew)))
+    other, baseline_m = stereo_partner(replace(frame_of(), other_cameras=(near, behind, far, askew)))
     assert other is far
     np.testing.assert_allclose(baseline_m, [-0.2, 0.1])
 
@@ -129,7 +129,7 @@ def test_of_several_mates_the_parallel_one_furthest_beside_is_the_partner() -> N
 def test_the_baseline_is_in_the_cameras_own_axes() -> None:
     """Both turned by 90 deg: what is along x of the rig is along -y of theirs."""
     one, other = frame_of((0, 0, 0), turned(90)), frame_of((0.1, 0, 0), turned(90))
-    np.testing.assert_allclose(partner(replace(one, other_cameras=(other,)))[1], [0, -0.1], atol=1e-15)
+    np.testing.assert_allclose(stereo_partner(replace(one, other_cameras=(other,)))[1], [0, -0.1], atol=1e-15)
 
 
 @pytest.mark.parametrize(
@@ -139,7 +139,7 @@ def test_the_baseline_is_in_the_cameras_own_axes() -> None:
 )
 def test_other_rigs_are_refused(other_cameras: tuple[DeviceFrame, ...]) -> None:
     with pytest.raises(EstimationFailure, match="stereo: no second camera is parallel to this one and beside it"):
-        partner(replace(frame_of(), other_cameras=other_cameras))
+        stereo_partner(replace(frame_of(), other_cameras=other_cameras))
 
 
 @pytest.mark.parametrize("name", ["rahman2011", "kim"])

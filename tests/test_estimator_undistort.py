@@ -1,12 +1,13 @@
-"""Real lenses' pixels to a pinhole's."""
+"""Undistortion: pixels of any lens to those of a pinhole."""
 
 import numpy as np
 import pytest
 from estimator_synthetic import Array
 
-from estimator.camera.undistort import lens_pixels, pinhole_pixels
+from estimator.camera.projection import projection_of
+from estimator.camera.undistort import has_pinhole_image, pinhole_image, pinhole_pixels
 from estimator.errors import EstimationFailure
-from estimator.io.dataset import Camera, Distortion
+from estimator.io.device import Camera, Distortion
 
 
 def camera(projection: str = "perspective", skew_px: float = 0.0, **coefficients: float) -> Camera:
@@ -37,7 +38,7 @@ def pixels(*rows: tuple[float, float]) -> Array:
     return np.array(rows)
 
 
-def test_a_pinhole_s_pixels_are_left_alone() -> None:
+def test_pixels_of_a_pinhole_are_unchanged() -> None:
     given = pixels((1.1, 2.3), (377.7, 3.9))
     assert pinhole_pixels(given, camera()) is given
 
@@ -60,7 +61,7 @@ def test_a_point_by_hand(
     assert pinhole_pixels(pixels(seen), camera(**coefficients)) == pytest.approx(pixels(straight), abs=1e-9)
 
 
-def test_a_barrel_s_pixels_go_outwards_and_a_pincushion_s_inwards() -> None:
+def test_undistortion_moves_pixels_of_a_barrel_outwards_and_of_a_pincushion_inwards() -> None:
     given = pixels((240.0, 150.0), (170.0, 170.0), (200.0, 90.0))
     radius = np.linalg.norm(given - [200, 150], axis=1)
     for k1, sign in ((-0.1, 1), (0.1, -1)):
@@ -75,22 +76,26 @@ def test_skew_is_not_part_of_the_lens() -> None:
 
 
 def test_a_fish_eye_by_hand() -> None:
-    """45 deg is a radius of 25 pi px, and 1 of the image distance for a pinhole; the axis stays where it is."""
+    """45 deg is a radius of 25 pi px, and 1 image distance for a pinhole; the axis does not move."""
     found = pinhole_pixels(pixels((200.0, 150.0 - 25 * np.pi), (200.0, 150.0)), camera("equidistant"))
     assert found == pytest.approx(pixels((200.0, 50.0), (200.0, 150.0)), abs=1e-9)
 
 
 @pytest.mark.parametrize("theta_deg", [80.1, 95.0])
-def test_what_no_pinhole_sees_is_a_named_failure(theta_deg: float) -> None:
+def test_a_spot_beyond_the_field_angle_is_refused(theta_deg: float) -> None:
     with pytest.raises(EstimationFailure, match=r"^undistort: a spot is 80 deg or more off the optical axis$"):
         pinhole_pixels(pixels((200.0, 150.0), (200.0 + 100 * np.radians(theta_deg), 150.0)), camera("equidistant"))
+    both = pixels((200.0, 150.0), (200.0 + 100 * np.radians(theta_deg), 150.0))
+    assert has_pinhole_image(both, camera("equidistant")).tolist() == [True, False]
 
 
 @pytest.mark.parametrize("coefficients", [{"k1": -0.5}, {"k1": 1e100, "k2": -1e100}, {"p2": -0.5}])
-def test_a_place_that_the_lens_images_nothing_at_is_a_named_failure(coefficients: dict[str, float]) -> None:
-    """r (1 - r^2 / 2) does not reach beyond 0.55."""
+def test_a_spot_beyond_the_fold_is_refused(coefficients: dict[str, float]) -> None:
+    """The maximum of r (1 - r^2 / 2) is 0.55."""
     with pytest.raises(EstimationFailure, match=r"^undistort: the distortion cannot be undone at a spot$"):
         pinhole_pixels(pixels((200.0, 150.0), (260.0, 151.0)), camera(**coefficients))
+    both = pixels((200.0, 150.0), (260.0, 151.0))
+    assert has_pinhole_image(both, camera(**coefficients)).tolist() == [True, False]
 
 
 @pytest.mark.parametrize(
@@ -102,6 +107,8 @@ def test_a_place_that_the_lens_images_nothing_at_is_a_named_failure(coefficients
     ],
     ids=["pinhole", "fish-eye", "distortion"],
 )
-def test_there_and_back_is_where_one_was(lens: Camera) -> None:
+def test_projecting_the_undistorted_image_gives_the_pixels_back(lens: Camera) -> None:
     given = pixels((120.0, 180.0), (200.0, 150.0), (250.3, 93.9), (290.0, 200.0))
-    np.testing.assert_allclose(lens_pixels(pinhole_pixels(given, lens), lens), given, atol=1e-9)
+    rays = np.column_stack([pinhole_image(given, lens), np.ones(len(given))])
+    back = lens.to_pixels(projection_of(lens).project(rays)[0])
+    np.testing.assert_allclose(back, given, atol=1e-9)

@@ -3,17 +3,18 @@
 import cv2
 import numpy as np
 import pytest
-from estimator_correspondences import device, sighted
+from estimator_correspondences import device, simulated
 from estimator_synthetic import Array, View, grid, view_of
 
-import estimator.variants.up2p
-from estimator.camera.leveling import level, rotation, tilt_from_gravity
+import estimator.methods.up2p
+from estimator.camera.leveling import level, tilt_from_gravity
+from estimator.camera.pose import rotation
 from estimator.errors import EstimationFailure
+from estimator.methods.pnp import position_from_pixels
+from estimator.methods.up2p import fit_correspondences, upright_pose
 from estimator.solvers.ranging import law_of_sines, led_ranges
-from estimator.solvers.reprojection import observations
+from estimator.solvers.reprojection import observe
 from estimator.solvers.trilateration import position_from_ranges
-from estimator.variants.pnp import position_from_pixels
-from estimator.variants.up2p import fit_correspondences, upright_pose
 
 poselib = pytest.importorskip("poselib")
 
@@ -33,7 +34,7 @@ def test_up2p_sqpnp_and_the_range_fit_agree_on_exact_points() -> None:
         leds[:, :2] += rng.uniform(-0.03, 0.03, (12, 2))
         view = random_view(rng, leds)
         frame, pixels = device(view, 0.0), view.project(leds)
-        upright_m = fit_correspondences(frame, sighted(view, leds)).position_m
+        upright_m = fit_correspondences(frame, simulated(view, leds)).position_m
         sqpnp_m = position_from_pixels(leds, pixels, view.K, (cv2.SOLVEPNP_SQPNP,))
         leveled = level(pixels, view.K, rotation(*tilt_from_gravity(frame.accelerometer_m_s2)))
         ranges_m = position_from_ranges(leds, led_ranges(leveled, view.K, leds, law_of_sines))
@@ -47,8 +48,8 @@ def test_poselib_s_two_points_alone_give_the_pose() -> None:
     for _ in range(50):
         leds = grid(2, 1, 0.3, (3.5, 3.6, 3.5)) + rng.uniform(-0.1, 0.1, (2, 3))
         view = random_view(rng, leds)
-        seen = observations(device(view, 0.0), sighted(view, leds))
-        poses = estimator.variants.up2p._from_pairs(seen)
+        seen = observe(device(view, 0.0), simulated(view, leds))
+        poses = estimator.methods.up2p._from_pairs(seen)
         assert min(np.abs(pose.position_m - view.position_m).max() for pose in poses) < 1e-8
         assert min(np.abs(pose.R_cam_world - view.R_cam_world).max() for pose in poses) < 1e-8
 
@@ -56,7 +57,7 @@ def test_poselib_s_two_points_alone_give_the_pose() -> None:
 def test_the_upright_start_is_exact_on_exact_points() -> None:
     leds = grid(3, 2, 0.2, (3, 2, 2.7))
     view = view_of((3, 2, 2.7), 2.6, 30, -20, 140)
-    pose = upright_pose(observations(device(view, 0.0), sighted(view, leds)))
+    pose = upright_pose(observe(device(view, 0.0), simulated(view, leds)))
     assert pose is not None
     np.testing.assert_allclose(pose.position_m, view.position_m, atol=1e-10)
     np.testing.assert_allclose(pose.R_cam_world, view.R_cam_world, atol=1e-10)
@@ -66,7 +67,7 @@ def test_no_upright_start_below_the_horizon() -> None:
     leds = grid(3, 2, 0.2, (3, 2, 2.7))
     view = view_of((3, 2, 2.7), 2.6, 0, 0)
     frame = device(view_of((3, 2, 2.7), 2.6, 120, 0), 0.0)
-    assert upright_pose(observations(frame, sighted(view, leds))) is None
+    assert upright_pose(observe(frame, simulated(view, leds))) is None
 
 
 def test_the_refinement_frees_the_tilt() -> None:
@@ -74,11 +75,11 @@ def test_the_refinement_frees_the_tilt() -> None:
     leds = grid(5, 4, 0.14, (3, 2, 2.7))
     view = view_of((3, 2, 2.7), 2.6, 20, -10, 40)
     wrong = device(view_of((3, 2, 2.7), 2.6, 22, -10, 40), 1.0)
-    found_m = fit_correspondences(wrong, sighted(view, leds)).position_m
+    found_m = fit_correspondences(wrong, simulated(view, leds)).position_m
     np.testing.assert_allclose(found_m, view.position_m, atol=1e-6)
 
 
 def test_without_poselib_there_is_a_named_failure(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(estimator.variants.up2p, "poselib", None)
+    monkeypatch.setattr(estimator.methods.up2p, "poselib", None)
     with pytest.raises(EstimationFailure, match="up2p: PoseLib is not installed"):
-        estimator.variants.up2p.up2p(device(view_of((3, 2, 2.7), 2.6), 0.1))
+        estimator.methods.up2p.up2p(device(view_of((3, 2, 2.7), 2.6), 0.1))

@@ -11,12 +11,13 @@ from estimator_synthetic import grid, small_dataset, view_of, write_dataset
 
 from estimator.errors import EstimationFailure
 from estimator.evaluate.batch import estimate_dataset, estimate_frame
-from estimator.io.dataset import DeviceFrame, read_dataset, read_frame
+from estimator.io.dataset import read_dataset, read_frame
+from estimator.io.device import DeviceFrame
 from estimator.io.estimates import EstimateRow
-from estimator.spots.correspondences import centroids_px, correspondences
+from estimator.methods.catalogue import VARIANTS, variant_named
+from estimator.methods.variant import Estimate, Variant
+from estimator.spots.correspondences import centroids_px, find_correspondences
 from estimator.spots.denoise import DENOISERS
-from estimator.variants.catalogue import VARIANTS, variant_named
-from estimator.variants.variant import Estimate, Variant
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +40,7 @@ def errors_m(folder: Path, rows: tuple[EstimateRow, ...]) -> list[float]:
 
 def test_without_noise_the_corrected_variants_err_by_the_ellipse_alone(tmp_path: Path) -> None:
     """A disc's image has its centroid off the image of its centre by some f (r / h)^2 tan(tilt) = 0.01 px here; digital
-    numbers round at 1/4000 of the lamp. One pixel is 2 mm on the ceiling, and 20 LEDs share the error.
+    numbers round at 1/4000 of the LED. One pixel is 2 mm on the ceiling, and 20 LEDs share the error.
     """
     folder = small_dataset(tmp_path, noise=False)
     rows = estimate(folder)
@@ -91,7 +92,7 @@ def chosen(folder: Path, name: str) -> tuple[EstimateRow, ...]:
 
 
 @pytest.mark.parametrize("name", ["huynh2016-as-printed", "huynh2016:ranges=printed"])
-def test_the_printed_equation_3_is_wrong_by_metres_and_its_ranges_reach_no_led(noisy: Path, name: str) -> None:
+def test_ranges_by_the_printed_equation_3_are_wrong_by_metres(noisy: Path, name: str) -> None:
     """A failed frame keeps its ranges. As printed in all, the shifted LEDs give a position from any ranges at all."""
     truth = pq.read_table(noisy / "truth.parquet").to_pylist()
     leds = read_dataset(noisy).leds
@@ -115,8 +116,8 @@ def test_sound_choices_are_as_good_as_the_default(noisy: Path, choice: str) -> N
     assert [row.position_m for row in chosen(noisy, name)] != [row.position_m for row in chosen(noisy, "huynh2016")]
 
 
-def test_the_brightest_pixel_is_off_by_the_lamps_radius(noisy: Path) -> None:
-    """A lamp's image is flat over 5 px of radius: noise picks the pixel, some 3 px away; a centroid errs by 0.02 px."""
+def test_the_brightest_pixel_errs_by_the_radius_of_the_led_image(noisy: Path) -> None:
+    """An LED image is flat over 5 px of radius: noise picks the pixel, some 3 px away; a centroid errs by 0.02 px."""
     names = [f"huynh2016:denoise=none,spot={spot}" for spot in ("brightest", "centroid")]
     brightest, centroid = (np.median(errors_m(noisy, chosen(noisy, name))) for name in names)
     assert brightest > 20 * centroid
@@ -130,16 +131,18 @@ def test_shifted_leds_put_the_camera_at_the_ceiling(noisy: Path) -> None:
 
 
 def test_the_literal_algorithm_1_shifts_every_spot_up_and_left(noisy: Path) -> None:
-    """Light shows where the pixel 5 px further right and down differs: around a place 2.5 px up and left of the lamp.
+    """Light shows where the pixel 5 px further right and down differs: around a place 2.5 px up and left of the LED.
 
-    lambda_1 goes as (SSoID - mu)^2, where SSoID = (c - c_k)^2 / 120 = 130000 e for a lamp of 4000 e and |mu| is at
-    most 4000 e: mu weights one side of the lamp by 2 * 4000 / 130000 = 6 % more, and 6 % of 2.5 px are 0.15 px.
+    lambda_1 goes as (SSoID - mu)^2, where SSoID = (c - c_k)^2 / 120 = 130000 e for an LED of 4000 e and |mu| is at
+    most 4000 e: mu weights one side of the LED by 2 * 4000 / 130000 = 6 % more, and 6 % of 2.5 px are 0.15 px.
     """
     dataset = read_dataset(noisy)
     truth = pq.read_table(noisy / "truth.parquet", columns=["leds"]).to_pylist()
     literal = DENOISERS["literal"]
     for record, true in zip(dataset.frames, truth, strict=True):
-        seen = correspondences(read_frame(dataset, record), lambda raw_e: literal.apply(raw_e, 0.0), literal.reach_px)
+        seen = find_correspondences(
+            read_frame(dataset, record), lambda raw_e: literal.apply(raw_e, 0.0), literal.radius_px
+        )
         exact = {led["led"]: (led["u_px"], led["v_px"]) for led in true["leds"]}
         off = centroids_px(seen) - [exact[correspondence.led.id] for correspondence in seen]
         assert len(off) > 10
@@ -159,7 +162,7 @@ def test_estimates_do_not_change_without_truth_and_provenance(noisy: Path, tmp_p
     assert answers(blind) == answers(noisy)
 
 
-def test_pnp_does_not_look_at_gravity_and_the_paper_does(noisy: Path, tmp_path: Path) -> None:
+def test_pnp_does_not_use_gravity_and_the_paper_does(noisy: Path, tmp_path: Path) -> None:
     """Two degrees of tilt error cost the paper's method about 60 mm and more (errata to Table 2)."""
     folder = Path(shutil.copytree(noisy, tmp_path / "off"))
     table = pq.read_table(folder / "frames.parquet")
@@ -203,7 +206,7 @@ def test_failures_carry_their_stage(noisy: Path) -> None:
     assert [(r.led, r.range_m) for r in row.ranges] == [(10, 3.5)]
 
 
-def test_the_registry_goes_by_its_names() -> None:
+def test_the_catalogue_keys_are_the_names() -> None:
     rivals = ["yoshino2008", "nakazawa2013", "rahman2011", "kim"]
     fits = ["pnp", "ippe", "sqpnp", "up2p", "gravity-fit", "ml"]
     assert list(VARIANTS) == ["huynh2016", "huynh2016-as-printed", *rivals, *fits]

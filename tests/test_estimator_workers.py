@@ -10,7 +10,7 @@ from estimator.evaluate.batch import estimate_dataset
 from estimator.evaluate.workers import estimate_with_workers
 from estimator.io.dataset import read_dataset
 from estimator.io.estimates import EstimateRow
-from estimator.variants.catalogue import VARIANTS
+from estimator.methods.catalogue import VARIANTS
 
 
 @pytest.fixture(scope="module")

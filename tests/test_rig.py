@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from estimator.evaluate.batch import estimate_dataset
 from estimator.io.dataset import read_dataset
-from estimator.variants.catalogue import VARIANTS
+from estimator.methods.catalogue import VARIANTS
 from vlcrender.camera.intrinsics import Pose
 from vlcrender.camera.rig import pose_of
 from vlcrender.dataset.generate import generate

@@ -11,7 +11,7 @@ from conftest import ROOT, SMALL
 from estimator.evaluate.batch import estimate_dataset
 from estimator.io.dataset import read_dataset
 from estimator.io.estimates import EstimateRow
-from estimator.variants.catalogue import VARIANTS
+from estimator.methods.catalogue import VARIANTS
 from vlcrender.dataset.generate import generate
 from vlcrender.dataset.recipe import load_plan
 
@@ -56,8 +56,8 @@ def errors_m(folder: Path, name: str) -> list[float]:
     ]
 
 
-def test_a_fish_eye_finds_its_place(fish_eye: Path) -> None:
-    """Lamps of 4 px radius and 3000 e: centroids to 0.02 px of 286 px to the image distance, 0.1 mm at 2 m.
+def test_a_fish_eye_is_located(fish_eye: Path) -> None:
+    """LEDs of 4 px radius and 3000 e: centroids to 0.02 px of 286 px to the image distance, 0.1 mm at 2 m.
 
     The fall of light by cos^4 pulls the centroid of a disc of radius r at depth z inwards by r^2 / z^2, which puts the
     camera r^2 / z too low, 0.5 to 1 mm; the ellipse adds as much.
@@ -65,7 +65,7 @@ def test_a_fish_eye_finds_its_place(fish_eye: Path) -> None:
     assert max(errors_m(fish_eye, "nakazawa2013")) < 3e-3
 
 
-def test_two_level_cameras_find_their_place(stereo: Path) -> None:
+def test_two_level_cameras_are_located(stereo: Path) -> None:
     """0.02 px of some 60 px of disparity: 1 mm of range; across, times distance over pattern, 2.6 m / 0.25 m, over
     the root of a dozen LEDs: 3 mm, of which the worst of four frames may be thrice.
     """
@@ -74,11 +74,11 @@ def test_two_level_cameras_find_their_place(stereo: Path) -> None:
     assert max(errors_m(stereo, "kim")) < 3e-3
 
 
-def test_ranges_by_disparity_do_not_mind_a_tilt_and_vectors_are_refused(tilted: Path) -> None:
+def test_ranges_by_disparity_do_not_depend_on_tilt_and_vectors_are_refused(tilted: Path) -> None:
     assert max(errors_m(tilted, "rahman2011")) < 15e-3
     tilts = pq.read_table(tilted / "truth.parquet", columns=["tilt_y_deg"])["tilt_y_deg"].to_pylist()
     refused = [
-        row.reason == "level: the camera is tilted, and the method takes it to be parallel to the ceiling"
+        row.reason == "leveling: the camera is tilted, and the method assumes it parallel to the ceiling"
         for row in rows(tilted, "kim")
     ]
     assert refused == [abs(tilt) > 5 for tilt in tilts]

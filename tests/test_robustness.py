@@ -18,21 +18,12 @@ from estimator_synthetic import Array, View, description, grid, poisson, render,
 
 from estimator.errors import InputError
 from estimator.evaluate.batch import estimate_dataset, estimate_frame
-from estimator.io.dataset import (
-    Accelerometer,
-    Camera,
-    DecodedSpot,
-    DeviceFrame,
-    Led,
-    Part,
-    Sensor,
-    read_dataset,
-    read_frame,
-)
+from estimator.io.dataset import read_dataset, read_frame
+from estimator.io.device import Accelerometer, Camera, DecodedSpot, DeviceFrame, DiscLed, Part, Sensor
 from estimator.io.estimates import EstimateRow
-from estimator.spots.correspondences import correspondences
+from estimator.methods.catalogue import VARIANTS
+from estimator.spots.correspondences import find_correspondences
 from estimator.spots.detect import Readout, detect
-from estimator.variants.catalogue import VARIANTS
 from vlcrender.dataset.generate import generate
 from vlcrender.dataset.recipe import load_plan
 
@@ -66,12 +57,12 @@ def sensor(**changes: object) -> Sensor:
 def frame_of(
     image: Array,
     view: View = VIEW,
-    lamps_m: Array = LEDS,
+    sources_m: Array = LEDS,
     names: Mapping[int, int] | None = None,
     of_sensor: Sensor | None = None,
 ) -> DeviceFrame:
-    """What a device has of an image; `names` says of which lamp which LED of the map is decoded, else each as it is."""
-    pixels = view.project(lamps_m)
+    """A frame of an image; `names` says which LED of the map is decoded of which source, by default the same."""
+    pixels = view.project(sources_m)
     inside = [k for k, (u, v) in enumerate(pixels[: len(LEDS)]) if 0 < u < view.width_px and 0 < v < view.height_px]
     named = {k: k for k in inside} if names is None else names
     rough = pixels + np.random.default_rng(5).normal(0, 3, pixels.shape)
@@ -86,8 +77,7 @@ def frame_of(
         exposure_s=1e-3,
         spots=tuple(DecodedSpot(led=10 + led, u_px=rough[k, 0], v_px=rough[k, 1]) for k, led in named.items()),
         leds={
-            10 + k: Led(id=10 + k, position_m=tuple(led), radius_m=RADIUS_M, shape="disc")
-            for k, led in enumerate(LEDS.tolist())
+            10 + k: DiscLed(id=10 + k, position_m=tuple(led), radius_m=RADIUS_M) for k, led in enumerate(LEDS.tolist())
         },
     )
 
@@ -98,9 +88,9 @@ def room() -> Array:
     return render(VIEW, LEDS, RADIUS_M, LED_E, BACKGROUND_E, samples=8)
 
 
-def with_lamps(lamps_m: Array, led_e: float) -> Array:
-    """The room and lamps besides."""
-    return np.maximum(room(), render(VIEW, lamps_m, RADIUS_M, led_e, BACKGROUND_E, samples=8))
+def with_sources(sources_m: Array, led_e: float) -> Array:
+    """The room and further sources."""
+    return np.maximum(room(), render(VIEW, sources_m, RADIUS_M, led_e, BACKGROUND_E, samples=8))
 
 
 @cache
@@ -140,22 +130,22 @@ def cut_by_the_border() -> Case:
 
 
 def reflections() -> Case:
-    """The LEDs again at a tenth of their light, mirrored in a window pane beside them."""
+    """The LEDs again at a tenth of their light, mirrored in a glazing beside them."""
     mirrored = LEDS * [-1, 1, 1] + [2 * 3.24, 0, 0]
-    return Case(frame_of(poisson(with_lamps(mirrored, LED_E / 10), 1)), 12)
+    return Case(frame_of(poisson(with_sources(mirrored, LED_E / 10), 1)), 12)
 
 
 def stray(led_e: float, at: tuple[float, float]) -> Case:
-    """Two lamps that are not on the map, (x, y) from two of the LEDs."""
-    lamps = np.vstack([LEDS, LEDS[[0, 5]] + [*at, 0]])
-    return Case(frame_of(poisson(with_lamps(lamps[12:], led_e), 1), lamps_m=lamps), 10)
+    """Two sources that are not on the map, (x, y) from two of the LEDs."""
+    sources = np.vstack([LEDS, LEDS[[0, 5]] + [*at, 0]])
+    return Case(frame_of(poisson(with_sources(sources[12:], led_e), 1), sources_m=sources), 10)
 
 
 def stray_in_place() -> Case:
-    """A lamp that is not on the map near one that is and does not shine: the identity goes to the wrong lamp."""
+    """A source that is not on the map near an LED that is off: the identity is assigned to the source."""
     dark = np.delete(LEDS, 5, axis=0)
-    lamp = LEDS[[5]] + [0.012, 0.006, 0]
-    image = render(VIEW, np.vstack([dark, lamp]), RADIUS_M, LED_E, BACKGROUND_E, samples=8)
+    source = LEDS[[5]] + [0.012, 0.006, 0]
+    image = render(VIEW, np.vstack([dark, source]), RADIUS_M, LED_E, BACKGROUND_E, samples=8)
     return Case(frame_of(poisson(image, 1)), 11)
 
 
@@ -179,10 +169,10 @@ CASES: dict[str, Callable[[], Case]] = {
     "saturated, read noise": lambda: saturated("full"),
     "cut by the border": cut_by_the_border,
     "reflections": reflections,
-    "stray lamps": lambda: stray(LED_E, (0.06, 0.05)),
-    "stray lamps touching": lambda: stray(LED_E, (0.016, 0.0)),
-    "stray lamps, much brighter": lambda: stray(100 * LED_E, (0.06, 0.05)),
-    "stray lamp in place of an LED": stray_in_place,
+    "stray sources": lambda: stray(LED_E, (0.06, 0.05)),
+    "stray sources touching": lambda: stray(LED_E, (0.016, 0.0)),
+    "stray sources, much brighter": lambda: stray(100 * LED_E, (0.06, 0.05)),
+    "stray source in place of an LED": stray_in_place,
     "three wrong identities of twelve": lambda: Case(named({**{k: k for k in range(12)}, 4: 10, 10: 0, 0: 4}), 9),
     "one wrong identity of five": lambda: Case(named({0: 0, 3: 3, 8: 8, 11: 11, 5: 6}), 4),
     "one wrong identity of four": lambda: Case(named({0: 0, 3: 3, 8: 8, 5: 6}), 3),
@@ -214,8 +204,8 @@ def answers(name: str) -> tuple[Case, dict[str, EstimateRow]]:
 WRONG_NAME = "takes every identity for right: nothing in it looks for one that is not"
 WRONG_TILT = "has no other word of the tilt than the accelerometer's"
 MAY_BE_WRONG = {
-    "stray lamps touching": "two lamps melted into one are one spot, and its centroid the middle of both",
-    "stray lamp in place of an LED": WRONG_NAME,
+    "stray sources touching": "a merged blob of two LEDs is one spot, with its centroid between both",
+    "stray source in place of an LED": WRONG_NAME,
     "three wrong identities of twelve": WRONG_NAME,
     "one wrong identity of five": WRONG_NAME,
     "one wrong identity of four": WRONG_NAME,
@@ -267,30 +257,30 @@ def test_the_stated_covariance_covers_the_error(name: str, variant: str) -> None
     assert error @ np.linalg.solve(np.reshape(row.covariance_m2, (3, 3)), error) < 27.7
 
 
-def test_spots_that_are_full_are_flagged_with_and_without_the_noise_of_reading() -> None:
+def test_saturated_spots_are_flagged_with_and_without_read_noise() -> None:
     """Lamps at three times the full well: every second one. The others, at 4000 of 6000 electrons, are not."""
     for name in ("saturated", "saturated, read noise"):
-        seen = correspondences(answers(name)[0].frame)
+        seen = find_correspondences(answers(name)[0].frame)
         assert [correspondence.spot.saturated for correspondence in seen] == [False, True] * 6
 
 
-def test_a_full_pixel_is_known_in_the_noise_of_reading() -> None:
-    """Five electrons of noise: of the pixels of full lamps' insides one in 30 000 reads four sigma low."""
+def test_a_saturated_pixel_is_detected_in_read_noise() -> None:
+    """Five electrons of noise: of the pixels inside saturated LED images one in 30 000 reads four sigma low."""
     frame = answers("saturated, read noise")[0].frame
     u, v = VIEW.project(LEDS[[1]])[0].astype(int)
     inside = np.s_[v - 4 : v + 5, u - 4 : u + 5]
     assert frame.clipped(frame.parts[0])[inside].all()
-    assert (frame.parts[0].image_dn[inside] < frame.sensor.largest_dn()).any()
+    assert (frame.parts[0].image_dn[inside] < frame.sensor.saturation_dn()).any()
     u, v = VIEW.project(LEDS[[0]])[0].astype(int)
     assert not frame.clipped(frame.parts[0])[v - 4 : v + 5, u - 4 : u + 5].any()
 
 
-def test_windows_alone_give_the_same(tmp_path: Path) -> None:
-    """Read out in windows, each variant is right where it is on the whole frame."""
+def test_regions_give_the_same(tmp_path: Path) -> None:
+    """Read out in regions, each variant is right where it is on the whole frame."""
     whole, rows = answers("plain")
     image = whole.frame.parts[0].image_dn
-    corners = (VIEW.project(LEDS) - 30).astype(int)
-    parts = tuple(Part(v, u, np.ascontiguousarray(image[v : v + 60, u : u + 60])) for u, v in corners.tolist())
+    first_px = (VIEW.project(LEDS) - 30).astype(int)
+    parts = tuple(Part(v, u, np.ascontiguousarray(image[v : v + 60, u : u + 60])) for u, v in first_px.tolist())
     for key, variant in VARIANTS.items():
         row = estimate_frame(variant, replace(whole.frame, parts=parts), 0)
         assert row.status == rows[key].status
@@ -333,8 +323,8 @@ pose = [{ position_m = [1.6, 3.5, 1.2], tilt_x_deg = 5.0, tilt_y_deg = -40.0 }]
 """
 
 
-def test_leds_mirrored_in_a_window_pane_of_the_renderer_s_are_left_alone(tmp_path: Path) -> None:
-    """At -40 deg, grazing the pane, some mirrored LEDs are bright enough to be found as lamps beside the real ones."""
+def test_specular_reflections_of_the_renderer_are_left_out(tmp_path: Path) -> None:
+    """At -40 deg, grazing the glazing, some reflections are bright enough to be detected beside the LEDs."""
     (tmp_path / "pane.toml").write_text((ROOT / "scenes/office.toml").read_text() + PANE)
     recipe = (ROOT / "datasets/quickstart.toml").read_text().split("[poses]")[0]
     recipe = recipe.replace("../scenes/office.toml", "pane.toml")

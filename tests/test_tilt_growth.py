@@ -8,11 +8,12 @@ import pyarrow.parquet as pq
 import pytest
 from estimator_synthetic import GRAVITY_M_S2, Array, grid, small_dataset, view_of
 
-from estimator.camera.leveling import level, rotation
+from estimator.camera.leveling import level
+from estimator.camera.pose import rotation
 from estimator.io.dataset import Dataset, read_dataset, read_frame
+from estimator.methods.catalogue import VARIANTS
 from estimator.solvers.ranging import law_of_sines, led_ranges
 from estimator.solvers.trilateration import position_from_ranges
-from estimator.variants.catalogue import VARIANTS
 
 STEP = 1e-6
 

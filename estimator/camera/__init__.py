@@ -1,4 +1,4 @@
-"""Camera geometry as the device knows it: projection, undistortion, and leveling by gravity.
+"""Camera geometry as the device knows it: pose, projection, undistortion, and leveling by gravity.
 
-Written apart from the renderer's on purpose: an error shared by both would cancel and never show.
+It is written independently of the renderer's: an error shared by both packages would cancel and stay hidden.
 """

@@ -1,149 +1,214 @@
-"""World to pixels for any lens of the format, and how pixels move with the pose (datasets/FORMAT.md, Projection)."""
+"""Projections of the format: camera axes to normalized image coordinates and back (datasets/FORMAT.md, Projection).
+
+Normalized image coordinates (x, y) are in units of the image distance, from the principal point; `Camera.to_pixels`
+maps them to pixels.
+"""
 
 from dataclasses import dataclass
+from typing import Protocol
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.camera.leveling import rotation
-from estimator.io.dataset import Camera
+from estimator.camera.pose import POSE_PARAMETERS, Pose, rotation
+from estimator.io.device import Camera, Distortion
 
 Floats = NDArray[np.float64]
 
-POSE_PARAMETERS = 6
-"""Position x, y, z in metres, then tilt_x, tilt_y and yaw in radians: the order of every derivative by the pose."""
-# What is less than this in front of a perspective lens, as a share of its distance, is beside it: 89.9 deg.
+# A point closer than this to the image-plane directions of a perspective lens has no image: 89.9 deg off the axis.
 MIN_DEPTH_SHARE = 1e-3
+# Distortion is inverted to this residual, in units of the image distance: 1e-8 px at 15 000 px to the image distance.
+MAX_RESIDUAL = 1e-12
+# Local magnification of an image by its distortion above which the coefficients describe no lens.
+MAX_MAGNIFICATION = 1e3
+# OpenCV 4 has the form with criteria under a name of its own.
+undistort_points = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)
+# Its fixed-point iteration gains a constant factor a step, which approaches 1 where the lens folds the image.
+UNDISTORT_CRITERIA = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 10_000, 1e-14)
+
+
+class Projection(Protocol):
+    """A lens: maps directions in camera axes to normalized image coordinates."""
+
+    @property
+    def rectilinear(self) -> bool:
+        """Whether straight lines are imaged as straight lines: a pinhole."""
+
+    def project(self, p_cam: Floats) -> tuple[Floats, Floats]:
+        """Image (n, 2) of points (n, 3) in camera axes, and its Jacobian (n, 2, 3); NaN outside the valid range."""
+
+    def unproject(self, image: Floats) -> Floats:
+        """Unit vectors (n, 3) in camera axes of normalized image coordinates (n, 2); NaN outside the valid range."""
+
+    def defocus_depth_m(self, p_cam: Floats) -> Floats:
+        """Depth (n,) that determines the defocus of points (n, 3), metres."""
+
+
+@dataclass(frozen=True)
+class Perspective:
+    """Pinhole with optional Brown-Conrady distortion, which OpenCV computes.
+
+    Valid: directions less than 89.9 deg off the axis, up to where the distortion folds the image.
+    """
+
+    distortion: Distortion | None = None
+
+    @property
+    def rectilinear(self) -> bool:
+        """Whether there is no distortion."""
+        return self.distortion is None
+
+    def project(self, p_cam: Floats) -> tuple[Floats, Floats]:
+        """See `Projection.project`."""
+        x, y, z = p_cam.T
+        with np.errstate(all="ignore"):
+            valid = z > MIN_DEPTH_SHARE * np.linalg.norm(p_cam, axis=1)
+            z = np.where(valid, z, np.nan)
+            plane = np.column_stack([x / z, y / z])
+            jacobian = np.zeros((len(p_cam), 2, 3))
+            jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1 / z
+            jacobian[:, :, 2] = -plane / z[:, None]
+            if self.distortion is None or len(p_cam) == 0:
+                return plane, jacobian
+            image, slope = _distorted(plane, self.distortion)
+            # Beyond the fold the image is reversed, or its radius shrinks.
+            folded = (np.linalg.det(slope) <= 0) | (np.einsum("ni,nij,nj->n", plane, slope, plane) < 0)
+            return np.where(folded[:, None], np.nan, image), slope @ jacobian
+
+    def unproject(self, image: Floats) -> Floats:
+        """See `Projection.unproject`."""
+        plane = image
+        if self.distortion is not None and len(image):
+            coefficients, eye = _coefficients(self.distortion), np.eye(3)
+            source = np.ascontiguousarray(image)[:, None]
+            plane = undistort_points(source, eye, coefficients, R=eye, P=eye, criteria=UNDISTORT_CRITERIA)
+            plane = plane.reshape(-1, 2)
+        rays = np.column_stack([plane, np.ones(len(plane))])
+        if self.distortion is not None:
+            with np.errstate(all="ignore"):
+                again, jacobian = self.project(rays)
+                found = np.linalg.norm(again - image, axis=1) <= MAX_RESIDUAL
+                found &= np.abs(jacobian[:, :, :2]).max(axis=(1, 2)) <= MAX_MAGNIFICATION
+            rays[~found] = np.nan
+        return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+
+    def defocus_depth_m(self, p_cam: Floats) -> Floats:
+        """Depth along the optical axis: the image is sharp in a plane."""
+        return np.asarray(p_cam[:, 2])
+
+
+@dataclass(frozen=True)
+class Equidistant:
+    """Fish-eye: a point at the angle theta off the axis is imaged at the radius theta.
+
+    Valid: all directions but the one straight behind. `cv2.fisheye` with k = 0 is the same up to 90 deg, where it
+    ends.
+    """
+
+    @property
+    def rectilinear(self) -> bool:
+        """False."""
+        return False
+
+    def project(self, p_cam: Floats) -> tuple[Floats, Floats]:
+        """See `Projection.project`."""
+        x, y, z = p_cam.T
+        with np.errstate(all="ignore"):
+            rho = np.maximum(np.hypot(x, y), 1e-12 * np.abs(z))
+            scale = np.arctan2(rho, z) / rho
+            distance2 = rho * rho + z * z
+            # (d scale / d rho) / rho, from d theta / d rho = z / distance2; and d theta / dz = -rho / distance2.
+            scale_slope = (z / distance2 - scale) / (rho * rho)
+            across = p_cam[:, :2]
+            jacobian = np.empty((len(p_cam), 2, 3))
+            jacobian[:, :, :2] = across[:, :, None] * across[:, None, :] * scale_slope[:, None, None]
+            jacobian[:, 0, 0] += scale
+            jacobian[:, 1, 1] += scale
+            jacobian[:, :, 2] = -across / distance2[:, None]
+            return across * scale[:, None], jacobian
+
+    def unproject(self, image: Floats) -> Floats:
+        """See `Projection.unproject`."""
+        theta = np.linalg.norm(image, axis=1)
+        rays = np.column_stack([image * np.sinc(theta / np.pi)[:, None], np.cos(theta)])
+        rays[~(theta < np.pi)] = np.nan
+        return rays
+
+    def defocus_depth_m(self, p_cam: Floats) -> Floats:
+        """Distance from the projection centre: the image is sharp on a sphere."""
+        return np.asarray(np.linalg.norm(p_cam, axis=1))
+
+
+def projection_of(camera: Camera) -> Projection:
+    """Projection of a camera of the format."""
+    return Perspective(camera.distortion) if camera.projection == "perspective" else Equidistant()
+
+
+def _coefficients(distortion: Distortion) -> Floats:
+    """Coefficients in OpenCV's order."""
+    return np.array([distortion.k1, distortion.k2, distortion.p1, distortion.p2, distortion.k3])
+
+
+def _distorted(plane: Floats, distortion: Distortion) -> tuple[Floats, Floats]:
+    """Distorted image (n, 2) of pinhole coordinates (n, 2), and its Jacobian (n, 2, 2)."""
+    at_depth_1 = np.column_stack([plane, np.ones(len(plane))])
+    image, jacobian = cv2.projectPoints(at_depth_1, np.zeros(3), np.zeros(3), np.eye(3), _coefficients(distortion))[:2]
+    # Columns 3 and 4 are by the translation along x and y, which at depth 1 shifts the pinhole coordinates.
+    return image.reshape(-1, 2), jacobian[:, 3:5].reshape(-1, 2, 2)
 
 
 @dataclass(frozen=True, eq=False)
-class TiltedPose:
-    """Where a camera is, (3,) world metres, and the rig's tilts and yaw in radians (FORMAT.md, Tilt)."""
+class ProjectedPoints:
+    """Images of n points: `pixels` (n, 2), NaN outside the lens's valid range; `slopes` (n, 2, 6) by the pose.
 
-    position_m: Floats
-    tilt_x: float
-    tilt_y: float
-    yaw: float
-
-    def R_rig_world(self) -> Floats:
-        """`Rx(tilt_x) Ry(tilt_y) Rz(yaw)`, (3, 3)."""
-        return np.asarray(rotation(self.tilt_x, self.tilt_y) @ _about_z(self.yaw))
-
-    def moved(self, step: Floats) -> "TiltedPose":
-        """This pose and a step (6,) of its parameters."""
-        return TiltedPose(
-            self.position_m + step[:3], self.tilt_x + step[3], self.tilt_y + step[4], float(self.yaw + step[5])
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class Projected:
-    """Images of n points: `pixels` (n, 2), NaN where the lens does not image a point; `slopes` (n, 2, 6) by the pose.
-
-    `p_cam` (n, 3) are the points in camera axes, metres. `light` (n,) is the light a pixel gets there from a surface of
-    one luminance, up to a factor that is the same all over the sensor.
+    `p_cam` (n, 3) are the points in camera axes, metres. `relative_illumination` (n,) is the irradiance of the sensor
+    there by a surface of uniform luminance, up to a factor common to the whole sensor.
     """
 
     pixels: Floats
     slopes: Floats
     p_cam: Floats
-    light: Floats
+    relative_illumination: Floats
 
 
-def pose_of_rotation(position_m: Floats, R_cam_world: Floats, camera: Camera) -> TiltedPose:
-    """The pose of a camera at a position (3,) with a rotation (3, 3)."""
-    R = np.array(camera.R_cam_rig).T @ R_cam_world
-    # R[:, 2] = Rx Ry (0, 0, 1) and R = (Rx Ry) Rz.
-    tilt_x, tilt_y = float(np.arctan2(R[1, 2], R[2, 2])), float(-np.arcsin(np.clip(R[0, 2], -1.0, 1.0)))
-    turn = rotation(tilt_x, tilt_y).T @ R
-    return TiltedPose(position_m, tilt_x, tilt_y, float(np.arctan2(turn[0, 1], turn[0, 0])))
-
-
-def project(points_m: Floats, pose: TiltedPose, camera: Camera) -> Projected:
-    """Images of world points (n, 3) and their derivatives by the pose."""
-    R_cam_rig = np.array(camera.R_cam_rig)
-    offset = points_m - pose.position_m
-    R = R_cam_rig @ pose.R_rig_world()
-    p_cam = offset @ R.T
-    with np.errstate(all="ignore"):
-        on_sensor, lens = _perspective(p_cam, camera) if camera.projection == "perspective" else _equidistant(p_cam)
+def project(points_m: Floats, pose: Pose, camera: Camera) -> ProjectedPoints:
+    """Images of world points (n, 3), and their derivatives by the POSE_PARAMETERS."""
+    p_cam = pose.in_camera(points_m)
+    image, jacobian = projection_of(camera).project(p_cam)
     K = camera.matrix()
-    pixels = on_sensor @ K[:2, :2].T + K[:2, 2]
-    to_pixels = K[:2, :2] @ lens
+    to_pixels = K[:2, :2] @ jacobian
     slopes = np.empty((len(points_m), 2, POSE_PARAMETERS))
-    slopes[:, :, :3] = (to_pixels.reshape(-1, 3) @ -R).reshape(-1, 2, 3)
-    for column, turn in enumerate(_rotation_slopes(pose), start=3):
-        turned = offset @ (R_cam_rig @ turn).T
-        slopes[:, :, column] = (to_pixels * turned[:, None]).sum(axis=2)
-    return Projected(pixels, slopes, p_cam, _light(p_cam, lens))
+    slopes[:, :, :3] = (to_pixels.reshape(-1, 3) @ -pose.R_cam_world).reshape(-1, 2, 3)
+    offset = points_m - pose.position_m
+    for column, rotation_slope in enumerate(_rotation_slopes(pose, camera), start=3):
+        rotated = offset @ rotation_slope.T
+        slopes[:, :, column] = (to_pixels * rotated[:, None]).sum(axis=2)
+    return ProjectedPoints(camera.to_pixels(image), slopes, p_cam, _relative_illumination(p_cam, jacobian))
 
 
-def _light(p_cam: Floats, lens: Floats) -> Floats:
-    """cos(theta), for the pupil seen at an angle, times the solid angle that an area of the sensor sees.
+def _relative_illumination(p_cam: Floats, jacobian: Floats) -> Floats:
+    """cos(theta), by which the pupil is foreshortened, times the solid angle that an area of the sensor subtends.
 
-    With the rows m1, m2 of the lens's slope an area across the ray is imaged (m1 x m2) . p / |p| times as large, and a
-    solid angle is area over |p|^2. For a pinhole this is cos^4(theta).
+    With the rows m1, m2 of the Jacobian, an area across the ray is magnified by (m1 x m2) . p / |p|, and a solid angle
+    is area over |p|^2. For a pinhole this is cos^4(theta).
     """
     distance = np.linalg.norm(p_cam, axis=1)
-    area = np.abs((np.cross(lens[:, 0], lens[:, 1]) * p_cam).sum(axis=1)) * distance
-    return np.asarray(np.maximum(p_cam[:, 2], 0.0) / distance / area)
+    with np.errstate(all="ignore"):
+        area = np.abs((np.cross(jacobian[:, 0], jacobian[:, 1]) * p_cam).sum(axis=1)) * distance
+        return np.asarray(np.maximum(p_cam[:, 2], 0.0) / distance / area)
 
 
-def _about_z(angle: float) -> Floats:
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
-
-
-def _rotation_slopes(pose: TiltedPose) -> tuple[Floats, Floats, Floats]:
-    """Derivatives of `Rx Ry Rz` by tilt_x, tilt_y and yaw, each (3, 3)."""
+def _rotation_slopes(pose: Pose, camera: Camera) -> tuple[Floats, Floats, Floats]:
+    """Derivatives of `R_cam_world = R_cam_rig Rx Ry Rz` by tilt_x, tilt_y and yaw, each (3, 3)."""
     about_x = np.array([[0.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     about_y = np.array([[0.0, 0, -1], [0, 0, 0], [1, 0, 0]])
     about_z = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 0]])
-    R, Rx = pose.R_rig_world(), rotation(pose.tilt_x, 0.0)
-    return about_x @ R, Rx @ about_y @ Rx.T @ R, R @ about_z
-
-
-def _perspective(p_cam: Floats, camera: Camera) -> tuple[Floats, Floats]:
-    """Places on the sensor (n, 2) in units of the image distance, and slopes (n, 2, 3) by the point."""
-    x, y, z = p_cam.T
-    seen = z > MIN_DEPTH_SHARE * np.linalg.norm(p_cam, axis=1)
-    z = np.where(seen, z, np.nan)
-    a, b = x / z, y / z
-    slopes = np.zeros((len(p_cam), 2, 3))
-    slopes[:, 0, 0] = slopes[:, 1, 1] = 1 / z
-    slopes[:, 0, 2], slopes[:, 1, 2] = -a / z, -b / z
-    plane = np.column_stack([a, b])
-    if camera.distortion is None:
-        return plane, slopes
-    d = camera.distortion
-    r2 = a * a + b * b
-    s = 1 + r2 * (d.k1 + r2 * (d.k2 + r2 * d.k3))
-    s_slope = 2 * (d.k1 + r2 * (2 * d.k2 + r2 * 3 * d.k3))  # ds/da = s_slope a
-    distorted = np.column_stack(
-        [a * s + 2 * d.p1 * a * b + d.p2 * (r2 + 2 * a * a), b * s + d.p1 * (r2 + 2 * b * b) + 2 * d.p2 * a * b]
+    R_cam_rig = camera.R_cam_rig_array()
+    R_rig_world = R_cam_rig.T @ pose.R_cam_world
+    Rx = rotation(pose.rig_angles(camera)[0], 0.0)
+    return (
+        R_cam_rig @ about_x @ R_rig_world,
+        R_cam_rig @ Rx @ about_y @ Rx.T @ R_rig_world,
+        pose.R_cam_world @ about_z,
     )
-    bend = np.empty((len(p_cam), 2, 2))
-    bend[:, 0, 0] = s + a * a * s_slope + 2 * d.p1 * b + 6 * d.p2 * a
-    bend[:, 0, 1] = bend[:, 1, 0] = a * b * s_slope + 2 * d.p1 * a + 2 * d.p2 * b
-    bend[:, 1, 1] = s + b * b * s_slope + 6 * d.p1 * b + 2 * d.p2 * a
-    # Beyond the fold the radius shrinks, or the image is the wrong way round: no pixel.
-    folded = (np.linalg.det(bend) <= 0) | (s + r2 * s_slope <= 0)
-    return np.where(folded[:, None], np.nan, distorted), bend @ slopes
-
-
-def _equidistant(p_cam: Floats) -> tuple[Floats, Floats]:
-    """As `_perspective`, of a fish-eye: (x, y) = theta (x, y) / rho."""
-    x, y, z = p_cam.T
-    rho = np.maximum(np.hypot(x, y), 1e-12 * np.abs(z))
-    theta = np.arctan2(rho, z)
-    size2 = rho * rho + z * z
-    scale = theta / rho
-    # d(theta)/d(rho) = z / size2 and d(theta)/dz = -rho / size2
-    scale_slope = (z / size2 - scale) / (rho * rho)
-    slopes = np.empty((len(p_cam), 2, 3))
-    for row, along in enumerate((x, y)):
-        slopes[:, row, 0] = along * x * scale_slope
-        slopes[:, row, 1] = along * y * scale_slope
-        slopes[:, row, row] += scale
-        slopes[:, row, 2] = -along / size2
-    return np.column_stack([x, y]) * scale[:, None], slopes

@@ -1,1 +1,1 @@
-"""Evaluation: variants run over a dataset, scored against the sealed truth, and compared with each other."""
+"""Evaluation: variants run over a dataset, scored by the sealed truth, and compared with each other."""

@@ -1,4 +1,4 @@
-"""Runs variants over a dataset, shot by shot, and times them. Whatever a variant does, its frame stays in the count."""
+"""Batch estimation: variants over the frames of a dataset, shot by shot, timed. Every frame gets a row."""
 
 import operator
 import time
@@ -9,21 +9,22 @@ from itertools import groupby
 import numpy as np
 
 from estimator.errors import EstimationFailure, InputError
-from estimator.io.dataset import Dataset, DeviceFrame, FrameRecord, Led, read_frame
+from estimator.io.dataset import Dataset, FrameRecord, read_frame
+from estimator.io.device import DeviceFrame, Led
 from estimator.io.estimates import EstimateRow, LedRange
-from estimator.io.records import LARGEST, is_covariance
-from estimator.variants.variant import Estimate, Variant
+from estimator.io.records import MAX_NUMBER, is_covariance
+from estimator.methods.variant import Estimate, Variant
 
 Rows = dict[str, list[EstimateRow]]
-"""By variant, one a frame."""
+"""Rows by variant name, one a frame."""
 
 
 def estimate_dataset(
     dataset: Dataset, variants: Sequence[Variant], on_frame: Callable[[], None]
 ) -> dict[str, tuple[EstimateRow, ...]]:
-    """Every variant's rows, one a frame; each image is read once, and `on_frame` is called for each.
+    """Rows of every variant, one a frame; each image is read once, and `on_frame` is called after each frame.
 
-    An image that cannot be read is a failed frame of every variant, with the reason `read: ...`.
+    A frame whose image cannot be read fails for every variant, with the reason `read: ...`.
     """
     rows: Rows = {variant.name: [] for variant in variants}
     for records in shots(dataset):
@@ -35,12 +36,12 @@ def estimate_dataset(
 
 
 def shots(dataset: Dataset) -> list[tuple[FrameRecord, ...]]:
-    """The frames of each shot, which are exposed and estimated together, in order."""
+    """Frames of each shot, in order; they were exposed at once and are estimated together."""
     return [tuple(records) for _, records in groupby(dataset.frames, lambda record: record.shot)]
 
 
 def estimate_shot(dataset: Dataset, records: Sequence[FrameRecord], variants: Sequence[Variant]) -> Rows:
-    """Every variant's rows for the frames of one shot."""
+    """Rows of every variant for the frames of one shot."""
     rows: Rows = {variant.name: [] for variant in variants}
     shot = [(record, _read(dataset, record)) for record in records]
     for record, frame in shot:
@@ -58,25 +59,25 @@ def estimate_shot(dataset: Dataset, records: Sequence[FrameRecord], variants: Se
 
 def _read(dataset: Dataset, record: FrameRecord) -> DeviceFrame | EstimationFailure:
     try:
-        frame = read_frame(dataset, record)
+        frame = read_frame(dataset, record, with_other_cameras=False)
     except InputError as error:
         return EstimationFailure("read", str(error))
     for part in frame.parts:
-        # One variant's work in place would be in the image that the next one gets.
+        # Variants share the image: one that changes it in place must fail.
         part.image_dn.setflags(write=False)
     return frame
 
 
 def estimate_frame(variant: Variant, frame: DeviceFrame, index: int) -> EstimateRow:
-    """One variant's answer to one frame; `time_s` is wall time from the digital numbers to the position.
+    """Row of one variant for one frame; `time_s` is wall time from the digital numbers to the position.
 
-    What is no answer is a failed frame: an exception of any kind, something else than an Estimate, numbers that are
-    not finite, a covariance that is none, a range to an LED that is not on the map.
+    The frame fails on any exception, a result that is not an Estimate, numbers that are not finite, a covariance that
+    is not positive definite, and a range to an LED that is not on the map.
     """
     start = time.perf_counter()
     try:
         estimate = variant.estimate(frame)
-        return _answered(index, estimate, frame.leds, time.perf_counter() - start)
+        return _ok(index, estimate, frame.leds, time.perf_counter() - start)
     except EstimationFailure as failure:
         return _failed(index, failure, frame.leds, time.perf_counter() - start)
     except (Exception, SystemExit) as error:
@@ -84,14 +85,14 @@ def estimate_frame(variant: Variant, frame: DeviceFrame, index: int) -> Estimate
         return _failed(index, crash, frame.leds, time.perf_counter() - start)
 
 
-def _answered(index: int, estimate: object, leds: Mapping[int, Led], time_s: float) -> EstimateRow:
+def _ok(index: int, estimate: object, leds: Mapping[int, Led], time_s: float) -> EstimateRow:
     if not isinstance(estimate, Estimate):
-        raise EstimationFailure("variant", "returned something else than an Estimate")
+        raise EstimationFailure("variant", "returned no Estimate")
     ranges = _led_ranges(estimate.ranges_m, leds)
     position_m = np.asarray(estimate.position_m, dtype=np.float64)
     if position_m.shape != (3,):
         raise EstimationFailure("position", "the result is not three numbers", estimate.ranges_m)
-    if not np.abs(position_m).max() <= LARGEST:  # also for NaN
+    if not np.abs(position_m).max() <= MAX_NUMBER:  # also for NaN
         raise EstimationFailure("position", "the result is not a finite number", estimate.ranges_m)
     covariance = None
     if estimate.covariance_m2 is not None:
@@ -116,7 +117,7 @@ def _failed(index: int, failure: EstimationFailure, leds: Mapping[int, Led], tim
     try:
         ranges = _led_ranges(failure.ranges_m, leds)
     except (EstimationFailure, TypeError, ValueError, OverflowError):
-        ranges = ()  # the frame has failed already, and for another reason
+        ranges = ()  # keep the first reason of the failure
     return EstimateRow(frame=index, status="failed", reason=str(failure), position_m=None, ranges=ranges, time_s=time_s)
 
 
@@ -124,6 +125,6 @@ def _led_ranges(ranges_m: Mapping[int, float], leds: Mapping[int, Led]) -> tuple
     ranges = {operator.index(led): float(range_m) for led, range_m in ranges_m.items()}
     if not ranges.keys() <= leds.keys():
         raise EstimationFailure("ranges", "to an LED that is not on the map")
-    if not all(abs(range_m) <= LARGEST for range_m in ranges.values()):
+    if not all(abs(range_m) <= MAX_NUMBER for range_m in ranges.values()):
         raise EstimationFailure("ranges", "the result is not a finite number")
     return tuple(LedRange(led=led, range_m=range_m) for led, range_m in ranges.items())

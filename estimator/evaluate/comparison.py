@@ -1,4 +1,4 @@
-"""Two variants on the same frames: their errors differ by the method alone, for the frames' own difficulty cancels."""
+"""Paired comparison of two variants on the same frames, which cancels the difficulty of the frames."""
 
 import numpy as np
 from pydantic import Field
@@ -9,11 +9,11 @@ from estimator.io.records import Number, Row
 
 
 class Comparison(Row):
-    """`a` against `b`. Every frame is in one of `both`, `only_a`, `only_b`, `neither`, by who answered it.
+    """Comparison of `a` with `b`. `both`, `only_a`, `only_b` and `neither` count the frames by which succeeded.
 
-    The rest is over `both`: on how many of them which was nearer; the median of A's 3D error minus B's, negative where
-    A is nearer, with its bootstrap interval; and the p-value of Wilcoxon's signed-rank test, two-sided, that such
-    differences come of a distribution symmetric about zero. Null without a frame, or without a difference, to go by.
+    The other values are over the frames of `both`: counts of frames where A or B is nearer to the truth; the median of
+    A's 3D error minus B's, with its bootstrap interval; and the two-sided p-value of Wilcoxon's signed-rank test for
+    differences symmetric about zero. They are null without a frame, the p-value also without a difference.
     """
 
     a: str
@@ -30,7 +30,7 @@ class Comparison(Row):
 
 
 def compare(a: VariantScore, b: VariantScore) -> Comparison:
-    """Pair two variants' scores of one dataset, frame by frame."""
+    """Compare two variants' scores of one dataset, frame by frame."""
     pairs = [(left.error_3d_m, right.error_3d_m) for left, right in zip(a.rows, b.rows, strict=True)]
     differences_m = [left - right for left, right in pairs if left is not None and right is not None]
     return Comparison(
@@ -55,9 +55,9 @@ def _signed_rank_p(differences_m: list[float]) -> float:
 
 
 def best(variants: tuple[VariantScore, ...]) -> VariantScore:
-    """The variant that is nearest over all frames, failed ones infinitely wrong: by the median, then p95, then name."""
+    """Variant with the smallest median error over all frames, then p95, failures, name; a failed frame is infinite."""
 
-    def badness(score: VariantScore) -> tuple[float, float, int, str]:
+    def sort_key(score: VariantScore) -> tuple[float, float, int, str]:
         median_m = p95_m = float("inf")
         if score.of_all is not None:
             median_m, p95_m = (
@@ -65,4 +65,4 @@ def best(variants: tuple[VariantScore, ...]) -> VariantScore:
             )
         return median_m, p95_m, score.failed, score.variant
 
-    return min(variants, key=badness)
+    return min(variants, key=sort_key)

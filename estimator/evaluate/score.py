@@ -1,9 +1,9 @@
-"""Estimates against the truth: per frame and per variant. Every frame is in the count, answered or not."""
+"""Scores: estimates compared with the truth, by frame and by variant. Every frame counts, failed or not."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, Field, ValidationError, model_validator
@@ -24,26 +24,30 @@ from estimator.evaluate.statistics import (
     summary,
 )
 from estimator.io.atomic import write_atomically
-from estimator.io.dataset import Dataset, Led, LedId, read_dataset
+from estimator.io.dataset import Dataset, read_dataset
+from estimator.io.device import AnyLed, Led, LedId
 from estimator.io.estimates import EstimateRow, read_estimates
 from estimator.io.records import Number, Positive, Row, Size, Triple, first_problem
 from estimator.io.truth import TruthRow, read_truth
 
-VERSION = 2
+if TYPE_CHECKING:
+    import pandas as pd
+
+VERSION = 3
 
 
 class RangeError(Row):
-    """Estimated minus true distance to an LED."""
+    """Estimated minus true distance to an LED, metres."""
 
     led: LedId
     error_m: Number
 
 
 class FrameScore(Row):
-    """One frame of one variant; errors are null where it failed. `vertical_error_m` is signed, positive is too high.
+    """Score of one frame of one variant; positions in world metres. Errors are null for a failed frame.
 
-    `bound_m` is the root of the trace of the frame's Cramer-Rao bound, null without one; `nees` is `e^T C^-1 e` where
-    the variant reports a covariance.
+    `vertical_error_m` is signed, positive is too high. `bound_m` is the root of the trace of the frame's Cramer-Rao
+    bound, null without one; `nees` is `e^T C^-1 e` if the variant reports a covariance C.
     """
 
     frame: int
@@ -69,11 +73,11 @@ class FrameScore(Row):
 
 
 class VariantScore(Row):
-    """One variant over all frames.
+    """Score of one variant over all frames.
 
-    `of_all` counts failed frames as infinitely wrong. Every other summary is over the `ok` frames, null without any: it
-    is to be read beside `coverage`, their share of all. The two intervals are of `error_3d`. Range errors are of all
-    distances the variant made, failed frames' included, for a frame can fail after its distances are made.
+    `of_all` counts failed frames as infinite errors. The other summaries are over the `ok` frames, null without one:
+    read them together with `success_rate`, the share of `ok` frames. The two intervals are those of `error_3d`. Range
+    errors are of all ranges that the variant computed, including those of frames that failed afterwards.
     """
 
     variant: str
@@ -98,13 +102,13 @@ class VariantScore(Row):
 
 
 class Scores(Row):
-    """scores.json: all that a report needs of a dataset, the truth included."""
+    """Scores of a dataset, the content of scores.json: all that a report needs, including the truth."""
 
     format: Literal["estimator-scores"] = "estimator-scores"
-    version: Literal[2] = 2
+    version: Literal[3] = 3
     dataset: str
     room_m: tuple[Positive, Positive, Positive]
-    led_map: tuple[Led, ...]
+    led_map: tuple[AnyLed, ...]
     variants: tuple[VariantScore, ...]
 
     @model_validator(mode="after")
@@ -114,11 +118,111 @@ class Scores(Row):
             raise ValueError("every variant has to have the frames 0, 1, 2, ... in order, and all the same")
         return self
 
+    def to_pandas(self) -> "pd.DataFrame":
+        """Table of the variants' scores.
+
+        Returns
+        -------
+        pandas.DataFrame
+            One row a variant. The columns are the keys of a variant in scores.json (datasets/FORMAT.md) without
+            `failures` and `rows`; a summary gives a column for each of its keys, `error_3d_median_m`, `nees_mean` and
+            so on. Units stand in the names. Missing values are NaN, and infinite ones of `of_all` infinity.
+
+        Raises
+        ------
+        InputError
+            pandas is not installed.
+        """
+        pd = _pandas()
+        columns = list(_summary_row(None))
+        return pd.DataFrame([_summary_row(variant) for variant in self.variants], columns=columns)
+
+    def frames_to_pandas(self) -> "pd.DataFrame":
+        """Table of the frames' scores.
+
+        Returns
+        -------
+        pandas.DataFrame
+            One row a frame and variant. The columns are `variant` and the keys of a row in scores.json
+            (datasets/FORMAT.md) without `range_errors`; positions give three columns, `true_x_m` to `estimate_z_m`.
+            Missing values are NaN.
+
+        Raises
+        ------
+        InputError
+            pandas is not installed.
+        """
+        pd = _pandas()
+        columns = ["variant", *_frame_columns()]
+        rows = [_frame_row(variant.variant, row) for variant in self.variants for row in variant.rows]
+        return pd.DataFrame(rows, columns=columns)
+
+
+def _pandas() -> Any:
+    try:
+        import pandas
+    except ImportError:
+        raise InputError("pandas is not installed: pip install pandas") from None
+    return pandas
+
+
+SUMMARIES: dict[str, type[Row]] = {
+    "of_all": OfAll,
+    "error_3d": Summary,
+    "median_interval": Interval,
+    "rmse_interval": Interval,
+    "horizontal": Summary,
+    "vertical": Summary,
+    "range_error": Summary,
+    "against_bound": AgainstBound,
+    "nees": Nees,
+}
+"""Keys of a variant that hold several values."""
+
+
+def _summary_row(score: VariantScore | None) -> dict[str, object]:
+    """Values of a variant by column name; None everywhere for None, which gives the columns."""
+    row: dict[str, object] = {}
+    for field in VariantScore.model_fields:
+        value = None if score is None else getattr(score, field)
+        if field in ("failures", "rows"):
+            continue
+        if field not in SUMMARIES:
+            row[field] = value
+            continue
+        for part in SUMMARIES[field].model_fields:
+            entry = None if value is None else getattr(value, part)
+            infinite = field == "of_all" and value is not None and entry is None
+            row[f"{field}_{part}"] = float("inf") if infinite else entry
+    return row
+
+
+def _frame_columns() -> list[str]:
+    columns: list[str] = []
+    for field in FrameScore.model_fields:
+        if field in ("true_m", "estimate_m"):
+            columns += [f"{field.removesuffix('_m')}_{axis}_m" for axis in "xyz"]
+        elif field != "range_errors":
+            columns.append(field)
+    return columns
+
+
+def _frame_row(variant: str, row: FrameScore) -> dict[str, object]:
+    values: dict[str, object] = {"variant": variant}
+    for field in FrameScore.model_fields:
+        value = getattr(row, field)
+        if field in ("true_m", "estimate_m"):
+            point = (None, None, None) if value is None else value
+            values |= {f"{field.removesuffix('_m')}_{axis}_m": size for axis, size in zip("xyz", point, strict=True)}
+        elif field != "range_errors":
+            values[field] = value
+    return values
+
 
 def score_variant(
     variant: str, estimates: Sequence[EstimateRow], truth: Sequence[TruthRow], leds: Mapping[int, Led]
 ) -> VariantScore:
-    """Score one variant's rows against the truth of the same frames."""
+    """Score of one variant's rows by the truth of the same frames."""
     rows = tuple(score_frame(row, true, leds) for row, true in zip(estimates, truth, strict=True))
     good = [row for row in rows if row.status == "ok"]
     errors_m = [row.error_3d_m for row in good if row.error_3d_m is not None]
@@ -148,7 +252,7 @@ def score_variant(
 
 
 def score_frame(estimate: EstimateRow, truth: TruthRow, leds: Mapping[int, Led]) -> FrameScore:
-    """Score one frame: position errors where there is a position, range errors for the ranges there are."""
+    """Score of one frame: position errors if it has a position, range errors for its ranges."""
     true_m = np.array(truth.position_m)
     error = horizontal = vertical = squares = None
     if estimate.position_m is not None:
@@ -179,8 +283,25 @@ def score_frame(estimate: EstimateRow, truth: TruthRow, leds: Mapping[int, Led])
     )
 
 
-def score_dataset(folder: Path) -> Scores:
-    """Score every file in `estimates/` and write scores.json; raises InputError where a file is missing or damaged."""
+def score(directory: str | Path) -> Scores:
+    """Compare all estimates of a dataset with the truth, and write scores.json.
+
+    Parameters
+    ----------
+    directory
+        Folder of a dataset with estimates, as `run` writes them.
+
+    Returns
+    -------
+    Scores
+        Scores by variant and by frame, also as tables: `to_pandas`, `frames_to_pandas`.
+
+    Raises
+    ------
+    InputError
+        There are no estimates, or a file is missing or damaged.
+    """
+    folder = Path(directory)
     dataset = read_dataset(folder)
     paths = _estimate_paths(folder)
     if not paths:
@@ -201,23 +322,23 @@ class _Version(BaseModel):
 
 
 def read_or_score(folder: Path) -> Scores:
-    """scores.json where it is newer than the truth and all estimates, and covers them, else new scores.
+    """Scores of scores.json if it is newer than the truth and all estimates and covers them, else new scores.
 
-    The truth need not be there where scores.json is. An older version's scores are made again. Raises InputError.
+    The truth may be missing if scores.json is there. Scores of an older version are computed again. Raises InputError.
     """
     path, estimates = folder / "scores.json", _estimate_paths(folder)
     sources = [source for source in (*estimates, folder / "truth.parquet") if source.exists()]
     if not path.exists() or any(source.stat().st_mtime > path.stat().st_mtime for source in sources):
-        return score_dataset(folder)
+        return score(folder)
     content = path.read_bytes()
     try:
         if _Version.model_validate_json(content).version < VERSION:
-            return score_dataset(folder)
+            return score(folder)
         scores = Scores.model_validate_json(content)
     except ValidationError as error:
         raise InputError(f"{path}: {first_problem(error)}") from None
-    if estimates and [score.variant for score in scores.variants] != [estimate.stem for estimate in estimates]:
-        return score_dataset(folder)
+    if estimates and [one.variant for one in scores.variants] != [estimate.stem for estimate in estimates]:
+        return score(folder)
     return scores
 
 
@@ -230,7 +351,7 @@ def _estimate_paths(folder: Path) -> list[Path]:
 
 
 def _read_known(path: Path, dataset: Dataset) -> tuple[EstimateRow, ...]:
-    """Estimates whose ranges are to LEDs of the map."""
+    """Estimates of a file; raises InputError for a range to an LED that is not in the map."""
     rows = read_estimates(path, len(dataset.frames))
     for row in rows:
         for led_range in row.ranges:

@@ -1,36 +1,46 @@
-"""Scores as the cells of tables, for a terminal and a page alike."""
+"""Scores as cells of tables, for the terminal and the report."""
 
 from estimator.evaluate.comparison import Comparison
 from estimator.evaluate.score import VariantScore
 from estimator.evaluate.statistics import Interval, Summary
 
 ERROR_HEADERS = (
-    *("ok", "failed", "coverage", "median of all", "p95 of all", "median", "95 % interval", "RMSE", "95 % interval"),
+    *(
+        "ok",
+        "failed",
+        "success rate",
+        "median of all",
+        "p95 of all",
+        "median",
+        "95 % interval",
+        "RMSE",
+        "95 % interval",
+    ),
     *("mean", "p95", "max", "horizontal", "vertical", "range", "time"),
 )
 ERROR_NOTE = (
-    "Of all: what the errors of 50 and 95 % of all frames do not exceed, a failed frame being infinitely wrong. The "
-    "others are over the frames that succeeded: median to max of the 3D error, with bootstrap intervals; medians of "
-    "horizontal, vertical and range errors (of all distances made, failed frames' included) and of the time."
+    "Of all: median and 95th percentile over all frames; a failed frame counts as infinite error. The other columns "
+    "are over the frames that succeeded: median to max of the 3D error, with bootstrap intervals; medians of "
+    "horizontal, vertical and range errors (of all ranges, including those of failed frames) and of the time."
 )
 LIMIT_HEADERS = ("frames with a bound", "bound", "RMSE there", "efficiency", "NEES", "99 % interval", "of", "ambiguous")
 LIMIT_NOTE = (
     "Bound and RMSE are root mean squares over the frames that succeeded and have a Cramér-Rao bound; efficiency is "
-    "their ratio. NEES is the mean squared error in units of the covariance that the variant reports, 3 where that is "
-    "honest; above its interval the variant is too sure of itself, below it too modest. Ambiguous: answers with a "
-    "second one that fits nearly as well."
+    "their ratio. NEES is the mean squared error in units of the covariance that the variant reports, 3 if the "
+    "covariance is consistent; above its interval the variant is overconfident, below it conservative. Ambiguous: "
+    "estimates with a second one that fits nearly as well."
 )
 PAIR_HEADERS = ("both", "only A", "only B", "neither", "A nearer", "median A − B", "95 % interval", "Wilcoxon p")
 PAIR_NOTE = (
-    "Over the frames that both answered: where A is nearer, the median of A's 3D error minus B's with its bootstrap "
-    "interval, and Wilcoxon's signed-rank test. Failures stand beside it."
+    "Over the frames where both succeeded: the share where A is nearer, the median of A's 3D error minus B's with its "
+    "bootstrap interval, and Wilcoxon's signed-rank test. The first four columns count all frames."
 )
 
 UNITS = ((1e-6, "µm"), (1e-3, "mm"), (1.0, "m"))
 
 
 def error_cells(score: VariantScore) -> tuple[str, ...]:
-    """A variant's row under ERROR_HEADERS."""
+    """Row of a variant, by ERROR_HEADERS."""
     of_all = [None] * 2 if score.of_all is None else [score.of_all.median_m, score.of_all.p95_m]
     time_s = score.median_time_s
     return (
@@ -53,22 +63,24 @@ def _of(part: Summary | None, field: str) -> str:
 
 
 def limit_cells(score: VariantScore) -> tuple[str, ...]:
-    """A variant's row under LIMIT_HEADERS."""
-    bound, honesty = score.against_bound, score.nees
+    """Row of a variant, by LIMIT_HEADERS."""
+    bound, consistency = score.against_bound, score.nees
     of_bound, of_nees = ("0", "–", "–", "–"), ("–", "–", "0")
     if bound is not None:
         efficiency = "–" if bound.efficiency is None else f"{bound.efficiency:.3g}"
         of_bound = (str(bound.frames), length_text(bound.bound_rms_m), length_text(bound.rmse_m), efficiency)
-    if honesty is not None:
-        verdict = "" if honesty.within else " (too sure)" if honesty.mean > honesty.high else " (too modest)"
-        interval = f"{honesty.low:.3g} to {honesty.high:.3g}"
-        of_nees = (f"{honesty.mean:.3g}{verdict}", interval, str(honesty.frames))
+    if consistency is not None:
+        verdict = ""
+        if not consistency.within:
+            verdict = " (overconfident)" if consistency.mean > consistency.high else " (conservative)"
+        interval = f"{consistency.low:.3g} to {consistency.high:.3g}"
+        of_nees = (f"{consistency.mean:.3g}{verdict}", interval, str(consistency.frames))
     share = f" ({share_text(score.ambiguous, score.ok)})" if score.ambiguous else ""
     return (*of_bound, *of_nees, f"{score.ambiguous}{share}")
 
 
 def pair_cells(pair: Comparison) -> tuple[str, ...]:
-    """A comparison's row under PAIR_HEADERS."""
+    """Row of a comparison, by PAIR_HEADERS."""
     counts = (pair.both, pair.only_a, pair.only_b, pair.neither)
     p = "–" if pair.wilcoxon_p is None else f"{pair.wilcoxon_p:.2g}"
     return (
@@ -81,16 +93,16 @@ def pair_cells(pair: Comparison) -> tuple[str, ...]:
 
 
 def length_text(metres: float | None) -> str:
-    """A length for people, to three digits: `12.3 mm`, `1.23 m`; a dash for None."""
+    """Length with a unit, to three digits: `12.3 mm`, `1.23 m`; a dash for None."""
     if metres is None:
         return "–"
-    # What would round up to 1000 has the next unit.
+    # A value that rounds to 1000 takes the next unit.
     size_m, unit = next((item for item in UNITS if abs(metres) < 999.5 * item[0]), UNITS[-1])
     return f"{metres / size_m:.3g} {unit}"
 
 
 def interval_text(interval: Interval | None) -> str:
-    """An interval for people, `12.3 to 14.5 mm`; a dash for None."""
+    """Interval with a unit, `12.3 to 14.5 mm`; a dash for None."""
     if interval is None:
         return "–"
     low, high = length_text(interval.low_m), length_text(interval.high_m)
@@ -99,7 +111,7 @@ def interval_text(interval: Interval | None) -> str:
 
 
 def share_text(count: int, of: int) -> str:
-    """A share for people, never 100 % of less than all: `99.5 %`; a dash of nothing."""
+    """Share in percent, rounded down: `99.5 %`; a dash for a share of nothing."""
     if of == 0:
         return "–"
     tenths = 1000 * count // of

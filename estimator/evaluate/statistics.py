@@ -1,4 +1,4 @@
-"""Errors of many frames in a few numbers: with failures counted, with intervals, against bounds and covariances."""
+"""Statistics of errors: summaries with failures counted, bootstrap intervals, efficiency, covariance consistency."""
 
 from collections.abc import Callable, Sequence
 
@@ -12,16 +12,16 @@ Floats = NDArray[np.float64]
 
 CONFIDENCE = 0.95
 RESAMPLES = 1999
-"""50 of them lie beyond each limit, so that the share beyond it is 2.5 % give or take 0.35."""
+"""50 of them lie beyond each limit, so that the share beyond it is 2.5 % with a standard error of 0.35 %."""
 BOOTSTRAP_KEY = 20161118
 MAX_RESAMPLED_AT_ONCE = 2_000_000
 NEES_CONFIDENCE = 0.99
 MIN_ERROR_M = 1e-100
-"""What is below is zero; nothing is divided by it."""
+"""Smaller errors count as zero; no efficiency is computed from them."""
 
 
 class Summary(Row):
-    """Of absolute errors, metres; `p95_m` is interpolated linearly."""
+    """Summary of absolute errors, metres; `p95_m` is interpolated linearly."""
 
     median_m: Size
     mean_m: Size
@@ -31,10 +31,10 @@ class Summary(Row):
 
 
 class OfAll(Row):
-    """Errors that half, and 95 %, of all frames do not exceed, a failed frame's being infinite; null is infinite.
+    """Median and 95th percentile of the 3D error over all frames, metres; null is infinite.
 
-    They are errors of frames, not interpolated between two, for there is nothing between a number and infinity. A frame
-    that fails instead of being wrong can only make them larger.
+    A failed frame counts as infinite error. The percentiles are errors of frames, not interpolated, because there is no
+    value between a number and infinity. A frame that fails instead of being wrong can only increase them.
     """
 
     median_m: Size | None
@@ -42,16 +42,16 @@ class OfAll(Row):
 
 
 class Interval(Row):
-    """Between these a quantity lies with 95 % confidence, metres."""
+    """95 % confidence interval, metres."""
 
     low_m: Number
     high_m: Number
 
 
 class AgainstBound(Row):
-    """`bound_rms_m / rmse_m`, both over the same `frames`: those that succeeded and have a bound.
+    """Efficiency `bound_rms_m / rmse_m`, both over the same `frames`: those that succeeded and have a bound.
 
-    `bound_rms_m` is the root of the mean trace of the bound; the efficiency is null where no frame has an error.
+    `bound_rms_m` is the root of the mean trace of the bound; the efficiency is null if the errors are zero.
     """
 
     frames: int = Field(ge=1)
@@ -61,11 +61,12 @@ class AgainstBound(Row):
 
 
 class Nees(Row):
-    """Mean of `e^T C^-1 e` over the `frames` that report a covariance C of their error e (3,).
+    """Covariance consistency: mean of `e^T C^-1 e` over the `frames` that report a covariance C of their error e (3,).
 
-    Where C is honest, errors normal and frames independent, `frames` times it is chi-square with 3 `frames` degrees of
-    freedom, and it lies from `low` to `high` with 99 % probability (Bar-Shalom, Li and Kirubarajan, Estimation with
-    Applications to Tracking and Navigation, 2001, 5.4.2). Above, the variant is too sure of itself; below, too modest.
+    If C is the true covariance, errors are normal and frames independent, `frames` times the mean is chi-square with
+    3 `frames` degrees of freedom, and the mean lies in `low` to `high` with 99 % probability (Bar-Shalom, Li and
+    Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, 5.4.2). Above the interval the variant
+    is overconfident, below it conservative.
     """
 
     frames: int = Field(ge=1)
@@ -76,7 +77,7 @@ class Nees(Row):
 
 
 def summary(errors_m: Sequence[float]) -> Summary | None:
-    """Summarise errors of either sign; None without any."""
+    """Summary of errors of either sign; None without errors."""
     if not errors_m:
         return None
     size_m = np.abs(np.array(errors_m, dtype=np.float64))
@@ -90,42 +91,42 @@ def summary(errors_m: Sequence[float]) -> Summary | None:
 
 
 def of_all(errors_m: Sequence[float | None]) -> OfAll | None:
-    """Errors of all frames, None for a failed one, which counts as infinite; None without a frame."""
+    """Percentiles of the errors of all frames, None for a failed one; None without a frame."""
     if not errors_m:
         return None
     ordered = sorted(np.inf if error_m is None else error_m for error_m in errors_m)
 
-    def kept_by(percent: int) -> float | None:
+    def percentile(percent: int) -> float | None:
         error_m = ordered[-(-percent * len(ordered) // 100) - 1]
         return error_m if np.isfinite(error_m) else None
 
-    return OfAll(median_m=kept_by(50), p95_m=kept_by(95))
+    return OfAll(median_m=percentile(50), p95_m=percentile(95))
 
 
 def root_mean_square(values: Floats, axis: int = -1) -> Floats:
-    """Over an axis."""
+    """Root mean square over an axis."""
     return np.asarray(np.sqrt(np.mean(np.square(values), axis=axis)))
 
 
 def median_interval(values_m: Sequence[float]) -> Interval | None:
-    """Interval of the median of what the values are a sample of; None for fewer than two."""
+    """Confidence interval of the median; None for fewer than two values."""
     return _interval(values_m, np.median)
 
 
 def rmse_interval(errors_m: Sequence[float]) -> Interval | None:
-    """Interval of the root mean square of what the errors are a sample of; None for fewer than two."""
+    """Confidence interval of the root mean square; None for fewer than two errors."""
     return _interval(errors_m, root_mean_square)
 
 
 def _interval(values_m: Sequence[float], statistic: Callable[..., Floats]) -> Interval | None:
-    """Percentile bootstrap over frames, which it takes as independent; the same values give the same interval.
+    """Percentile bootstrap over frames, which are assumed independent; the same values give the same interval.
 
-    Not BCa: it corrects by a jackknife, which is inconsistent for a median (Efron and Tibshirani, An Introduction to
-    the Bootstrap, 1993, 11.6), and which takes time with the square of the number of frames.
+    Not BCa: its jackknife is inconsistent for a median (Efron and Tibshirani, An Introduction to the Bootstrap, 1993,
+    11.6), and its time grows with the square of the number of frames.
     """
     if len(values_m) < 2:
         return None
-    # Here and below: its import takes a second, which commands that score nothing are spared.
+    # Imported here and below: the import takes a second, which other commands need not wait for.
     from scipy.stats import bootstrap
 
     result = bootstrap(
@@ -142,7 +143,7 @@ def _interval(values_m: Sequence[float], statistic: Callable[..., Floats]) -> In
 
 
 def against_bound(errors_m: Sequence[float], bounds_m: Sequence[float]) -> AgainstBound | None:
-    """Hold errors against the bounds of the same frames, each the root of the bound's trace; None without any."""
+    """Efficiency of errors by the bounds of the same frames, each the root of its trace; None without a frame."""
     if not errors_m:
         return None
     rmse_m, bound_rms_m = (float(root_mean_square(np.array(sizes))) for sizes in (errors_m, bounds_m))
@@ -155,7 +156,7 @@ def against_bound(errors_m: Sequence[float], bounds_m: Sequence[float]) -> Again
 
 
 def squared_in_sigmas(error_m: Floats, covariance_m2: Sequence[float]) -> float:
-    """`e^T C^-1 e` of one error (3,) and its covariance, nine numbers row by row."""
+    """`e^T C^-1 e` of an error (3,) and its covariance, nine numbers row by row."""
     matrix = np.reshape(np.asarray(covariance_m2), (3, 3))
     sigma_m = np.sqrt(np.diag(matrix))
     error = error_m / sigma_m
@@ -163,7 +164,7 @@ def squared_in_sigmas(error_m: Floats, covariance_m2: Sequence[float]) -> float:
 
 
 def nees(squares: Sequence[float]) -> Nees | None:
-    """Mean and interval of `e^T C^-1 e` over frames; None without any."""
+    """Mean and interval of `e^T C^-1 e` over frames; None without a frame."""
     if not squares:
         return None
     from scipy.stats import chi2

@@ -1,4 +1,4 @@
-"""A dataset estimated by several processes: the same answers as by one, only sooner."""
+"""Estimation of a dataset by several processes, with the same results as by one."""
 
 import multiprocessing
 import os
@@ -14,16 +14,16 @@ from estimator.errors import InputError
 from estimator.evaluate.batch import Rows, estimate_dataset, estimate_shot, shots
 from estimator.io.dataset import Dataset, FrameRecord
 from estimator.io.estimates import EstimateRow
-from estimator.variants.registry import Registry
-from estimator.variants.variant import Variant
+from estimator.methods.registry import Registry
+from estimator.methods.variant import Variant
 
 
 def estimate_with_workers(
     dataset: Dataset, names: Sequence[str], workers: int, on_frame: Callable[[], None]
 ) -> dict[str, tuple[EstimateRow, ...]]:
-    """As `estimate_dataset`, for variants given by name, which each of `workers` processes looks up for itself.
+    """Rows as by `estimate_dataset`, for variants given by name; each of `workers` processes looks them up itself.
 
-    Raises InputError for an unknown name, and where a process dies.
+    Raises InputError for an unknown name, and if a process dies.
     """
     registry = Registry.read()
     variants = [registry.named(name) for name in names]
@@ -32,13 +32,13 @@ def estimate_with_workers(
     if workers <= 1:
         return estimate_dataset(dataset, variants, on_frame)
     rows: Rows = {variant.name: [] for variant in variants}
-    # spawn: a forked child of a process with threads may hang
+    # A forked child of a process with threads may hang: spawn.
     pool = ProcessPoolExecutor(
         workers, multiprocessing.get_context("spawn"), _start, (dataset, tuple(names), max(1, _cores() // workers))
     )
     try:
-        # Children start with the first task. Interrupts are the parent's, which has to live to see them out: they
-        # would otherwise each print a traceback. A mask is inherited; one that came meanwhile is delivered after.
+        # Child processes start with the first task. They inherit the mask, so that an interrupt reaches the parent
+        # alone and the children print no traceback. An interrupt in between is delivered after unmasking.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
             tasks = [pool.submit(_work, records) for records in todo]
@@ -60,20 +60,20 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-_mine: tuple[Dataset, list[Variant]]
-"""A worker's own, set as it starts."""
+_worker_state: tuple[Dataset, list[Variant]]
+"""Dataset and variants of a worker process, set as it starts."""
 
 
 def _start(dataset: Dataset, names: Sequence[str], threads: int) -> None:
-    global _mine
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    global _worker_state
+    threading.Thread(target=_exit_with_parent, daemon=True).start()
     cv2.setNumThreads(threads)
     registry = Registry.read()
-    _mine = dataset, [registry.named(name) for name in names]
+    _worker_state = dataset, [registry.named(name) for name in names]
 
 
-def _end_with_parent() -> None:
-    """Where the parent is killed, nobody would ever tell its children to stop."""
+def _exit_with_parent() -> None:
+    """Exit when the parent process dies."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
@@ -81,5 +81,5 @@ def _end_with_parent() -> None:
 
 
 def _work(records: tuple[FrameRecord, ...]) -> Rows:
-    dataset, variants = _mine
+    dataset, variants = _worker_state
     return estimate_shot(dataset, records, variants)

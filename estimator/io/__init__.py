@@ -1,4 +1,4 @@
-"""Files of the dataset format: frames as the device sees them, estimates, and the sealed truth.
+"""Files of the dataset format: frames as a device knows them, estimates, and the sealed truth.
 
-Every row is a checked model; writes are atomic.
+Rows are validated models. Files are written atomically.
 """

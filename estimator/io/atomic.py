@@ -1,11 +1,14 @@
-"""Writing a file so that a reader sees all of it or nothing."""
+"""Atomic file writes: a reader sees the old file or the new one, never a part."""
 
 import os
 from pathlib import Path
 
 
 def write_atomically(path: Path, data: bytes) -> None:
-    """Write `data` to `path` by way of a temporary file beside it, which is gone afterwards; raises OSError."""
+    """Write `data` to `path` through a temporary file in the same folder.
+
+    The temporary file is removed in any case. Raises OSError, which names `path`.
+    """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         with temporary.open("wb") as file:
@@ -14,7 +17,7 @@ def write_atomically(path: Path, data: bytes) -> None:
             os.fsync(file.fileno())
         os.replace(temporary, path)
     except OSError as error:
-        # Named after the file that was asked for.
+        # Name the requested file, not the temporary one.
         raise OSError(error.errno, error.strerror, str(path)) from None
     finally:
         temporary.unlink(missing_ok=True)

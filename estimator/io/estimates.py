@@ -1,4 +1,4 @@
-"""A variant's answers on disk: estimates/VARIANT.parquet, one row a frame (datasets/FORMAT.md)."""
+"""Estimates of a variant on disk: estimates/VARIANT.parquet, one row a frame (datasets/FORMAT.md)."""
 
 import io
 import re
@@ -12,7 +12,7 @@ from pydantic import Field, Strict, model_validator
 
 from estimator.errors import InputError
 from estimator.io.atomic import write_atomically
-from estimator.io.dataset import LedId
+from estimator.io.device import LedId
 from estimator.io.records import Covariance, Number, Row, Triple, read_rows
 
 COLUMNS = {
@@ -26,22 +26,22 @@ COLUMNS = {
     "time_s": pa.float64(),
 }
 
-# Most file systems end at 255 bytes, of which a temporary file's name takes some.
+# Most file systems allow names of 255 bytes; the name of the temporary file is longer than the variant's.
 NAME = r"[A-Za-z0-9][A-Za-z0-9._:=,+-]{0,199}"
 NAME_RULE = "at most 200 of A-Z a-z 0-9 . _ : = , + -, a letter or digit first"
 
 
 class LedRange(Row):
-    """The distance from the camera's projection centre to an LED, metres."""
+    """Distance from the camera's projection centre to an LED, metres."""
 
     led: LedId
     range_m: Number
 
 
 class EstimateRow(Row):
-    """One frame's answer: a world position in metres, or `failed` and a reason `stage: what went wrong`.
+    """Estimate of one frame: a world position in metres, or `failed` and a reason `stage: what went wrong`.
 
-    `covariance_m2` is of the position, row by row, where the variant says how sure it is.
+    `covariance_m2` is the covariance of the position, row by row, if the variant reports one.
     """
 
     frame: int = Field(ge=0)
@@ -62,14 +62,14 @@ class EstimateRow(Row):
 
 
 def estimates_path(folder: Path, variant: str) -> Path:
-    """Where a dataset keeps this variant's estimates; raises InputError for a name that no file can have."""
+    """Path of a variant's estimates in a dataset; raises InputError for a name that cannot be a file name."""
     if not re.fullmatch(NAME, variant):
         raise InputError(f"variant {variant!r}: the name becomes a file's; allowed: {NAME_RULE}")
     return folder / "estimates" / f"{variant}.parquet"
 
 
 def write_estimates(folder: Path, variant: str, rows: Sequence[EstimateRow]) -> Path:
-    """Write a variant's rows, replacing what was there in one step; returns the path, raises InputError, OSError."""
+    """Write a variant's rows, replacing an older file atomically; returns the path. Raises InputError, OSError."""
     path = estimates_path(folder, variant)
     path.parent.mkdir(exist_ok=True)
     schema = pa.schema(list(COLUMNS.items()))
@@ -80,7 +80,7 @@ def write_estimates(folder: Path, variant: str, rows: Sequence[EstimateRow]) -> 
 
 
 def read_estimates(path: Path, frame_count: int) -> tuple[EstimateRow, ...]:
-    """Read one variant's rows; raises InputError where they are damaged or are not one a frame, in order."""
+    """Read one variant's rows; raises InputError if they are damaged or not one a frame, in order."""
     rows = read_rows(path, COLUMNS, EstimateRow)
     if [row.frame for row in rows] != list(range(frame_count)):
         raise InputError(f"{path}: {len(rows)} rows, needed one for each of the {frame_count} frames, in order")

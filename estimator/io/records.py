@@ -1,4 +1,4 @@
-"""Parquet files as checked rows, and the one-line wording of what is wrong with them."""
+"""Parquet files as validated rows, and one-line messages about invalid ones."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,26 +13,26 @@ from estimator.errors import InputError
 
 
 class Row(BaseModel):
-    """A checked, unchangeable record: types are meant (no "1" for 1), and no number is NaN or infinite."""
+    """Validated, immutable record: types are strict (no "1" for 1), and no number is NaN or infinite."""
 
     model_config = ConfigDict(strict=True, frozen=True, allow_inf_nan=False, extra="ignore")
 
 
-# Every number that is reckoned with has a square that is a number too.
-LARGEST = 1e100
-Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
-Positive = Annotated[float, Field(gt=0, le=LARGEST)]
-NotNegative = Annotated[float, Field(ge=0, le=LARGEST)]
+# The square of a number must not overflow.
+MAX_NUMBER = 1e100
+Number = Annotated[float, Field(ge=-MAX_NUMBER, le=MAX_NUMBER)]
+Positive = Annotated[float, Field(gt=0, le=MAX_NUMBER)]
+NotNegative = Annotated[float, Field(ge=0, le=MAX_NUMBER)]
 Size = Annotated[float, Field(ge=0)]
-"""Of what was reckoned, so it may be larger than what is read."""
-# Arrow hands over lists; only the container is converted, the numbers in it stay strict.
+"""Computed, and so allowed to exceed MAX_NUMBER."""
+# Arrow returns lists: convert the container, keep the numbers strict.
 Triple = Annotated[tuple[Number, Number, Number], Strict(False)]
 
 MIN_VARIANCE = 1e-60
-"""A covariance below this would overflow where an error is measured by it."""
+"""Smaller variances would overflow in e^T C^-1 e."""
 MAX_ASYMMETRY = 1e-6
 MIN_EIGENVALUE = 1e-14
-"""Of the correlations: below it the inverse, in double precision, has not two digits left."""
+"""Of the correlation matrix: with a smaller one, its inverse keeps less than two digits in double precision."""
 
 
 def is_covariance(values: Sequence[float]) -> bool:
@@ -40,7 +40,7 @@ def is_covariance(values: Sequence[float]) -> bool:
     matrix = np.reshape(np.asarray(values, dtype=np.float64), (3, 3))
     variances = np.diag(matrix)
     # Also false for NaN.
-    if not (variances >= MIN_VARIANCE).all() or not np.abs(matrix).max() <= LARGEST:
+    if not (variances >= MIN_VARIANCE).all() or not np.abs(matrix).max() <= MAX_NUMBER:
         return False
     correlations = matrix / np.sqrt(np.outer(variances, variances))
     if np.abs(correlations - correlations.T).max() > MAX_ASYMMETRY:
@@ -58,13 +58,16 @@ Covariance = Annotated[
     tuple[Number, ...], Strict(False), Field(min_length=9, max_length=9), AfterValidator(_check_covariance)
 ]
 
+UNION_TAGS = ("disc", "square")
+
 RowT = TypeVar("RowT", bound=Row)
 
 
 def first_problem(error: ValidationError) -> str:
-    """The first of pydantic's complaints on one line: `where: what is allowed (got value)`."""
+    """First of pydantic's errors on one line: `where: what is allowed (got value)`."""
     problem = error.errors(include_url=False)[0]
-    where = ".".join(str(part) for part in problem["loc"]) or "the document"
+    # pydantic adds the tag of a tagged union, which is no key.
+    where = ".".join(str(part) for part in problem["loc"] if part not in UNION_TAGS) or "the document"
     value = repr(problem["input"])
     value = value if len(value) <= 60 else value[:57] + "..."
     got = "" if problem["type"] in ("missing", "json_invalid") else f" (got {value})"
@@ -72,15 +75,17 @@ def first_problem(error: ValidationError) -> str:
 
 
 def read_rows(path: Path, columns: Mapping[str, pa.DataType], row: type[RowT]) -> tuple[RowT, ...]:
-    """Read the named columns of a Parquet file as rows of the given model; other columns are ignored.
+    """Read the named columns of a Parquet file as rows of a model; other columns are ignored.
 
-    Raises InputError where the file is missing or damaged, a column is missing or of another type, or a value is not
+    Raises InputError if the file is missing or damaged, a column is missing or of another type, or a value is not
     allowed.
     """
     try:
         with pq.ParquetFile(path) as file:
             _check_columns(path, file.schema_arrow, columns)
             records = file.read(columns=list(columns)).to_pylist()
+    except InputError:
+        raise
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except (pa.ArrowException, OSError, ValueError, MemoryError) as error:
@@ -118,6 +123,6 @@ def _same_type(actual: pa.DataType, wanted: pa.DataType) -> bool:
 
 
 def first_line(error: BaseException) -> str:
-    """An exception's text on one line of at most 120 characters, its type where it has no text."""
+    """First line of an exception's text, at most 120 characters; its type if it has no text."""
     lines = str(error).splitlines()
     return lines[0][:120] if lines else type(error).__name__

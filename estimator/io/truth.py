@@ -1,4 +1,4 @@
-"""Where the camera of each frame was. The only module that opens truth.parquet; only the scorer imports it."""
+"""True positions of the frames. This is the only module that opens truth.parquet; only the scorer imports it."""
 
 from pathlib import Path
 
@@ -11,9 +11,9 @@ COLUMNS = {"frame": pa.int64(), "position_m": pa.list_(pa.float64()), "bound_m2"
 
 
 class TruthRow(Row):
-    """One frame: its camera's true position, world metres, and the Cramer-Rao bound of it where there is one.
+    """True position of a frame's camera, world metres, and its Cramer-Rao bound if the dataset has one.
 
-    `bound_m2` is a covariance, row by row: no unbiased estimator's is smaller.
+    `bound_m2` is a covariance, row by row: no unbiased estimator has a smaller one.
     """
 
     frame: int
@@ -22,7 +22,7 @@ class TruthRow(Row):
 
 
 def read_truth(path: Path, frame_count: int) -> tuple[TruthRow, ...]:
-    """Read truth.parquet; raises InputError where it is missing or damaged, or has not one row a frame, in order."""
+    """Read truth.parquet; raises InputError if it is missing or damaged, or has not one row a frame, in order."""
     rows = read_rows(path, COLUMNS, TruthRow)
     if [row.frame for row in rows] != list(range(frame_count)):
         raise InputError(f"{path}: {len(rows)} rows, needed one for each of the {frame_count} frames, in order")

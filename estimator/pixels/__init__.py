@@ -1,1 +1,1 @@
-"""The pixel model of maximum likelihood: LED shapes rasterised, blurred and compared with the measured pixels."""
+"""Pixel model of maximum likelihood: LED images under a pose, lens blur, pixel readings, and their likelihood."""

@@ -1,9 +1,9 @@
-"""How much of each pixel lies inside outlines, and how that changes as they move: exact for polygons.
+"""Polygon rasterization: share of each pixel inside outlines, and its derivatives as the outlines move; exact.
 
-By Green's theorem the area that a closed outline covers of a pixel is a sum over the outline's pieces inside the pixel
-and to the left of it in its row. Each edge is cut where it crosses a line between pixels; a piece that climbs by dv in
-a pixel adds dv times the share of the pixel to its right, and dv itself to all pixels further right. An outline whose
-piece (du, dv) moves with velocity (a, b) gains b du - a dv of the pixel, exactly.
+By Green's theorem the area of a pixel that a closed outline covers is a sum over the pieces of the outline in the pixel
+and to the left of it in its row. Each edge is cut where it crosses a line between pixels. A piece that rises by dv in a
+pixel adds dv times the share of the pixel to its right, and dv to all pixels further right. If the piece (du, dv) moves
+with velocity (a, b), the covered area of the pixel grows by b du - a dv, exactly.
 """
 
 from dataclasses import dataclass
@@ -19,11 +19,11 @@ MAX_EDGE_PX = 0.75
 
 
 @dataclass(frozen=True, eq=False)
-class Canvas:
-    """Windows of pixels, n of them, kept one after another in one flat array, each row by row.
+class RoiStack:
+    """Stack of n regions of interest, stored one after another in one flat array of cells, each row by row.
 
-    Window k holds pixels from (rows[k], columns[k]) on, heights[k] by widths[k] of them. Each row has one cell more,
-    which takes what is right of the window and belongs to no pixel: with it every row adds up to nothing.
+    Region k has heights[k] by widths[k] pixels; its first pixel is (rows[k], columns[k]). Each row has one additional
+    cell, which collects what lies right of the region and belongs to no pixel: with it every row sums to zero.
     """
 
     rows: Ints
@@ -31,40 +31,57 @@ class Canvas:
     heights: Ints
     widths: Ints
 
-    def padded(self, by_px: int) -> "Canvas":
-        """Each window with a margin on all sides."""
-        return Canvas(self.rows - by_px, self.columns - by_px, self.heights + 2 * by_px, self.widths + 2 * by_px)
+    def padded(self, by_px: int) -> "RoiStack":
+        """The regions with a margin on all sides."""
+        return RoiStack(self.rows - by_px, self.columns - by_px, self.heights + 2 * by_px, self.widths + 2 * by_px)
 
-    def finer(self, times: Ints) -> "Canvas":
-        """The same windows in pixels so many times finer, window by window (n,)."""
-        return Canvas(self.rows * times, self.columns * times, self.heights * times, self.widths * times)
+    def subdivided(self, factors: Ints) -> "RoiStack":
+        """The regions in pixels finer by a factor for each region, (n,)."""
+        return RoiStack(self.rows * factors, self.columns * factors, self.heights * factors, self.widths * factors)
 
     def cells(self) -> int:
-        """How many cells there are."""
+        """Number of cells."""
         return int((self.heights * (self.widths + 1)).sum())
 
     def roi(self, cells: Floats, k: int) -> Floats:
-        """Window k of a flat array of cells, (rows, columns): a view of it."""
+        """View of region k in a flat array of cells, (rows, columns)."""
         start, height, width = int(self.starts()[k]), int(self.heights[k]), int(self.widths[k])
         return cells[start : start + height * (width + 1)].reshape(height, width + 1)[:, :width]
 
     def starts(self) -> Ints:
-        """The first cell of each window, (n + 1,); the last is the number of cells."""
+        """First cell of each region, (n + 1,); the last entry is the number of cells."""
         return np.concatenate([[0], np.cumsum(self.heights * (self.widths + 1))])
 
     def cell(self, roi: Ints, row: Ints, column: Ints) -> Ints:
-        """The cells of pixels of the sensor that lie in the given windows, elementwise."""
+        """Cells of sensor pixels (row, column) in the given regions, elementwise."""
         return np.asarray(
             self.starts()[roi] + (row - self.rows[roi]) * (self.widths[roi] + 1) + column - self.columns[roi]
         )
 
+    def overlapping(self, k: int) -> list[int]:
+        """Other regions that share pixels with region k."""
+        bottom, right = self.rows + self.heights, self.columns + self.widths
+        overlaps = (self.rows < bottom[k]) & (bottom > self.rows[k])
+        overlaps &= (self.columns < right[k]) & (right > self.columns[k])
+        overlaps[k] = False
+        return list(map(int, np.flatnonzero(overlaps)))
+
+    def intersection(self, k: int, other: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+        """The pixels that two regions share, as (rows, columns) slices of each."""
+        slices = []
+        for first, sizes in ((self.rows, self.heights), (self.columns, self.widths)):
+            low = max(first[k], first[other])
+            high = min(first[k] + sizes[k], first[other] + sizes[other])
+            slices.append([slice(int(low - first[i]), int(high - first[i])) for i in (k, other)])
+        return (slices[0][0], slices[1][0]), (slices[0][1], slices[1][1])
+
 
 @dataclass(frozen=True, eq=False)
 class Outlines:
-    """Closed polygons: `points` (n, 2) in pixels, all outlines one after another, `window` (n,) each point's window.
+    """Closed polygons: `points` (n, 2) in pixels, all outlines one after another, and `roi` (n,) each point's region.
 
-    `following` (n,) is the index of the next point of the same outline, and `slopes` (n, 2, p) say how the points move
-    with p parameters. No edge may be LONGEST_EDGE_PX long; each goes round in the sense of u towards v.
+    `following` (n,) is the index of the next point of the same outline, and `slopes` (n, 2, p) are the derivatives of
+    the points by p parameters. No edge may be longer than MAX_EDGE_PX; each outline runs in the sense from u to v.
     """
 
     points: Floats
@@ -74,10 +91,10 @@ class Outlines:
 
 
 @dataclass(frozen=True, eq=False)
-class Pieces:
-    """Edges cut at the lines between pixels, m pieces inside their windows: where each is, (m,), on the sensor.
+class EdgePieces:
+    """Edges cut at the lines between pixels: m pieces inside their regions, with the pixel (m,) of each.
 
-    `slopes` (m, p) is what the pixel gains as the piece moves.
+    `slopes` (m, p) are the derivatives of the pixel's covered share by p parameters.
     """
 
     roi: Ints
@@ -86,11 +103,11 @@ class Pieces:
     slopes: Floats
 
 
-def cover(canvas: Canvas, outlines: Outlines) -> tuple[Floats, Pieces]:
-    """Share of each cell of the canvas that is covered, (cells,), and its slopes, piece by piece."""
+def cover(rois: RoiStack, outlines: Outlines) -> tuple[Floats, EdgePieces]:
+    """Covered share of each cell, (cells,), and its derivatives by pieces."""
     start, end = outlines.points, outlines.points[outlines.following]
     step = end - start
-    # Where along each edge a line between columns and one between rows is crossed; at its end where there is none.
+    # Position along each edge where it crosses a line between columns and one between rows; 1 if it crosses none.
     line = np.maximum(np.floor(start), np.floor(end))
     crosses = np.floor(start) != np.floor(end)
     at = np.divide(line - start, step, out=np.ones_like(start), where=crosses)
@@ -104,20 +121,20 @@ def cover(canvas: Canvas, outlines: Outlines) -> tuple[Floats, Pieces]:
 
     roi = outlines.roi[edge]
     row, column = np.floor(v).astype(np.int64), np.floor(u).astype(np.int64)
-    inside = (row >= canvas.rows[roi]) & (row < canvas.rows[roi] + canvas.heights[roi])
+    inside = (row >= rois.rows[roi]) & (row < rois.rows[roi] + rois.heights[roi])
     edge, roi, row, column, u, dv = (values[inside] for values in (edge, roi, row, column, u, dv))
-    left, right = canvas.columns[roi], canvas.columns[roi] + canvas.widths[roi]
+    left, right = rois.columns[roi], rois.columns[roi] + rois.widths[roi]
     within = (column >= left) & (column < right)
-    # What is left of a window covers its first pixel, what is right of it the cell beyond, from side to side.
+    # A piece left of a region covers its first pixel, one right of it the additional cell, over the full width.
     to_the_right = np.where(within, column + 1 - u, 1.0)
-    cell = canvas.cell(roi, row, np.clip(column, left, right))
-    cells = canvas.cells()
-    climbed = np.bincount(cell, -dv * to_the_right, cells + 1)
-    climbed += np.bincount(cell + 1, -dv * (1 - to_the_right), cells + 1)
-    covered: Floats = np.cumsum(climbed[:-1], dtype=np.float64)
+    cell = rois.cell(roi, row, np.clip(column, left, right))
+    cells = rois.cells()
+    increments = np.bincount(cell, -dv * to_the_right, cells + 1)
+    increments += np.bincount(cell + 1, -dv * (1 - to_the_right), cells + 1)
+    covered: Floats = np.cumsum(increments[:-1], dtype=np.float64)
 
-    # What moves each edge, at its middle: over so short a way it hardly changes.
+    # Velocity at the middle of each edge: over so short an edge it is constant.
     velocity = (outlines.slopes + outlines.slopes[outlines.following]) / 2
     gained = velocity[:, 0] * step[:, 1:] - velocity[:, 1] * step[:, :1]
     slopes = gained[edge[within]] * length[inside][within]
-    return covered, Pieces(roi[within], row[within], column[within], slopes)
+    return covered, EdgePieces(roi[within], row[within], column[within], slopes)

@@ -1,1 +1,1 @@
-"""The report: one self-contained HTML page about the scores of one or more datasets."""
+"""Report: one self-contained HTML page of the scores of one or more datasets."""

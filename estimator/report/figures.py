@@ -1,4 +1,4 @@
-"""Errors as pictures: over the frames, and their distribution. Colours come from the page's style."""
+"""Figures of the errors: by frame, and their distribution. The page's style sheet sets the colours."""
 
 import itertools
 import math
@@ -13,7 +13,7 @@ WIDTH = 960
 LEFT, RIGHT, TOP, BOTTOM = 72, 28, 12, 40
 INNER = WIDTH - LEFT - RIGHT
 HEIGHT = 300
-"""Of the axes; a variant's lane of failures has LANE more."""
+"""Height of the axes; each variant adds LANE for its failed frames."""
 LANE = 12
 MIN_SHOWN_M = 1e-6
 MAX_LABELS = 12
@@ -30,7 +30,7 @@ class Decades:
 
     @classmethod
     def of(cls, variants: Sequence[VariantScore]) -> "Decades":
-        """Around all errors and bounds that are there to be shown."""
+        """Axis that contains all errors and bounds of the variants."""
         rows = [row for variant in variants for row in variant.rows]
         errors_m = [row.error_3d_m for row in rows if row.error_3d_m is not None]
         shown_m = [max(size_m, MIN_SHOWN_M) for size_m in errors_m + [b for _, b in frames_with_bound(variants)]]
@@ -38,23 +38,23 @@ class Decades:
         return cls(low, max(math.ceil(math.log10(max(shown_m, default=1.0))), low + 1))
 
     def share(self, size_m: float) -> float:
-        """How far along the axis, 0 to 1."""
+        """Position along the axis, 0 to 1."""
         return (math.log10(max(size_m, MIN_SHOWN_M)) - self.low) / (self.high - self.low)
 
     def labelled_m(self) -> list[float]:
-        """The decades to be labelled, all of them unless there are too many."""
+        """Decades to label, all of them up to MAX_LABELS."""
         step = math.ceil((self.high - self.low) / MAX_LABELS)
         return [10.0**decade for decade in range(self.low, self.high + 1, step)]
 
 
 def frames_with_bound(variants: Sequence[VariantScore]) -> list[tuple[int, float]]:
-    """Frames that have a bound, and its root mean square in metres; they are the same for every variant."""
+    """Frames with a Cramer-Rao bound, and the root of its trace, metres; they are the same for every variant."""
     rows = variants[0].rows if variants else ()
     return [(row.frame, row.bound_m) for row in rows if row.bound_m is not None]
 
 
 def error_plot(variants: Sequence[VariantScore]) -> str:
-    """3D error of each frame on a logarithmic axis, a mark a variant; failed frames are crosses in lanes below."""
+    """SVG of the 3D error of each frame on a logarithmic axis; failed frames are crosses in lanes below."""
     decades = Decades.of(variants)
     frames = max((v.frames for v in variants), default=0)
     lanes_top = TOP + HEIGHT + 14
@@ -95,7 +95,7 @@ def error_plot(variants: Sequence[VariantScore]) -> str:
 
 
 def distribution_plot(variants: Sequence[VariantScore]) -> str:
-    """The share of all frames whose 3D error does not exceed a size: a curve ends at the share that was answered."""
+    """SVG of the cumulative distribution of the 3D error over all frames; a curve ends at the success rate."""
     decades = Decades.of(variants)
     bottom = TOP + HEIGHT
 

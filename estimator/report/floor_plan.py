@@ -1,4 +1,4 @@
-"""The room seen from above, with one variant's estimates beside the truth."""
+"""Floor plan: the room from above, with one variant's estimates and the true positions."""
 
 from collections.abc import Sequence
 
@@ -12,7 +12,7 @@ BORDER = 12.0
 
 
 def floor_plan(room_m: Triple, leds_m: Sequence[Triple], variant: VariantScore, index: int) -> str:
-    """The room, x right and y up: LEDs, true positions (rings), estimates (marks) and the errors between."""
+    """SVG of the room, x right and y up: LEDs, true positions (rings), estimates (marks) and lines between them."""
     scale = (WIDTH - 2 * BORDER) / room_m[0]
     height = room_m[1] * scale + 2 * BORDER
 
@@ -28,15 +28,15 @@ def floor_plan(room_m: Triple, leds_m: Sequence[Triple], variant: VariantScore, 
         if row.estimate_m is None:
             parts.append(cross(u, v, index, f"frame {row.frame}: {row.reason}"))
             continue
-        # Far outside, a coordinate says no more than a nearer one, and viewers choke on huge numbers.
+        # Limit far outliers: viewers fail on huge coordinates.
         a, b = (max(-1e4, min(1e4, value)) for value in place(row.estimate_m))
         parts.append(line(u, v, a, b, f"v{index}"))
         parts.append(f'<circle class="truth" cx="{u:.1f}" cy="{v:.1f}" r="4"/>')
         parts.append(mark(a, b, 2.5, index, f"frame {row.frame}: {length_text(row.error_3d_m)}"))
-    return picture(WIDTH, height, f"plan of the room, {variant.variant}", parts)
+    return picture(WIDTH, height, f"floor plan, {variant.variant}", parts)
 
 
-def outside(room_m: Triple, variant: VariantScore) -> int:
-    """How many of a variant's estimates lie beyond the plan's walls."""
+def estimates_outside(room_m: Triple, variant: VariantScore) -> int:
+    """Number of a variant's estimates outside the walls."""
     estimates = [row.estimate_m for row in variant.rows if row.estimate_m is not None]
     return sum(not (0 <= x <= room_m[0] and 0 <= y <= room_m[1]) for x, y, _ in estimates)

@@ -1,4 +1,4 @@
-"""One HTML page about one or more scored datasets; it needs no other file and no network."""
+"""HTML page of the scores of one or more datasets; it needs no other file and no network."""
 
 import base64
 from collections.abc import Sequence
@@ -19,10 +19,10 @@ from estimator.evaluate.score_table import (
     pair_cells,
 )
 from estimator.report.figures import distribution_plot, error_plot, frames_with_bound
-from estimator.report.floor_plan import floor_plan, outside
+from estimator.report.floor_plan import estimates_outside, floor_plan
 from estimator.report.svg import key, style_of_variants
 
-# Pictures are to get an impression; a page of thousands of them would open nowhere.
+# Previews are for an impression; a page of thousands of them would not open.
 MAX_PREVIEWS = 12
 MAX_LARGE_PLANS = 6
 
@@ -75,25 +75,25 @@ svg.key .mark { fill-opacity: 1; }
 
 
 def page(datasets: Sequence[tuple[Path, Scores]]) -> str:
-    """The whole page, for datasets given as folder and scores; previews are read from the folders, nothing else is.
+    """The page, for datasets given as folder and scores; of the folders, only previews are read.
 
-    Raises OSError where a preview cannot be read.
+    Raises OSError if a preview cannot be read.
     """
     body = "\n".join(_dataset(folder, scores) for folder, scores in datasets)
     names = ", ".join(escape(scores.dataset) for _, scores in datasets)
-    most = max((len(scores.variants) for _, scores in datasets), default=0)
+    max_variants = max((len(scores.variants) for _, scores in datasets), default=0)
     return f"""<!doctype html>
 <html lang="en">
 <head>
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <title>Positioning report: {names}</title>
-<style>{STYLE}{style_of_variants(most)}</style>
+<style>{STYLE}{style_of_variants(max_variants)}</style>
 </head>
 <body>
 <h1>Positioning report</h1>
-<p>No frame is dropped: failed ones are counted beside the errors of the others, and as infinitely wrong where it says
-“of all”.</p>
+<p>No frame is dropped: failed frames are counted beside the errors of the others, and count as infinite errors in the
+columns “of all”.</p>
 {body}
 </body>
 </html>
@@ -113,8 +113,8 @@ def _dataset(folder: Path, scores: Scores) -> str:
         f'<span class="name">{_name(scores, index)}</span>' for index, variant in enumerate(scores.variants)
     )
     bounded = len(frames_with_bound(scores.variants))
-    of_frames = f" Ledges: the Cramér-Rao bound, on {bounded} of {frames} frames." if bounded else ""
-    of_all = " Upright line: the bound's root mean square." if bounded else ""
+    of_frames = f" Short lines: the Cramér-Rao bound, of {bounded} of {frames} frames." if bounded else ""
+    of_all = " Vertical line: root mean square of the bound." if bounded else ""
     return f"""<section>
 <h2>{escape(scores.dataset)}</h2>
 <p>{frames} frames · {len(leds_m)} LEDs · room {x:g} × {y:g} × {z:g} m</p>
@@ -127,9 +127,9 @@ def _dataset(folder: Path, scores: Scores) -> str:
 <p>Crosses: failed frames.{of_frames}</p>
 <div class="card"><p>{legend}</p>{error_plot(scores.variants)}</div>
 <h3>Distribution of the 3D error</h3>
-<p>A curve ends, on the right, at the share of the frames that the variant answered.{of_all}</p>
+<p>A curve ends, on the right, at the variant's success rate.{of_all}</p>
 <div class="card"><p>{legend}</p>{distribution_plot(scores.variants)}</div>
-<h3>The room from above</h3>
+<h3>Floor plans</h3>
 <p>Yellow: LEDs. Rings: true positions. Marks: estimates, joined to the truth. Crosses: failed frames.</p>
 <div class="card grid{" many" if len(scores.variants) > MAX_LARGE_PLANS else ""}">{plans}</div>
 {_previews(folder)}
@@ -142,15 +142,15 @@ def _score_table(scores: Scores) -> str:
 
 
 def _limit_table(scores: Scores) -> str:
-    """Nothing where there is no bound, no covariance and no answer flagged."""
+    """Table of bounds and covariances; empty if there is none, and no estimate is ambiguous."""
     if not any(variant.against_bound or variant.nees or variant.ambiguous for variant in scores.variants):
         return ""
     rows = [(_name(scores, index), limit_cells(variant)) for index, variant in enumerate(scores.variants)]
-    return "<h3>The bound, and what the variants say of themselves</h3>" + _table(LIMIT_HEADERS, rows, LIMIT_NOTE)
+    return "<h3>Cramér-Rao bound and covariance consistency</h3>" + _table(LIMIT_HEADERS, rows, LIMIT_NOTE)
 
 
 def _pair_table(scores: Scores) -> str:
-    """Every variant against the best; nothing where there is one alone."""
+    """Table of every variant compared with the best; empty for a single variant."""
     if len(scores.variants) < 2:
         return ""
     of_best = best(scores.variants)
@@ -160,14 +160,14 @@ def _pair_table(scores: Scores) -> str:
         if variant is not of_best
     ]
     note = (
-        f"A: the row's variant. B: {of_best.variant}, with the least median error of all frames; it was picked on "
-        f"these very frames, which flatters it. {PAIR_NOTE}"
+        f"A: the row's variant. B: {of_best.variant}, with the smallest median error of all frames. It was selected on "
+        f"the same frames, which favours it. {PAIR_NOTE}"
     )
     return f"<h3>Frame by frame against {escape(of_best.variant)}</h3>" + _table(PAIR_HEADERS, rows, note)
 
 
 def _table(headers: Sequence[str], rows: Sequence[tuple[str, Sequence[str]]], note: str) -> str:
-    """Rows of a variant's name, as HTML, and its cells; an interval stands small below what it is of."""
+    """Table of rows, each a variant's name as HTML and its cells; an interval stands in small type below its value."""
     body = "".join(f'<tr><td class="text">{name}</td>{_folded(headers, cells, "td")}</tr>' for name, cells in rows)
     return f"""<div class="card rows"><table>
 <thead><tr><th class="text">variant</th>{_folded(headers, headers, "th")}</tr></thead>
@@ -203,18 +203,18 @@ def _failure_card(scores: Scores) -> str:
 
 
 def _outside_note(scores: Scores, variant: VariantScore) -> str:
-    count = outside(scores.room_m, variant)
+    count = estimates_outside(scores.room_m, variant)
     return f" · {count} estimates outside the walls" if count else ""
 
 
 def _name(scores: Scores, index: int) -> str:
-    """A variant's mark and name, which may be broken before its options."""
+    """Mark and name of a variant, with line breaks allowed before its options."""
     name = escape(scores.variants[index].variant)
     return key(index) + name.replace(":", ":<wbr>").replace(",", ",<wbr>")
 
 
 def _previews(folder: Path) -> str:
-    """Up to MOST_PREVIEWS of the dataset's small pictures, evenly picked, as data in the page; nothing without any."""
+    """Up to MAX_PREVIEWS previews of the dataset, evenly selected, embedded in the page; empty without previews."""
     paths = sorted((folder / "previews").glob("*.png"))
     if not paths:
         return ""

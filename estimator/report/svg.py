@@ -1,12 +1,12 @@
-"""Inline SVG for the report: lines, text, and the marks and colours that variants go by."""
+"""Inline SVG for the report: lines, text, and the marks and colours of the variants."""
 
 from collections.abc import Sequence
 from html import escape
 
-# Okabe and Ito's colours, told apart by colour-blind readers too. After seven variants they come again with another
-# mark, and another dash of their curves.
+# Okabe and Ito's colours, distinguishable by colour-blind readers. From the eighth variant on they repeat with another
+# mark and another dash pattern.
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8a7a00")
-# Corners in units of the radius of the disc that looks as large; the first mark is that disc.
+# Vertices in units of the radius of a disc of the same visual size; the first mark is that disc.
 MARKS = (
     (),
     ((-0.9, -0.9), (0.9, -0.9), (0.9, 0.9), (-0.9, 0.9)),
@@ -17,7 +17,7 @@ DASHES = ("none", "7 3", "2 3", "9 3 2 3")
 
 
 def style_of_variants(count: int) -> str:
-    """CSS of the classes `v0`, `v1`, ... of so many variants."""
+    """CSS of the classes `v0`, `v1`, ... of `count` variants."""
     rules = []
     for index in range(count):
         colour, dash = COLOURS[index % len(COLOURS)], DASHES[index // len(COLOURS) % len(DASHES)]
@@ -27,37 +27,37 @@ def style_of_variants(count: int) -> str:
 
 
 def picture(width: float, height: float, label: str, parts: Sequence[str]) -> str:
-    """A picture that fills its place, with what it shows for those who cannot see it."""
+    """SVG element as wide as its container, with a label for screen readers."""
     body = "\n".join(parts)
     return f'<svg viewBox="0 0 {width:.0f} {height:.0f}" role="img" aria-label="{escape(label)}">\n{body}\n</svg>'
 
 
 def key(index: int) -> str:
-    """A variant's mark to stand in text."""
+    """Mark of a variant, as an SVG element for running text."""
     return f'<svg class="key" viewBox="0 0 12 12" aria-hidden="true">{mark(6, 6, 4, index)}</svg>'
 
 
 def mark(x: float, y: float, radius: float, index: int, title: str = "") -> str:
-    """A variant's mark; the title shows under the pointer."""
-    told = f"<title>{escape(title)}</title>" if title else ""
-    corners = MARKS[index // len(COLOURS) % len(MARKS)]
-    if not corners:
-        return f'<circle class="mark v{index}" cx="{x:.1f}" cy="{y:.1f}" r="{radius:g}">{told}</circle>'
-    places = "L".join(f"{x + a * radius:.1f} {y + b * radius:.1f}" for a, b in corners)
-    return f'<path class="mark v{index}" d="M{places}z">{told}</path>'
+    """Mark of a variant; the title shows under the pointer."""
+    tooltip = f"<title>{escape(title)}</title>" if title else ""
+    vertices = MARKS[index // len(COLOURS) % len(MARKS)]
+    if not vertices:
+        return f'<circle class="mark v{index}" cx="{x:.1f}" cy="{y:.1f}" r="{radius:g}">{tooltip}</circle>'
+    places = "L".join(f"{x + a * radius:.1f} {y + b * radius:.1f}" for a, b in vertices)
+    return f'<path class="mark v{index}" d="M{places}z">{tooltip}</path>'
 
 
 def cross(x: float, y: float, index: int, title: str) -> str:
-    """Where a variant failed."""
+    """Cross that marks a failed frame of a variant."""
     strokes = f"M{x - 3:.1f} {y - 3:.1f}l6 6m0 -6l-6 6"
     return f'<path class="v{index}" d="{strokes}"><title>{escape(title)}</title></path>'
 
 
 def line(x1: float, y1: float, x2: float, y2: float, kind: str) -> str:
-    """A straight line of a CSS class."""
+    """Straight line of a CSS class."""
     return f'<line class="{kind}" x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}"/>'
 
 
 def text(x: float, y: float, words: str, anchor: str) -> str:
-    """Words that start at, end at, or stand about (x, y): anchor `start`, `end` or `middle`."""
+    """Text that starts at, ends at, or is centred on (x, y): anchor `start`, `end` or `middle`."""
     return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{escape(words)}</text>'

@@ -1,1 +1,1 @@
-"""Solvers: distances and spots into positions, by trilateration, collinearity, stereo or reprojection error."""
+"""Solvers: from LEDs and their images to distances and poses."""

@@ -1,17 +1,17 @@
-"""Least squares on spots: the pose whose LEDs fall where their spots are, each weighed by its covariance.
+"""Reprojection fit: the pose that minimizes the reprojection errors of spots, weighted by their covariances.
 
-An LED's image has its centroid off the image of its centre, which photogrammetry calls eccentricity (Lenz & Fritsch
-1990). Here it has a closed form. A face that is alike all over, seen at X from the camera, lights the image plane in
-proportion to z / |X|^4 a unit of its own area: what it looks like from there, and the lens's cos^4. The centroid of its
-image is then the image of M = mean of X / |X|^4 over the face. With the mean X0, at the range d, the upward normal n,
-and the mean square extent s^2 along any direction of the face, X / |X|^4 to second order gives M along
-X0 + 4 s^2 (n . X0) / d^2 n: **the image of a point above the LED by 4 s^2 h / d^2**, h being its height above the
-camera. s^2 is r^2 / 4 for a disc of radius r, and r^2 / 3 for a square of half side r. What is left goes with
+The centroid of an LED's image differs from the image of the LED's centre; photogrammetry calls the difference
+eccentricity (Lenz & Fritsch 1990). Here it has a closed form. A face of uniform luminance, at X from the camera,
+illuminates the image plane in proportion to z / |X|^4 per unit of its own area: its solid angle, and the lens's cos^4.
+The centroid of its image is then the image of M = mean of X / |X|^4 over the face. With the mean X0, at the distance d,
+the upward normal n, and the mean square extent s^2 along any direction of the face, X / |X|^4 to second order puts M
+along X0 + 4 s^2 (n . X0) / d^2 n: **the image of a point above the LED by 4 s^2 h / d^2**, where h is the LED's height
+above the camera. s^2 is r^2 / 4 for a disc of radius r, and a^2 / 12 for a square of side a. The next order is
 r^4 / h^3, a nanometre.
 
-It holds on a pinhole's image plane. A lens that bends also does so within a spot, whose centroid then is not where its
-centre goes when the lens is taken out. `straightened` takes that off the centroids, once a pose says how large the
-spots are.
+The closed form holds in a pinhole's image plane. A lens that bends straight lines also bends the image of an LED, and
+the undistorted centroid is then not the centroid of the undistorted image. `corrected_for_eccentricity` subtracts that
+difference once a pose determines the size of the images.
 """
 
 from collections.abc import Sequence
@@ -22,245 +22,223 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
 from estimator.camera.leveling import tilt_from_gravity, tilt_sigmas
-from estimator.camera.undistort import lens_pixels, pinhole_pixels
+from estimator.camera.pose import Pose
+from estimator.camera.projection import projection_of
+from estimator.camera.undistort import has_pinhole_image, pinhole_image
 from estimator.errors import EstimationFailure
-from estimator.io.dataset import Camera, DeviceFrame
+from estimator.io.device import Camera, DeviceFrame
+from estimator.spots.correspondences import centroids_px, led_positions_m
 from estimator.spots.identify import Correspondence
 
 Floats = NDArray[np.float64]
 
-# No centroid is better: keeps a covariance of nothing, of a spot without noise, from weighing without end.
+# Added to every centroid's covariance, so that a spot without noise has a finite weight.
 MIN_CENTROID_SIGMA_PX = 1e-4
-# Beyond so many standard deviations a robust fit weighs less and less.
+# Residuals beyond this many standard deviations are weighted down by the robust loss.
 ROBUST_SIGMA = 3.0
 MAX_EVALUATIONS = 60
-# Over 4 s^2 = r^2 for a disc, see above.
-SQUARE_TO_DISC = 4.0 / 3.0
-
-
-@dataclass(frozen=True, eq=False)
-class Pose:
-    """Where a camera is, (3,) world metres, and how it is turned, `R_cam_world` (3, 3)."""
-
-    R_cam_world: Floats
-    position_m: Floats
 
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """What a pose has to explain: spots on a pinhole's image plane at unit distance, and a reading of gravity."""
+    """Input of a fit: centroids in a pinhole's image plane, and a reading of gravity.
+
+    `leds_m` (n, 3) are the centres of the LEDs, world metres; `lift_m2` (n,) is 4 s^2 of each LED, m^2, see the module.
+    `image` (n, 2) are centroids in normalized pinhole coordinates; `whitening` (n, 2, 2) maps an offset in them to one
+    of unit covariance. `tilt_rad` (2,) is (tilt_x, tilt_y) by the accelerometer, `tilt_sigma_rad` (2,) its standard
+    deviations, infinite if gravity is not used.
+    """
 
     leds_m: Floats
-    """Centres of the LEDs, (n, 3), world."""
     lift_m2: Floats
-    """4 s^2 of each LED, (n,): see the module."""
     camera: Camera
-    plane: Floats
-    """Centroids, (n, 2), in units of the image distance."""
+    image: Floats
     whitening: Floats
-    """(n, 2, 2): takes an offset in the plane to one with unit covariance."""
     tilt_rad: Floats
-    """The reading, (tilt_x, tilt_y)."""
     tilt_sigma_rad: Floats
-    """Its standard deviations, (2,); infinite where gravity takes no part."""
 
     def without_gravity(self) -> "Observations":
-        """The spots alone."""
+        """The same spots without gravity."""
         return replace(self, tilt_sigma_rad=np.full(2, np.inf))
 
     def only(self, chosen: NDArray[np.bool_]) -> "Observations":
-        """Those of the spots that are chosen, (n,)."""
+        """The chosen spots, (n,), with the same gravity."""
         return replace(
             self,
             leds_m=self.leds_m[chosen],
             lift_m2=self.lift_m2[chosen],
-            plane=self.plane[chosen],
+            image=self.image[chosen],
             whitening=self.whitening[chosen],
         )
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A local minimum of the squared, whitened residuals."""
+    """Local minimum of the squared, whitened residuals.
+
+    `cost` is the minimized sum of squares, or of a robust loss of them. `spots_chi2` (n,) is the chi-square of each
+    spot, of two degrees of freedom; `tilt_chi2` that of gravity. `covariance_m2` (3, 3) is the position's, the inverse
+    of the information matrix.
+    """
 
     pose: Pose
     cost: float
-    """What was made least: the sum of squares, or of a robust loss of them."""
     spots_chi2: Floats
-    """Of each spot, (n,): two degrees of freedom each."""
     tilt_chi2: float
     covariance_m2: Floats
-    """Of the position, (3, 3), from the information matrix."""
 
     @property
     def chi2(self) -> float:
-        """The sum of squares of all residuals."""
+        """Sum of squares of all residuals."""
         return float(self.spots_chi2.sum()) + self.tilt_chi2
 
 
-def observations(frame: DeviceFrame, seen: Sequence[Correspondence]) -> Observations:
-    """Spots and gravity as a fit takes them; a spot that the lens cannot be taken out of is left out.
+def observe(frame: DeviceFrame, correspondences: Sequence[Correspondence]) -> Observations:
+    """Observations of a frame; spots that cannot be undistorted are left out.
 
-    Raises EstimationFailure where gravity reads nothing or no spot is left.
+    Raises EstimationFailure if the accelerometer reads zero or no spot is left.
     """
     camera = frame.camera
-    pixels = np.array([(correspondence.spot.u_px, correspondence.spot.v_px) for correspondence in seen]).reshape(-1, 2)
-    covariance_px2 = np.array([correspondence.spot.covariance_px2 for correspondence in seen]).reshape(-1, 2, 2)
-    leds = [correspondence.led for correspondence in seen]
-    try:
-        out, slope = _pinhole(pixels, camera)
-    except EstimationFailure:
-        kept = [k for k, pixel in enumerate(pixels) if _has_pinhole(pixel, camera)]
-        if not kept:
-            raise
-        pixels, covariance_px2, leds = pixels[kept], covariance_px2[kept], [leds[k] for k in kept]
-        out, slope = _pinhole(pixels, camera)
-    from_pixels = np.linalg.inv(camera.matrix())
-    to_plane = from_pixels[:2, :2] @ slope
-    covariance = to_plane @ (covariance_px2 + MIN_CENTROID_SIGMA_PX**2 * np.eye(2)) @ to_plane.transpose(0, 2, 1)
-    lift = [led.radius_m**2 * (SQUARE_TO_DISC if led.shape == "square" else 1.0) for led in leds]
+    usable = has_pinhole_image(centroids_px(correspondences), camera)
+    if usable.any():
+        correspondences = [one for one, use in zip(correspondences, usable, strict=True) if use]
+    image = pinhole_image(centroids_px(correspondences), camera)
+    covariance_px2 = np.array([one.spot.covariance_px2 for one in correspondences]).reshape(-1, 2, 2)
+    # At depth 1 the projection's Jacobian by x and y is that from pinhole coordinates to the lens's.
+    rays = np.column_stack([image, np.ones(len(image))])
+    to_pixels = camera.matrix()[:2, :2] @ projection_of(camera).project(rays)[1][:, :, :2]
+    from_pixels = np.linalg.inv(to_pixels)
+    covariance = from_pixels @ (covariance_px2 + MIN_CENTROID_SIGMA_PX**2 * np.eye(2)) @ from_pixels.transpose(0, 2, 1)
     tilt = tilt_from_gravity(frame.accelerometer_m_s2)
     return Observations(
-        leds_m=np.array([led.position_m for led in leds]),
-        lift_m2=np.array(lift),
+        leds_m=led_positions_m(correspondences),
+        lift_m2=np.array([4 * one.led.mean_square_extent_m2 for one in correspondences]),
         camera=camera,
-        plane=out @ from_pixels[:2, :2].T + from_pixels[:2, 2],
-        whitening=np.linalg.inv(np.linalg.cholesky(covariance)),
+        image=image,
+        whitening=np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)), dtype=np.float64),
         tilt_rad=np.array(tilt),
         tilt_sigma_rad=tilt_sigmas(frame.accelerometer, tilt[1]),
     )
 
 
-def _pinhole(pixels: Floats, camera: Camera) -> tuple[Floats, Floats]:
-    """Pixels (n, 2) with the lens taken out, and the slopes (n, 2, 2) of that, by central differences over a pixel."""
-    steps = np.array([[0.0, 0.0], [0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]])
-    out = pinhole_pixels((pixels + steps[:, None]).reshape(-1, 2), camera).reshape(5, -1, 2)
-    return out[0], np.stack([out[1] - out[2], out[3] - out[4]], axis=2)
-
-
-def _has_pinhole(pixel: Floats, camera: Camera) -> bool:
-    """Whether the lens can be taken out of a pixel (2,)."""
-    try:
-        _pinhole(pixel[None], camera)
-    except EstimationFailure:
-        return False
-    return True
-
-
-def projected(pose: Pose, leds_m: Floats, lift_m2: Floats) -> tuple[Floats, Floats]:
-    """Where the images of LEDs (n, 3) have their centroids in the plane, (n, 2), and the LEDs' depths (n,), metres."""
+def centroid_images(pose: Pose, leds_m: Floats, lift_m2: Floats) -> tuple[Floats, Floats]:
+    """Centroids (n, 2) of the images of LEDs (n, 3) in the pinhole's image plane, and the LEDs' depths (n,), metres."""
     offset = leds_m - pose.position_m
-    lifted = offset.copy()
+    lifted = leds_m.copy()
     lifted[:, 2] += lift_m2 * offset[:, 2] / (offset**2).sum(axis=1)
-    seen = lifted @ pose.R_cam_world.T
-    # Of what is behind the camera nothing is an image; it only has to be far off, and finite.
-    depth = np.where(np.abs(seen[:, 2]) < 1e-9, 1e-9, seen[:, 2])
-    return seen[:, :2] / depth[:, None], seen[:, 2]
+    p_cam = pose.in_camera(lifted)
+    # An LED behind the camera has no image; here it only has to be far off, and finite.
+    depth = np.where(np.abs(p_cam[:, 2]) < 1e-9, 1e-9, p_cam[:, 2])
+    return p_cam[:, :2] / depth[:, None], p_cam[:, 2]
 
 
-def corrected_for_eccentricity(seen: Observations, pose: Pose) -> Observations:
-    """The same with centroids as if the lens had not bent the spots, by the sizes they have from a pose.
+def corrected_for_eccentricity(observations: Observations, pose: Pose) -> Observations:
+    """Observations with centroids as a lens that does not bend the images would have them, of the size by a pose.
 
-    Each LED is four points, sqrt(2) s from its centre along x and y, which have its s^2. Their images weigh as the
-    lens's light does, z / |X|^4, whatever the lens: what it spreads over more pixels it makes dimmer.
+    Each LED is represented by four points, sqrt(2) s from its centre along x and y, which have its s^2. Their images
+    are weighted by the lens's irradiance, z / |X|^4, for any lens: a lens that spreads light over more pixels makes it
+    dimmer. An LED with a point that has no image is not corrected.
     """
-    steps = np.sqrt(seen.lift_m2 / 2)[:, None, None] * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
-    points = (seen.leds_m[:, None] + steps - pose.position_m) @ pose.R_cam_world.T
-    before = (points[..., 2] > 0).all(axis=1)
-    points = points[before]
-    weights = points[..., 2] / (points**2).sum(axis=2) ** 2
+    steps = np.sqrt(observations.lift_m2 / 2)[:, None, None] * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
+    points_m = (observations.leds_m[:, None] + steps).reshape(-1, 3)
+    p_cam = pose.in_camera(points_m)
+    camera = observations.camera
+    lens_image = projection_of(camera).project(p_cam)[0].reshape(-1, 4, 2)
+    p_cam = p_cam.reshape(-1, 4, 3)
+    imaged = (p_cam[..., 2] > 0).all(axis=1) & np.isfinite(lens_image).all(axis=(1, 2))
+    p_cam, lens_image = p_cam[imaged], lens_image[imaged]
+    weights = p_cam[..., 2] / (p_cam**2).sum(axis=2) ** 2
     weights /= weights.sum(axis=1, keepdims=True)
-    straight = points[..., :2] / points[..., 2:]
-    K = seen.camera.matrix()
-    bent = lens_pixels(straight.reshape(-1, 2) @ K[:2, :2].T + K[:2, 2], seen.camera).reshape(straight.shape)
-    centroids = pinhole_pixels((weights[..., None] * bent).sum(axis=1), seen.camera)
-    plane = seen.plane.copy()
-    taken_out = (np.column_stack([centroids, np.ones(len(centroids))]) @ np.linalg.inv(K).T)[:, :2]
-    plane[before] -= taken_out - (weights[..., None] * straight).sum(axis=1)
-    return replace(seen, plane=plane)
+    lens_centroids = pinhole_image(camera.to_pixels((weights[..., None] * lens_image).sum(axis=1)), camera)
+    pinhole_centroids = (weights[..., None] * p_cam[..., :2] / p_cam[..., 2:]).sum(axis=1)
+    image = observations.image.copy()
+    image[imaged] -= lens_centroids - pinhole_centroids
+    return replace(observations, image=image)
 
 
-def fit(seen: Observations, start: Pose, loss: Literal["linear", "soft_l1"] = "linear") -> Fit:
-    """The local minimum from `start` on, by Levenberg's and Marquardt's method (SciPy) with exact derivatives.
+def fit(observations: Observations, start: Pose, loss: Literal["linear", "soft_l1"] = "linear") -> Fit:
+    """Local minimum from an initial pose, by Levenberg-Marquardt (SciPy) with exact derivatives.
 
-    Raises EstimationFailure where what is seen does not fix a pose there.
+    Raises EstimationFailure if the observations do not determine a pose there.
     """
-    centre = seen.leds_m.mean(axis=0)
-    model = np.ascontiguousarray(seen.leds_m - centre)
+    centre = observations.leds_m.mean(axis=0)
+    model = np.ascontiguousarray(observations.leds_m - centre)
 
     def pose_of(x: Floats) -> Pose:
-        turn = cv2.Rodrigues(x[:3])[0]
-        return Pose(turn, centre - turn.T @ x[3:])
+        R_cam_world = np.asarray(Rotation.from_rotvec(x[:3]).as_matrix())
+        return Pose(centre - R_cam_world.T @ x[3:], R_cam_world)
 
     def residuals(x: Floats) -> Floats:
         pose = pose_of(x)
-        offset = projected(pose, seen.leds_m, seen.lift_m2)[0] - seen.plane
-        white = np.einsum("nij,nj->ni", seen.whitening, offset)
-        return np.concatenate([white.ravel(), _tilt_residual(pose, seen)])
+        offset = centroid_images(pose, observations.leds_m, observations.lift_m2)[0] - observations.image
+        white = np.einsum("nij,nj->ni", observations.whitening, offset)
+        return np.concatenate([white.ravel(), _tilt_residual(pose, observations)])
 
-    def slopes(x: Floats) -> Floats:
-        # Lifting an LED by some micrometres changes these by some millionths.
-        of_plane = cv2.projectPoints(model, x[:3], x[3:], np.eye(3), None)[1][:, :6].reshape(-1, 2, 6)
-        white = np.einsum("nij,njk->nik", seen.whitening, of_plane).reshape(-1, 6)
-        return np.vstack([white, _tilt_slopes(x, seen)])
+    def jacobian(x: Floats) -> Floats:
+        # The lift of an LED, some micrometres, changes these by some millionths.
+        of_image = cv2.projectPoints(model, x[:3], x[3:], np.eye(3), None)[1][:, :6].reshape(-1, 2, 6)
+        white = np.einsum("nij,njk->nik", observations.whitening, of_image).reshape(-1, 6)
+        return np.vstack([white, _tilt_jacobian(x, observations)])
 
-    x0 = np.concatenate([cv2.Rodrigues(start.R_cam_world)[0].ravel(), start.R_cam_world @ (centre - start.position_m)])
     try:
         with np.errstate(all="ignore"):
-            # MINPACK is several times faster, and knows no robust loss.
+            vector = Rotation.from_matrix(start.R_cam_world).as_rotvec()
+            x0 = np.concatenate([vector, start.R_cam_world @ (centre - start.position_m)])
+            # MINPACK ("lm") is several times faster, and has no robust loss.
             found = least_squares(
                 residuals,
                 x0,
-                slopes,
+                jacobian,
                 method="lm" if loss == "linear" else "trf",
                 loss=loss,
                 f_scale=ROBUST_SIGMA,
                 x_scale="jac",
                 max_nfev=MAX_EVALUATIONS,
             )
-            # Of a robust loss it would not be the information.
-            slope = slopes(found.x)
+            # SciPy's own Jacobian is scaled by the robust loss, and so is not the information.
+            slope = jacobian(found.x)
             covariance = np.asarray(np.linalg.inv(slope.T @ slope), dtype=np.float64)
     except (np.linalg.LinAlgError, ValueError, cv2.error):
-        raise EstimationFailure("position", "what is seen does not fix a pose") from None
+        raise EstimationFailure("position", "the observations do not determine a pose") from None
     pose = pose_of(found.x)
-    at_end = residuals(found.x)
-    count = len(seen.leds_m)
+    at_minimum = residuals(found.x)
+    count = len(observations.leds_m)
     return Fit(
         pose=pose,
         cost=2 * float(found.cost),
-        spots_chi2=(at_end[: 2 * count].reshape(-1, 2) ** 2).sum(axis=1),
-        tilt_chi2=float((at_end[2 * count :] ** 2).sum()),
+        spots_chi2=(at_minimum[: 2 * count].reshape(-1, 2) ** 2).sum(axis=1),
+        tilt_chi2=float((at_minimum[2 * count :] ** 2).sum()),
         covariance_m2=_position_covariance(found.x, covariance),
     )
 
 
-def _tilt_residual(pose: Pose, seen: Observations) -> Floats:
-    """Tilts of a pose less the reading's, in standard deviations, (2,)."""
+def _tilt_residual(pose: Pose, observations: Observations) -> Floats:
+    """Tilts of a pose minus the accelerometer's, in standard deviations, (2,)."""
     x, y, z = pose.R_cam_world[:, 2]
-    off = np.array([np.arctan2(y, z), -np.arcsin(np.clip(x, -1, 1))]) - seen.tilt_rad
-    # The short way round.
-    return np.asarray((off + np.pi) % (2 * np.pi) - np.pi) / seen.tilt_sigma_rad
+    off = np.array([np.arctan2(y, z), -np.arcsin(np.clip(x, -1, 1))]) - observations.tilt_rad
+    # Wrapped to -pi ... pi.
+    return np.asarray((off + np.pi) % (2 * np.pi) - np.pi) / observations.tilt_sigma_rad
 
 
-def _tilt_slopes(x: Floats, seen: Observations) -> Floats:
+def _tilt_jacobian(x: Floats, observations: Observations) -> Floats:
     """Derivatives of `_tilt_residual` by the six parameters, (2, 6)."""
-    turn, by_vector = cv2.Rodrigues(x[:3])
-    up_y, up_z = turn[1:, 2]
+    R_cam_world, by_vector = cv2.Rodrigues(x[:3])
+    up_y, up_z = R_cam_world[1:, 2]
     by_x, by_y, by_z = by_vector[:, [2, 5, 8]].T
-    # Where the camera's x axis is upright, tilt_x is none.
+    # tilt_x is undefined where the camera's x axis is vertical.
     across2 = max(up_y**2 + up_z**2, 1e-12)
     slopes = np.zeros((2, 6))
     slopes[0, :3] = (up_z * by_y - up_y * by_z) / across2
     slopes[1, :3] = -by_x / np.sqrt(across2)
-    return slopes / seen.tilt_sigma_rad[:, None]
+    return slopes / observations.tilt_sigma_rad[:, None]
 
 
 def _position_covariance(x: Floats, covariance: Floats) -> Floats:
-    """Of `centre - R^T t`, (3, 3), from that of the rotation vector and t, (6, 6)."""
-    turn, by_vector = cv2.Rodrigues(x[:3])
-    by_turn = np.column_stack([-by_vector[k].reshape(3, 3).T @ x[3:] for k in range(3)])
-    slope = np.hstack([by_turn, -turn.T])
+    """Covariance (3, 3) of `centre - R^T t` from the covariance (6, 6) of the rotation vector and t."""
+    R_cam_world, by_vector = cv2.Rodrigues(x[:3])
+    by_rotation = np.column_stack([-by_vector[k].reshape(3, 3).T @ x[3:] for k in range(3)])
+    slope = np.hstack([by_rotation, -R_cam_world.T])
     return np.asarray(slope @ covariance @ slope.T)

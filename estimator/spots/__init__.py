@@ -1,1 +1,1 @@
-"""LED images: denoising, detection with centroids, and their correspondence to LEDs of the map."""
+"""Spots: denoising, detection of LED images with centroids, and their correspondence to LEDs of the map."""

@@ -1,6 +1,6 @@
-"""Image to image: Algorithm 1 of Huynh & Yoo 2016, as printed and put right, and what to hold it against.
+"""Denoisers: Algorithm 1 of Huynh & Yoo 2016, as printed and corrected, and others for comparison.
 
-Every denoiser takes an image (height, width) of electrons above the black level, which stays as it was.
+Every denoiser takes an image (height, width) of electrons above the black level and returns a new one.
 """
 
 from collections.abc import Callable
@@ -14,77 +14,78 @@ Image = NDArray[np.float32]
 
 NEIGHBOURHOOD_PX = 11
 PIXELS_AT_ONCE = 50_000
-REACH_PX = NEIGHBOURHOOD_PX // 2
+NEIGHBOURHOOD_RADIUS_PX = NEIGHBOURHOOD_PX // 2
 NEIGHBOURS = NEIGHBOURHOOD_PX**2 - 1
 BILATERAL_PX = 5
-# Stabilised noise has a standard deviation of 1: what differs by three is not the same surface.
+# Stabilised noise has a standard deviation of 1: a difference of three is an edge.
 BILATERAL_SIGMA = 3.0
 BILATERAL_SPACE_PX = 1.5
 
 
 @dataclass(frozen=True)
 class Denoiser:
-    """A denoiser, and how far it reaches: a pixel of its result depends on a square of 2 `reach_px` + 1.
+    """A denoiser and its radius: a pixel of the result depends on a square of 2 `radius_px` + 1 pixels.
 
-    `apply` takes the image and the standard deviation of the noise beside the shot noise, electrons.
+    `apply` takes the image and the standard deviation of the signal-independent noise, electrons.
     """
 
     apply: Callable[[Image, float], Image]
-    reach_px: int
+    radius_px: int
 
 
 def neighbourhood_mean(image: Image) -> Image:
     """Replace each pixel by the mean of the 120 others in the 11 x 11 square around it; (height, width), any unit.
 
-    This is Algorithm 1 with its slips corrected: with mu_S the mean of the differences c - c_k over the neighbours
-    (Eq. 14), the adjusted intensity c - mu_S is the mean of the c_k, and c itself cancels. sigma_S takes no part in it.
-    Near the image's border the mean is over those neighbours that exist.
+    This is Algorithm 1 with its errors corrected: with mu_S the mean of the differences c - c_k over the neighbours
+    (Eq. 14), the adjusted intensity c - mu_S is the mean of the c_k, and c itself cancels. sigma_S is not used.
+    Near the image's border the mean is over the neighbours inside the image.
     """
     height_px, width_px = image.shape
-    # Zeros outside the image add nothing to the sum, and the count leaves them out.
+    # Zeros outside the image do not change the sum, and the count omits them.
     size = (NEIGHBOURHOOD_PX, NEIGHBOURHOOD_PX)
     result = cv2.boxFilter(image, cv2.CV_32F, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
     result -= image
     rows, columns = _counts(height_px), _counts(width_px)
     band = max(1, PIXELS_AT_ONCE // max(width_px, 1))
     for start in range(0, height_px, band):
-        # Not all at once: the whole image of counts would cost as much memory as the image itself.
+        # By bands: an image of all counts would take as much memory as the image itself.
         rows_here = slice(start, start + band)
         result[rows_here] /= np.maximum(rows[rows_here, None] * columns - 1, 1)
     return np.asarray(result, dtype=np.float32)
 
 
 def algorithm_1(image: Image) -> Image:
-    """Algorithm 1 of Huynh & Yoo 2016, line by line as printed, in electrons; no image of what was there comes out.
+    """Algorithm 1 of Huynh & Yoo 2016, line by line as printed, in electrons; the result is not an image of the scene.
 
-    Line 9: mu_S is the mean of the differences c - c_k over the 120 neighbours. Line 10 assigns SSoID and does not
-    add to it, so that the last neighbour's (c - c_k)^2 / 120 stays, 5 px further right and down. Line 11:
-    sigma_S = mu_S - SSoID. Line 12, by Eq. 13: lambda_1 = (sigma_S^2 + mu_S) / 2.
+    Line 9: mu_S is the mean of the differences c - c_k over the 120 neighbours. Line 10 assigns SSoID
+    instead of adding to it, so that only the last neighbour's (c - c_k)^2 / 120 remains, 5 px further right and down.
+    Line 11: sigma_S = mu_S - SSoID. Line 12, by Eq. 13: lambda_1 = (sigma_S^2 + mu_S) / 2.
 
-    Filled in: mu_S starts from 0 at each pixel ("we execute Algorithm 1 for every pixel"; the printed line 3 starts it
-    once for the image), and the adjusted intensity of line 16, of which nothing is said, is lambda_1: the mean of the
-    Poisson variable that the pixel is in Eq. 12, so what it would hold without noise (Eq. 11). Taking c - mu_S in its
-    place is `neighbourhood_mean`, and needs none of lines 10 to 12.
+    Not published, chosen here: mu_S starts from 0 at each pixel ("we execute Algorithm 1 for every pixel"; the printed
+    line 3 sets it once for the image), and the adjusted intensity of line 16, which the paper does not define, is
+    lambda_1: the mean of the Poisson variable that models the pixel in Eq. 12, hence its value without noise (Eq. 11).
+    With c - mu_S in its place the result is `neighbourhood_mean`, and lines 10 to 12 are not needed.
     """
     mu = image - neighbourhood_mean(image)
-    beyond = cv2.copyMakeBorder(image, 0, REACH_PX, 0, REACH_PX, cv2.BORDER_REPLICATE)
-    sigma = mu - (image - beyond[REACH_PX:, REACH_PX:]) ** 2 / np.float32(NEIGHBOURS)
+    radius = NEIGHBOURHOOD_RADIUS_PX
+    padded = cv2.copyMakeBorder(image, 0, radius, 0, radius, cv2.BORDER_REPLICATE)
+    sigma = mu - (image - padded[radius:, radius:]) ** 2 / np.float32(NEIGHBOURS)
     return np.asarray((sigma**2 + mu) / 2, dtype=np.float32)
 
 
 def box_mean(image: Image) -> Image:
-    """The mean of the 11 x 11 square around each pixel, itself included; the image is mirrored at its borders."""
+    """Mean of the 11 x 11 square around each pixel, itself included; the image is mirrored at its borders."""
     return np.asarray(cv2.blur(image, (NEIGHBOURHOOD_PX, NEIGHBOURHOOD_PX)), dtype=np.float32)
 
 
 def variance_stabilised(image: Image, read_noise_e: float) -> Image:
-    """Make shot noise even, smooth within surfaces but not over their edges by a bilateral filter, and go back."""
+    """Stabilise the variance of shot noise, smooth by a bilateral filter, which preserves edges, and invert."""
     even = cv2.bilateralFilter(stabilise(image, read_noise_e), BILATERAL_PX, BILATERAL_SIGMA, BILATERAL_SPACE_PX)
     return unbiased_inverse(np.asarray(even, dtype=np.float32), read_noise_e)
 
 
 def stabilise(image: Image, read_noise_e: float) -> Image:
-    """Generalised Anscombe transform, `2 sqrt(e + 3/8 + sigma^2)`: noise of standard deviation 1 from some 4 e on.
+    """Generalised Anscombe transform, `2 sqrt(e + 3/8 + sigma^2)`: noise of standard deviation 1 from about 4 e on.
 
     Starck, Murtagh & Bijaoui, Image Processing and Data Analysis, 1998, at a gain of one electron.
     """
@@ -96,12 +97,12 @@ def stabilise(image: Image, read_noise_e: float) -> Image:
 
 
 def unbiased_inverse(stabilised: Image, read_noise_e: float) -> Image:
-    """Electrons whose `stabilise`d values have this mean, to some 0.02 e; the algebraic inverse is up to 0.25 e low.
+    """Electrons whose `stabilise`d values have this mean, to about 0.02 e; the algebraic inverse is up to 0.25 e low.
 
-    The closed form of Maekitalo & Foi, IEEE Trans. Image Processing 20 (2011), with sigma^2 taken off again (their
+    The closed form of Maekitalo & Foi, IEEE Trans. Image Processing 20 (2011), with sigma^2 subtracted (their
     paper on the generalised transform, vol. 22, 2013).
     """
-    # No mean is lower than this one of 0 e, where the closed form is 0.
+    # The lowest mean is that at 0 e, where the closed form is 0.
     mean = np.maximum(stabilised, np.float32(2 * np.sqrt(0.375)))
     inverse = 1 / mean
     result = inverse * np.float32(0.625 * np.sqrt(1.5)) - np.float32(1.375)
@@ -116,16 +117,17 @@ def unbiased_inverse(stabilised: Image, read_noise_e: float) -> Image:
 
 
 DENOISERS: dict[str, Denoiser] = {
-    "corrected": Denoiser(lambda image, read_noise_e: neighbourhood_mean(image), REACH_PX),
-    "literal": Denoiser(lambda image, read_noise_e: algorithm_1(image), REACH_PX),
-    "box": Denoiser(lambda image, read_noise_e: box_mean(image), REACH_PX),
+    "corrected": Denoiser(lambda image, read_noise_e: neighbourhood_mean(image), NEIGHBOURHOOD_RADIUS_PX),
+    "literal": Denoiser(lambda image, read_noise_e: algorithm_1(image), NEIGHBOURHOOD_RADIUS_PX),
+    "box": Denoiser(lambda image, read_noise_e: box_mean(image), NEIGHBOURHOOD_RADIUS_PX),
     "none": Denoiser(lambda image, read_noise_e: image, 0),
     "anscombe": Denoiser(variance_stabilised, BILATERAL_PX // 2),
 }
 
 
 def _counts(length_px: int) -> NDArray[np.float32]:
-    """How many pixels of the 11 around each place along a line of `length_px` lie on the line."""
+    """Number of the 11 pixels around each position along a line of `length_px` that lie on the line."""
     index = np.arange(length_px)
-    first, last = np.maximum(index - REACH_PX, 0), np.minimum(index + REACH_PX, length_px - 1)
+    first = np.maximum(index - NEIGHBOURHOOD_RADIUS_PX, 0)
+    last = np.minimum(index + NEIGHBOURHOOD_RADIUS_PX, length_px - 1)
     return (last - first + 1).astype(np.float32)

@@ -1,8 +1,8 @@
-"""Image to LED spots: where each lamp's image is, to a hundredth of a pixel, and how sure that is.
+"""Detection: LED images with centroids to a hundredth of a pixel, and the centroids' covariances.
 
-Blobs are found in a lightly smoothed copy with one low threshold. Each is then looked at alone: the part above half of
-its own level gives an ellipse, and the centroid is taken over that ellipse grown by a margin, so that all of the spot's
-light is in it, blurred or not, and the background around it cancels.
+Blobs are found in a lightly smoothed copy with one low threshold. The part of a blob above half of its own level gives
+an ellipse. The centroid is computed over that ellipse padded by a margin, so that it contains all light of the LED
+image, blurred or not, and the background around it cancels.
 """
 
 from collections.abc import Sequence
@@ -16,25 +16,25 @@ from estimator.errors import EstimationFailure
 
 Pixels = NDArray[np.float64]
 
-# The 5 x 5 mean that blobs are searched in: keeps a spot whole that is but a few electrons a pixel.
+# Blobs are searched in a 5 x 5 mean, which keeps an LED image of a few electrons a pixel in one piece.
 SMOOTHING_PX = 5
-# Ceiling and walls at 1/100 of a lamp stay below this share of the brightest; a lamp at a quarter of it stays above.
+# Share of the brightest level: above ceiling and walls at 1/100 of an LED, below an LED at a quarter of it.
 THRESHOLD_OF_BRIGHTEST = 0.05
 THRESHOLD_SIGMA = 6.0
-# A demodulator's pixel is off by some 10 px: the lamp is within so many of it.
+# Distance of an LED image from its decoded pixel, whose standard deviation is about 10 px.
 NEAR_PX = 40.0
-# One bright pixel smoothed covers 25; smaller blobs are noise near the threshold.
+# One bright pixel covers 25 when smoothed; smaller blobs are noise near the threshold.
 MIN_BLOB_PX = 16
-# No scene has as many lamps: what is smaller than the thousand largest blobs is noise in an image that holds no lamp.
+# More than any scene has LEDs: further blobs are noise in an image without an LED.
 MAX_BLOBS = 1000
-# A blob over a tenth of the frame is a wall or a window.
+# A blob larger than a tenth of the frame is a wall or a window of the room.
 MAX_BLOB_OF_FRAME = 0.1
-# Pieces of a blob above half level count as lamps of their own from a fifth of the largest piece's area on.
+# Pieces of a blob above half level count as separate LED images from a fifth of the largest piece's area on.
 MIN_PIECE = 0.2
-# A square of half side r has the second moments of a disc of radius 2 r / sqrt(3), and corners at sqrt(2) r.
+# A square of half side r has the second moments of a disc of radius 2 r / sqrt(3), and its vertices at sqrt(2) r.
 SQUARE_STRETCH = 1.5**0.5
-# Where a disc of blur has fallen to the threshold it has a fifth of its way to go.
-FRINGE_BEYOND = 1.25
+# A disc of blur extends a quarter further than to where it has fallen to the threshold.
+FRINGE_EXTENSION = 1.25
 MARGIN_PX = 2.0
 RING_PX = 3.0
 MIN_SIGNAL_TO_NOISE = 5.0
@@ -42,10 +42,12 @@ MIN_SIGNAL_TO_NOISE = 5.0
 
 @dataclass(frozen=True, eq=False)
 class Spot:
-    """A lamp's image, in continuous pixels with pixel centres at +0.5.
+    """An LED image: its centroid (u, v), continuous pixels with pixel centres at +0.5, and properties.
 
-    `covariance_px2` is (2, 2), of the centroid (u, v), from the pixels' noise. The brightest pixel is given by its
-    centre; on a flat-topped or clipped lamp noise alone decides which one it is, and ties go to the first row's first.
+    `covariance_px2` (2, 2) is the centroid's covariance by the pixels' noise. The brightest pixel is given by its
+    centre; in a flat or clipped LED image noise decides which it is, and of equal ones the first, row by row, is taken.
+    `area_px` are the pixels above half level. `touches_border` marks an LED image that may be cut by the border of its
+    region, which biases the centroid; `saturated` one with a pixel that is or may be saturated.
     """
 
     u_px: float
@@ -61,10 +63,11 @@ class Spot:
 
 @dataclass(frozen=True, eq=False)
 class Readout:
-    """A window of the sensor in electrons, (rows, columns), from pixel (row, column) of the sensor on.
+    """A region of interest in electrons, `image_e` (rows, columns); its first pixel is (row, column) of the sensor.
 
-    `raw_e` is the image before the denoiser and `clipped` where it was full. Beside shot noise a pixel's variance has a
-    part that stays, `floor_e2`, and one that goes with the square of its light, by the pixels' unequal response `prnu`.
+    `raw_e` is the image before denoising; `clipped` marks saturated pixels. Beside shot noise a pixel's variance has a
+    signal-independent part, `floor_e2`, and one proportional to its signal squared, by the photo response
+    nonuniformity `prnu`.
     """
 
     row: int
@@ -78,65 +81,68 @@ class Readout:
 
 @dataclass(frozen=True, eq=False)
 class _Ellipse:
-    """The part of a blob above half level: its centroid (u, v) and the ellipse of the same second moments."""
+    """Part of a blob above half level: its centroid (u, v) and the ellipse of the same second moments.
+
+    `axes` (2, 2) are its unit axes as columns, `semi_axes_px` (2,) their lengths. `low_px` and `high_px` (2,) are
+    opposite vertices of the upright box around the part itself. `fringe_px` is the width of the light found around the
+    ellipse beyond that of a sharp LED image.
+    """
 
     centre_px: NDArray[np.float64]
     axes: NDArray[np.float64]
     semi_axes_px: NDArray[np.float64]
     low_px: NDArray[np.float64]
     high_px: NDArray[np.float64]
-    """Corners of the upright box around the part itself."""
     area_px: int
     fringe_px: float
-    """How much further than a sharp lamp's the light goes that was found around it."""
 
-    def distance2(self, u_px: NDArray[np.float64], v_px: NDArray[np.float64], grown_px: float) -> NDArray[np.float64]:
-        """Squared distance from the centre in units of the grown ellipse: at most 1 inside. Takes a row of u, a column
-        of v.
+    def distance2(self, u_px: NDArray[np.float64], v_px: NDArray[np.float64], padding_px: float) -> NDArray[np.float64]:
+        """Squared distance from the centre in units of the padded ellipse, at most 1 inside.
+
+        Takes a row of u (1, columns) and a column of v (rows, 1); returns (rows, columns).
         """
         du, dv = u_px - self.centre_px[0], v_px - self.centre_px[1]
-        (uu, uv), (_, vv) = (self.axes / (self.semi_axes_px + grown_px) ** 2) @ self.axes.T
+        (uu, uv), (_, vv) = (self.axes / (self.semi_axes_px + padding_px) ** 2) @ self.axes.T
         return np.asarray(uu * du**2 + vv * dv**2 + (2 * uv * dv) * du)
 
-    def half_extent(self, grown_px: float) -> NDArray[np.float64]:
-        """Half width and half height of the upright box around the grown ellipse."""
-        return np.asarray(np.sqrt((self.axes**2) @ (self.semi_axes_px + grown_px) ** 2))
+    def half_extent(self, padding_px: float) -> NDArray[np.float64]:
+        """Half width and half height, (2,), of the upright box around the padded ellipse."""
+        return np.asarray(np.sqrt((self.axes**2) @ (self.semi_axes_px + padding_px) ** 2))
 
 
 def detect(
     readouts: Sequence[Readout],
     sensor_px: int,
-    reach_px: int,
-    lamps_px: Pixels | None = None,
-    corners: bool = False,
+    denoise_radius_px: int,
+    decoded_px: Pixels | None = None,
+    any_square: bool = False,
 ) -> tuple[Spot, ...]:
-    """Find the lamps in what was read out of a sensor of `sensor_px` pixels: all of it, or windows around lamps.
+    """Detect LED images in the regions read out of a sensor of `sensor_px` pixels: one full frame, or several.
 
-    What counts as bright is measured near `lamps_px`, (n, 2), where somebody saw lamps that matter, so that a brighter
-    one elsewhere hides none of them; without, or where nothing is read out there, the image's brightest does. `corners`
-    says that lamps may have some: the ellipse that a square's centroid is taken over goes around it.
-    `reach_px` is the half width of the box that the denoiser averaged over, 0 where the images are the raw ones. A spot
-    whose light may go over the border of its window is reported and flagged: its centroid is biased. Raises
-    EstimationFailure where there is no spot at all.
+    The brightness scale is measured near `decoded_px` (n, 2), the rough pixels of decoded LEDs, so that a brighter
+    light elsewhere does not hide them; without them, or if nothing was read out there, it is the image's maximum.
+    `any_square` says that LEDs may be square: the ellipse for the centroid then encloses the square.
+    `denoise_radius_px` is the radius of the box that the denoiser averaged over, 0 for raw images. An LED image that
+    may be cut by the border of its region is reported and flagged. Raises EstimationFailure if there is none at all.
     """
     size = (SMOOTHING_PX, SMOOTHING_PX)
     smooth = [cv2.blur(readout.image_e, size, borderType=cv2.BORDER_REPLICATE) for readout in readouts]
     whole = sum(image.size for image in smooth) == sensor_px and len(smooth) == 1
-    background_e, threshold_e = _levels(smooth, whole, _brightest(readouts, smooth, lamps_px))
+    background_e, threshold_e = _levels(smooth, whole, _brightest(readouts, smooth, decoded_px))
     spots: list[Spot] = []
     for readout, image in zip(readouts, smooth, strict=True):
-        stretch = SQUARE_STRETCH if corners else 1.0
+        stretch = SQUARE_STRETCH if any_square else 1.0
         ellipses = _ellipses(image, background_e, threshold_e, MAX_BLOB_OF_FRAME * sensor_px, stretch)
-        spots += _spots(readout, ellipses, reach_px)
+        spots += _spots(readout, ellipses, denoise_radius_px)
     if not spots:
         raise EstimationFailure("detect", "no spot found")
     return tuple(spots)
 
 
-def _spots(readout: Readout, ellipses: Sequence[_Ellipse], reach_px: int) -> list[Spot]:
-    """Measure each ellipse of a window, beside those near it."""
+def _spots(readout: Readout, ellipses: Sequence[_Ellipse], denoise_radius_px: int) -> list[Spot]:
+    """Measure each ellipse of a region, given those near it."""
     fringe_px = max((ellipse.fringe_px for ellipse in ellipses), default=0.0)
-    margin_px = MARGIN_PX + max(reach_px, fringe_px)
+    margin_px = MARGIN_PX + max(denoise_radius_px, fringe_px)
     centres = np.array([ellipse.centre_px for ellipse in ellipses]).reshape(-1, 2)
     extents = np.array([ellipse.half_extent(margin_px + RING_PX) for ellipse in ellipses]).reshape(-1, 2)
     spots = []
@@ -144,21 +150,21 @@ def _spots(readout: Readout, ellipses: Sequence[_Ellipse], reach_px: int) -> lis
         overlaps = (np.abs(centres - centres[index]) < extents + extents[index]).all(axis=1)
         overlaps[index] = False
         others = [ellipses[other] for other in np.flatnonzero(overlaps).tolist()]
-        spot = _measure(readout, ellipse, others, reach_px)
+        spot = _measure(readout, ellipse, others, denoise_radius_px)
         if spot is not None:
             spots.append(spot)
     return spots
 
 
-def _brightest(readouts: Sequence[Readout], smooth: Sequence[NDArray[np.float32]], lamps_px: Pixels | None) -> float:
-    """How bright the lamps are, electrons: the median of what is brightest near each, or the image's brightest."""
+def _brightest(readouts: Sequence[Readout], smooth: Sequence[NDArray[np.float32]], decoded_px: Pixels | None) -> float:
+    """Brightness of the LEDs, electrons: median of the maxima near the decoded pixels, or the image's maximum."""
     peaks = []
-    if lamps_px is not None:
+    if decoded_px is not None:
         first = np.array([(readout.column, readout.row) for readout in readouts])
         size = np.array([image.shape[::-1] for image in smooth])
-        for lamp_px in lamps_px:
-            low = np.clip(lamp_px - NEAR_PX - first, 0, size).astype(int)
-            high = np.clip(lamp_px + NEAR_PX - first, 0, size).astype(int)
+        for centre_px in decoded_px:
+            low = np.clip(centre_px - NEAR_PX - first, 0, size).astype(int)
+            high = np.clip(centre_px + NEAR_PX - first, 0, size).astype(int)
             for part in np.flatnonzero((low < high).all(axis=1)).tolist():
                 (left, top), (right, bottom) = low[part], high[part]
                 peaks.append(float(smooth[part][top:bottom, left:right].max()))
@@ -168,8 +174,8 @@ def _brightest(readouts: Sequence[Readout], smooth: Sequence[NDArray[np.float32]
 def _levels(smooth: Sequence[NDArray[np.float32]], whole: bool, brightest_e: float) -> tuple[float, float]:
     """Background and the threshold for blobs, electrons.
 
-    In the whole image most pixels are background, and every few of them are enough. A lamp may fill most of a window
-    around it, but not of the window's outermost pixels: the darkest quarter of these is background, blurred or not.
+    In a full frame most pixels are background, and a subset of them suffices. An LED image may fill most of its region
+    of interest, but not most of the region's outermost pixels: the darkest quarter of these is background.
     """
     if whole:
         (image,) = smooth
@@ -188,9 +194,9 @@ def _levels(smooth: Sequence[NDArray[np.float32]], whole: bool, brightest_e: flo
 def _ellipses(
     smooth: NDArray[np.float32], background_e: float, threshold_e: float, largest_px: float, stretch: float
 ) -> list[_Ellipse]:
-    """The blobs above the threshold, cut at half of their own level, as ellipses made longer by `stretch`."""
+    """Blobs above the threshold, cut at half of their own level, as ellipses with axes longer by `stretch`."""
     mask = (smooth > threshold_e).view(np.uint8)
-    # Outlines are found a hundred times sooner than labels and their statistics for all of a large image.
+    # Finding contours is a hundred times faster than labelling a large image.
     outlines, nesting = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     outer = (
         [outline for outline, (*_, parent) in zip(outlines, nesting[0], strict=True) if parent < 0] if outlines else []
@@ -205,7 +211,7 @@ def _ellipses(
         values = smooth[roi][own]
         if not MIN_BLOB_PX <= len(values) <= largest_px:
             continue
-        # The upper quartile is the plateau of a lamp; the maximum would be its noise.
+        # The upper quartile is the plateau of an LED image; the maximum would be its noise.
         quartile = 3 * len(values) // 4
         half_e = background_e + (float(np.partition(values, quartile)[quartile]) - background_e) / 2
         core = (own & (smooth[roi] >= half_e)).view(np.uint8)
@@ -221,7 +227,7 @@ def _ellipses(
 
 
 def _ellipse(core: NDArray[np.bool_], left: int, top: int, stretch: float) -> _Ellipse:
-    """The ellipse with the centroid and second moments of the pixels set; (left, top) is the window's first pixel."""
+    """Ellipse with the centroid and second moments of the pixels set; (left, top) is the first pixel of `core`."""
     weights = core.astype(np.float64)
     of_columns, of_rows = weights.sum(axis=0), weights.sum(axis=1)
     count = of_rows.sum()
@@ -240,21 +246,21 @@ def _ellipse(core: NDArray[np.bool_], left: int, top: int, stretch: float) -> _E
 
 
 def _fringe_px(ellipse: _Ellipse, low_px: NDArray[np.int64], high_px: NDArray[np.int64]) -> float:
-    """How far a blob's box goes beyond its ellipse's, without what the smoothing adds; none where it is no lamp's own.
+    """Width by which a blob's box exceeds its core's, less the smoothing's; 0 if the fringe is not the LED image's own.
 
-    A fringe wider than the lamp itself is not its blur but something bright beside it.
+    A fringe wider than the LED image itself is not its blur but another bright object.
     """
     fringe_px = max((ellipse.low_px - low_px).max(), (high_px - ellipse.high_px).max()) - SMOOTHING_PX // 2
-    return FRINGE_BEYOND * float(fringe_px) if 0 < fringe_px < ellipse.semi_axes_px.max() else 0.0
+    return FRINGE_EXTENSION * float(fringe_px) if 0 < fringe_px < ellipse.semi_axes_px.max() else 0.0
 
 
-def _measure(readout: Readout, ellipse: _Ellipse, others: list[_Ellipse], reach_px: int) -> Spot | None:
-    """Centroid and covariance of one spot, or None where it does not stand out of its own noise."""
-    margin_px = MARGIN_PX + max(reach_px, ellipse.fringe_px)
+def _measure(readout: Readout, ellipse: _Ellipse, others: list[_Ellipse], denoise_radius_px: int) -> Spot | None:
+    """Centroid and covariance of one spot; None if its signal-to-noise ratio is too small."""
+    margin_px = MARGIN_PX + max(denoise_radius_px, ellipse.fringe_px)
     height_px, width_px = readout.image_e.shape
-    reach = ellipse.half_extent(margin_px + RING_PX)
-    left, top = np.maximum(np.floor(ellipse.centre_px - reach), 0).astype(int)
-    right, bottom = np.minimum(np.ceil(ellipse.centre_px + reach), (width_px, height_px)).astype(int)
+    half_extent = ellipse.half_extent(margin_px + RING_PX)
+    left, top = np.maximum(np.floor(ellipse.centre_px - half_extent), 0).astype(int)
+    right, bottom = np.minimum(np.ceil(ellipse.centre_px + half_extent), (width_px, height_px)).astype(int)
     roi = np.s_[top:bottom, left:right]
     u_px, v_px = np.arange(left, right)[None, :] + 0.5, np.arange(top, bottom)[:, None] + 0.5
     electrons = readout.image_e[roi].astype(np.float64)
@@ -263,8 +269,8 @@ def _measure(readout: Readout, ellipse: _Ellipse, others: list[_Ellipse], reach_
     support = distance2 <= 1
     ring = ~support & (ellipse.distance2(u_px, v_px, margin_px + RING_PX) <= 1)
     for other in others:
-        # Where two supports meet, a pixel belongs to the spot it is nearer to.
-        other_distance2 = other.distance2(u_px, v_px, MARGIN_PX + max(reach_px, other.fringe_px))
+        # A pixel in two supports belongs to the nearer spot.
+        other_distance2 = other.distance2(u_px, v_px, MARGIN_PX + max(denoise_radius_px, other.fringe_px))
         support &= distance2 <= other_distance2
         ring &= other_distance2 > 1
     background_e = electrons[ring].mean() if ring.any() else 0.0
@@ -277,8 +283,8 @@ def _measure(readout: Readout, ellipse: _Ellipse, others: list[_Ellipse], reach_
     if flux <= MIN_SIGNAL_TO_NOISE * np.sqrt(variance[support].sum()):
         return None
     u, v = float(signal.sum(axis=0) @ u_px[0] / flux), float(signal.sum(axis=1) @ v_px[:, 0] / flux)
-    # A centroid of box means is a sum over the raw pixels, whose weights are the box means of the centroid's weights.
-    box = (2 * reach_px + 1, 2 * reach_px + 1)
+    # A centroid of box means is a sum over the raw pixels, weighted by the box means of the centroid's weights.
+    box = (2 * denoise_radius_px + 1, 2 * denoise_radius_px + 1)
     levers = np.stack([support * ((u_px - u) / flux), support * ((v_px - v) / flux)])
     weights = np.stack([cv2.blur(lever, box, borderType=cv2.BORDER_CONSTANT).ravel() for lever in levers])
     covariance = (weights * variance.ravel()) @ weights.T

@@ -1,7 +1,7 @@
-"""A pipeline's name with some of its stages chosen: `NAME:stage=value,stage=value`.
+"""Options of a variant: its name with values for some of its stages, `NAME:stage=value,stage=value`.
 
-The whole text is the variant's name, also of its file in estimates/. It holds nothing but names and values that are
-allowed, and `:`, `=` and `,`, so it is a file name wherever a colon may stand in one (not on Windows).
+The whole text is the variant's name, and the name of its file in estimates/. It consists of allowed names and values
+and of `:`, `=` and `,`, so it is a valid file name on systems that allow a colon (not on Windows).
 """
 
 from collections.abc import Mapping, Sequence
@@ -10,9 +10,9 @@ from estimator.errors import InputError
 
 
 def read_options(name: str, stages: Mapping[str, Sequence[str]]) -> dict[str, str]:
-    """The stages that `name` chooses after its first colon, by stage; `stages` are the values allowed, by stage.
+    """Values that `name` gives after its first colon, by stage; `stages` are the allowed values, by stage.
 
-    Raises InputError, naming what is wrong and what is allowed, for a stage or value unknown, and a stage chosen twice.
+    Raises InputError, which names what is allowed, for an unknown stage or value, and for a stage given twice.
     """
     chosen: dict[str, str] = {}
     for part in name.partition(":")[2].split(","):
@@ -24,6 +24,6 @@ def read_options(name: str, stages: Mapping[str, Sequence[str]]) -> dict[str, st
         if value not in stages[stage]:
             raise InputError(f"variant {name}: {stage}={value!r} is unknown; allowed: {', '.join(stages[stage])}")
         if stage in chosen:
-            raise InputError(f"variant {name}: {stage} is chosen twice")
+            raise InputError(f"variant {name}: {stage} is given twice")
         chosen[stage] = value
     return chosen

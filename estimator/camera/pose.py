@@ -1,0 +1,51 @@
+"""Pose of a camera, and rotations by the tilts and yaw of the format (datasets/FORMAT.md, Tilt)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from estimator.io.device import Camera
+
+Floats = NDArray[np.float64]
+
+POSE_PARAMETERS = 6
+"""Position x, y, z in metres, then the rig's tilt_x, tilt_y and yaw in radians: order of all pose derivatives."""
+
+
+def rotation(tilt_x: float, tilt_y: float, yaw: float = 0.0) -> Floats:
+    """`Rx(tilt_x) Ry(tilt_y) Rz(yaw)`, (3, 3), for angles in radians."""
+    # The format turns the axes, SciPy the points: opposite signs.
+    return np.asarray(Rotation.from_euler("XYZ", [-tilt_x, -tilt_y, -yaw]).as_matrix(), dtype=np.float64)
+
+
+def rotation_angles(matrix: Floats) -> Floats:
+    """The (tilt_x, tilt_y, yaw) of a rotation matrix (3, 3), radians: the inverse of `rotation`."""
+    return np.asarray(-Rotation.from_matrix(matrix).as_euler("XYZ"), dtype=np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """Projection centre `position_m` (3,), world metres, and rotation `R_cam_world` (3, 3) of a camera."""
+
+    position_m: Floats
+    R_cam_world: Floats
+
+    @classmethod
+    def of_rig_angles(cls, position_m: Floats, angles: Floats, camera: Camera) -> "Pose":
+        """Pose of a camera at a position (3,) whose rig has the (tilt_x, tilt_y, yaw), (3,) radians."""
+        tilt_x, tilt_y, yaw = np.asarray(angles).tolist()
+        return cls(position_m, camera.R_cam_rig_array() @ rotation(tilt_x, tilt_y, yaw))
+
+    def rig_angles(self, camera: Camera) -> Floats:
+        """The rig's (tilt_x, tilt_y, yaw), (3,) radians."""
+        return rotation_angles(camera.R_cam_rig_array().T @ self.R_cam_world)
+
+    def moved(self, step: Floats, camera: Camera) -> "Pose":
+        """This pose plus a step (6,) of its POSE_PARAMETERS."""
+        return Pose.of_rig_angles(self.position_m + step[:3], self.rig_angles(camera) + step[3:], camera)
+
+    def in_camera(self, points_m: Floats) -> Floats:
+        """World points (n, 3) in camera axes, (n, 3), metres."""
+        return np.asarray((points_m - self.position_m) @ self.R_cam_world.T)

@@ -1,0 +1,99 @@
+"""Run of variants over a dataset, which writes their estimates."""
+
+import logging
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from estimator.errors import InputError
+from estimator.evaluate.batch import estimate_dataset
+from estimator.evaluate.workers import estimate_with_workers
+from estimator.io.dataset import read_dataset
+from estimator.io.estimates import EstimateRow, estimates_path, write_estimates
+from estimator.methods.registry import Registry, variants
+from estimator.methods.variant import Variant
+
+logger = logging.getLogger(__name__)
+
+
+def run(
+    directory: str | Path,
+    variants: Sequence[str | Variant] | None = None,
+    workers: int = 1,
+    progress: Callable[[int, int], None] | None = None,
+) -> dict[str, tuple[EstimateRow, ...]]:
+    """Estimate every frame of a dataset, and write estimates/VARIANT.parquet for each variant.
+
+    Parameters
+    ----------
+    directory
+        Folder of the dataset.
+    variants
+        Names of variants, or Variant objects; all registered variants if None.
+    workers
+        Number of processes; the estimates do not depend on it. More than 1 needs variants given by name.
+    progress
+        Called with (frames done, frames in all) at the start and after every frame.
+
+    Returns
+    -------
+    dict
+        Rows by variant name, one a frame, in order. A frame without a position has `status` "failed" and a `reason`.
+
+    Raises
+    ------
+    InputError
+        The dataset cannot be read, a variant is unknown, or a worker process died.
+    OSError
+        The estimates cannot be written.
+    """
+    if workers < 1:
+        raise InputError(f"workers {workers}: is not 1 or more")
+    folder = Path(directory)
+    chosen = _chosen(variants)
+    for name in chosen:
+        estimates_path(folder, name)
+    dataset = read_dataset(folder)
+    done, total = 0, len(dataset.frames)
+
+    def on_frame() -> None:
+        nonlocal done
+        done += 1
+        if progress is not None:
+            progress(done, total)
+
+    if progress is not None:
+        progress(0, total)
+    if workers == 1:
+        rows = estimate_dataset(dataset, list(chosen.values()), on_frame)
+    else:
+        _check_registered(chosen)
+        rows = estimate_with_workers(dataset, list(chosen), workers, on_frame)
+    for name, of_variant in rows.items():
+        path = write_estimates(folder, name, of_variant)
+        failed = sum(row.status == "failed" for row in of_variant)
+        logger.info("%s: %d of %d frames failed, estimates in %s", name, failed, len(of_variant), path)
+    return rows
+
+
+def _chosen(selection: Sequence[str | Variant] | None) -> dict[str, Variant]:
+    """Variants by name, each once; all registered ones for None."""
+    if selection is None:
+        found = variants()
+    elif isinstance(selection, str):
+        raise InputError(f"variants {selection!r}: needed a sequence of names")
+    else:
+        registry = Registry.read()
+        found = [registry.named(one) if isinstance(one, str) else one for one in selection]
+    return {variant.name: variant for variant in found}
+
+
+def _check_registered(chosen: dict[str, Variant]) -> None:
+    """Raise InputError for a Variant that worker processes would not find by its name."""
+    registry = Registry.read()
+    for name, variant in chosen.items():
+        try:
+            registered = registry.named(name)
+        except InputError:
+            registered = None
+        if registered != variant:
+            raise InputError(f"variant {name}: is not registered under its name, so workers has to be 1")

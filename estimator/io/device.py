@@ -1,0 +1,425 @@
+"""Device knowledge: camera, sensor, accelerometer, LED map, and a frame with all of them (datasets/FORMAT.md)."""
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, Strict, ValidationError, field_validator, model_validator
+
+from estimator.errors import InputError
+from estimator.io.records import NotNegative, Number, Positive, Row, Triple, first_problem
+
+Floats = NDArray[np.float64]
+
+INT64_MAX = 2**63 - 1
+MAX_SENSOR_AREAS = 16
+"""Upper limit of the pixels in all regions of a frame, in sensor areas; regions may extend beyond the sensor."""
+# Pixels within this many standard deviations of the full well count as possibly full.
+FULL_SIGMA = 4.0
+LedId = Annotated[int, Field(ge=0, le=INT64_MAX)]
+# Within 1000 km of the origin: any range to an LED, even a wrong one, can then be written.
+Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
+
+
+def normalized(pixels: Floats, K: Floats) -> Floats:
+    """Normalized image coordinates (n, 2), `K^-1 [u, v, 1]`, in units of the image distance, of pixels (n, 2)."""
+    return np.asarray((np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(K).T)[:, :2])
+
+
+def to_pixels(image: Floats, K: Floats) -> Floats:
+    """Pixels (n, 2), `K [x, y, 1]`, of normalized image coordinates (n, 2): the inverse of `normalized`."""
+    return np.asarray(image @ K[:2, :2].T + K[:2, 2])
+
+
+class Distortion(Row):
+    """Brown-Conrady coefficients in OpenCV's convention, for normalized image coordinates."""
+
+    k1: Number
+    k2: Number
+    k3: Number
+    p1: Number
+    p2: Number
+
+
+class Camera(Row):
+    """Camera of a device: intrinsics, lens, and mounting on the rig; keys as in dataset.json.
+
+    `K` maps normalized image coordinates to continuous pixels with pixel centres at +0.5.
+    """
+
+    width_px: int = Field(ge=1, le=65536)
+    height_px: int = Field(ge=1, le=65536)
+    K: tuple[Triple, Triple, Triple]
+    pixel_pitch_um: Positive
+    focal_length_mm: Positive
+    image_distance_mm: Positive
+    f_number: Positive
+    projection: Literal["perspective", "equidistant"]
+    distortion: Distortion | None
+    focus_distance_m: Positive | Literal["infinity"] | None
+    psf: Literal["none", "diffraction", "measured"]
+    psf_wavelength_nm: Positive
+    psf_kernel: tuple[tuple[Number, ...], ...] | None
+    R_cam_rig: tuple[Triple, Triple, Triple]
+    offset_m: Triple
+
+    @field_validator("K")
+    @classmethod
+    def _upper_triangular(cls, k: tuple[Triple, Triple, Triple]) -> tuple[Triple, Triple, Triple]:
+        if k[0][0] <= 0 or k[1][1] <= 0 or k[1][0] != 0 or k[2] != (0.0, 0.0, 1.0):
+            raise ValueError("K has to be [[fx, skew, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0")
+        return k
+
+    @model_validator(mode="after")
+    def _no_distortion_of_a_fish_eye(self) -> Self:
+        if self.projection == "equidistant" and self.distortion is not None:
+            raise ValueError('distortion has to be null with projection "equidistant"')
+        return self
+
+    def matrix(self) -> Floats:
+        """`K` as a (3, 3) array, pixels."""
+        return np.array(self.K, dtype=np.float64)
+
+    def normalized(self, pixels: Floats) -> Floats:
+        """Normalized image coordinates (n, 2) of this camera's pixels (n, 2)."""
+        return normalized(pixels, self.matrix())
+
+    def to_pixels(self, image: Floats) -> Floats:
+        """This camera's pixels (n, 2) of normalized image coordinates (n, 2)."""
+        return to_pixels(image, self.matrix())
+
+    @property
+    def pixel_angle_rad(self) -> float:
+        """Angle of one pixel on the optical axis, 1 / fx, radians."""
+        return 1 / self.K[0][0]
+
+    def R_cam_rig_array(self) -> Floats:
+        """`R_cam_rig` as a (3, 3) array."""
+        return np.array(self.R_cam_rig, dtype=np.float64)
+
+
+class Sensor(Row):
+    """Sensor of a device; keys as in dataset.json: `dn = round(min(e, full_well_e) / gain_e_per_dn) + black_level_dn`.
+
+    Noise other than shot noise is given by standard deviations, as in a data sheet.
+    """
+
+    bits: int = Field(ge=1, le=32)
+    gain_e_per_dn: Positive
+    full_well_e: Positive
+    black_level_dn: float = Field(ge=0, le=2**32)
+    noise: Literal["shot", "none", "full"]
+    prnu: NotNegative
+    dark_current_e_s: NotNegative
+    dsnu_e: NotNegative
+    read_noise_e: NotNegative
+    adc_noise_dn: NotNegative
+    row_offset_e: NotNegative
+    column_offset_e: NotNegative
+    mosaic: str
+
+    def saturation_dn(self) -> float:
+        """Digital number of a saturated pixel: at the full well, or the ADC's last code if that is lower."""
+        return min(2.0**self.bits - 1, float(np.rint(self.full_well_e / self.gain_e_per_dn)) + self.black_level_dn)
+
+    def clipping_dn(self) -> float:
+        """Lowest digital number that a saturated pixel may have.
+
+        It is FULL_SIGMA standard deviations below the full well, of all noise that is added after clipping. The ADC's
+        last code needs no such margin: a pixel that reads less has not reached it.
+        """
+        added_e = float(np.hypot(self.read_noise_e, np.hypot(self.row_offset_e, self.column_offset_e)))
+        spread_dn = float(np.hypot(added_e / self.gain_e_per_dn, self.adc_noise_dn))
+        well_dn = float(np.rint(self.full_well_e / self.gain_e_per_dn)) + self.black_level_dn
+        return min(2.0**self.bits - 1, well_dn - FULL_SIGMA * spread_dn)
+
+    def floor_e2(self) -> float:
+        """Signal-independent variance of a pixel, electrons squared.
+
+        Offsets of whole rows and columns are left out: subtracting a spot's local background removes most of them.
+        """
+        rounding = self.gain_e_per_dn**2 / 12 if self.noise == "full" or self.gain_e_per_dn != 1 else 0.0
+        return self.dsnu_e**2 + self.read_noise_e**2 + (self.adc_noise_dn * self.gain_e_per_dn) ** 2 + rounding
+
+
+class Led(Row):
+    """LED of the map: identity, and centre of its horizontal face, world metres. See `DiscLed`, `SquareLed`."""
+
+    id: LedId
+    position_m: Annotated[tuple[Coordinate, Coordinate, Coordinate], Strict(False)]
+    shape: str
+
+    @property
+    def half_width_m(self) -> float:
+        """Radius of a disc, half the side of a square, metres."""
+        raise NotImplementedError
+
+    @property
+    def mean_square_extent_m2(self) -> float:
+        """Mean of x^2 over the face, x measured from the centre along any direction of the face, m^2."""
+        raise NotImplementedError
+
+
+class DiscLed(Led):
+    """Disc of radius `radius_m`."""
+
+    shape: Literal["disc"] = "disc"
+    radius_m: Positive
+
+    @model_validator(mode="before")
+    @classmethod
+    def _has_no_side(cls, entry: Any) -> Any:
+        return _without_key(entry, "side_m", "a disc has radius_m, not side_m")
+
+    @property
+    def half_width_m(self) -> float:
+        """The radius, metres."""
+        return self.radius_m
+
+    @property
+    def mean_square_extent_m2(self) -> float:
+        """A quarter of the radius squared, m^2."""
+        return self.radius_m**2 / 4
+
+
+class SquareLed(Led):
+    """Square of side `side_m`, its sides along x and y of the world."""
+
+    shape: Literal["square"] = "square"
+    side_m: Positive
+
+    @model_validator(mode="before")
+    @classmethod
+    def _has_no_radius(cls, entry: Any) -> Any:
+        return _without_key(entry, "radius_m", "a square has side_m (the whole side), not radius_m")
+
+    @property
+    def half_width_m(self) -> float:
+        """Half the side, metres."""
+        return self.side_m / 2
+
+    @property
+    def mean_square_extent_m2(self) -> float:
+        """A twelfth of the side squared, m^2."""
+        return self.side_m**2 / 12
+
+
+def _without_key(entry: Any, key: str, message: str) -> Any:
+    if isinstance(entry, Mapping) and key in entry:
+        raise ValueError(message)
+    return entry
+
+
+AnyLed = Annotated[DiscLed | SquareLed, Field(discriminator="shape")]
+"""An entry of `led_map`, told apart by `shape`."""
+
+
+def leds_by_id(leds: Iterable[AnyLed]) -> dict[int, AnyLed]:
+    """LEDs by id; raises ValueError for an id that occurs twice."""
+    entries = list(leds)
+    mapped = {led.id: led for led in entries}
+    if len(mapped) != len(entries):
+        raise ValueError("LED ids have to be unique")
+    return mapped
+
+
+class DecodedSpot(Row):
+    """Decoded identity: the LED that a demodulator reports near this pixel. The pixel is rough, not a centroid."""
+
+    led: LedId
+    u_px: Number
+    v_px: Number
+
+
+def decoding_problem(spots: Sequence[DecodedSpot], leds: Mapping[int, Led]) -> str | None:
+    """What is wrong with a frame's decoded identities, None if nothing: an LED decoded twice, or not in `led_map`."""
+    decoded = [spot.led for spot in spots]
+    if len(set(decoded)) != len(decoded):
+        return "an LED is decoded twice in spots"
+    if unknown := set(decoded) - leds.keys():
+        return f"spots name LED {min(unknown)}, which is not in led_map"
+    return None
+
+
+class Accelerometer(Row):
+    """Error of the accelerometer as the device knows it, degrees, one standard deviation.
+
+    Of kind "tilt-error" it is the error of each tilt; of kind "imu" the error of the direction of gravity, along each
+    of two perpendicular axes.
+    """
+
+    kind: Literal["tilt-error", "imu"]
+    error_deg: NotNegative
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Region of interest that was read out: `image_dn` (rows, columns) uint32, digital numbers, row 0 at the top.
+
+    Its first pixel is pixel (row, column) of the sensor.
+    """
+
+    row: int
+    column: int
+    image_dn: NDArray[np.uint32]
+
+
+@dataclass(frozen=True, eq=False)
+class DeviceFrame:
+    """A frame as the device has it: the regions read out (one for a full frame), and all that the device knows.
+
+    `accelerometer_m_s2` is the reading in the axes of this frame's camera; `spots` are decoded identities; `leds` is
+    the LED map by id.
+    """
+
+    parts: tuple[Part, ...]
+    camera: Camera
+    sensor: Sensor
+    accelerometer_m_s2: tuple[float, float, float]
+    accelerometer: Accelerometer
+    exposure_s: float
+    spots: tuple[DecodedSpot, ...]
+    leds: Mapping[int, Led]
+    other_cameras: "tuple[DeviceFrame, ...]" = ()
+    """Frames of the rig's other cameras of the same shot; their own `other_cameras` are empty."""
+
+    def electrons(self, part: Part) -> NDArray[np.float32]:
+        """Electrons above the black level of a part, (rows, columns)."""
+        image = part.image_dn.astype(np.float32)
+        if self.sensor.black_level_dn != 0:
+            image -= np.float32(self.sensor.black_level_dn)
+        if self.sensor.gain_e_per_dn != 1:
+            image *= np.float32(self.sensor.gain_e_per_dn)
+        return image
+
+    def clipped(self, part: Part) -> NDArray[np.bool_]:
+        """Pixels of a part, (rows, columns), that are or may be saturated, so that their electrons are unknown."""
+        # Compare with an integer: a float would convert the whole image.
+        return part.image_dn >= int(np.ceil(self.sensor.clipping_dn()))
+
+
+class _Record(Row):
+    """A frame record without its images."""
+
+    camera: Camera
+    sensor: Sensor
+    accelerometer: Accelerometer
+    led_map: tuple[AnyLed, ...]
+    exposure_s: Positive
+    accelerometer_m_s2: Triple
+    spots: tuple[DecodedSpot, ...]
+
+
+class _Origin(Row):
+    """First pixel of a part."""
+
+    row: int = Field(ge=-INT64_MAX, le=INT64_MAX)
+    column: int = Field(ge=-INT64_MAX, le=INT64_MAX)
+
+
+def frame(record: Mapping[str, Any]) -> DeviceFrame:
+    """Make a frame from a mapping in the vocabulary of datasets/FORMAT.md.
+
+    Parameters
+    ----------
+    record
+        `camera`, `sensor`, `accelerometer` and `led_map` as in dataset.json; `exposure_s` (s), `accelerometer_m_s2`
+        (x, y, z in camera axes, m/s^2) and `spots` (`{led, u_px, v_px}`) as in frames.parquet; and `parts`, a sequence
+        of `{"row": int, "column": int, "image_dn": array}`, where `image_dn` (rows, columns) uint32 holds digital
+        numbers and its first pixel is pixel (row, column) of the sensor. NumPy arrays and scalars may stand for lists
+        and numbers. Other keys are ignored.
+
+    Returns
+    -------
+    DeviceFrame
+        The frame. The images are copied and read-only.
+
+    Raises
+    ------
+    InputError
+        A key is missing or its value not allowed; the message names the key.
+    """
+    if not isinstance(record, Mapping):
+        raise InputError(f"record: is a {type(record).__name__}, needed a mapping")
+    try:
+        text = json.dumps({key: record[key] for key in _Record.model_fields if key in record}, default=_plain)
+        known = _Record.model_validate_json(text)
+        leds = leds_by_id(known.led_map)
+    except ValidationError as error:
+        raise InputError(f"record: {first_problem(error)}") from None
+    except (TypeError, ValueError) as error:
+        raise InputError(f"record: {error}") from None
+    if problem := decoding_problem(known.spots, leds):
+        raise InputError(f"record: {problem}")
+    return DeviceFrame(
+        parts=_parts(record, known.camera, known.sensor),
+        camera=known.camera,
+        sensor=known.sensor,
+        accelerometer_m_s2=known.accelerometer_m_s2,
+        accelerometer=known.accelerometer,
+        exposure_s=known.exposure_s,
+        spots=known.spots,
+        leds=leds,
+    )
+
+
+def _plain(value: object) -> object:
+    """A NumPy array or scalar as JSON's lists and numbers; raises TypeError for anything else."""
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    raise TypeError(f"a {type(value).__name__} is not a value of the format")
+
+
+def _parts(record: Mapping[str, Any], camera: Camera, sensor: Sensor) -> tuple[Part, ...]:
+    entries = record.get("parts")
+    if not isinstance(entries, Sequence) or not entries:
+        raise InputError("record: parts: needed a sequence of at least one {row, column, image_dn}")
+    parts = []
+    for index, entry in enumerate(entries):
+        where = f"record: parts.{index}"
+        if not isinstance(entry, Mapping):
+            raise InputError(f"{where}: is a {type(entry).__name__}, needed a mapping")
+        try:
+            origin = _Origin.model_validate_json(
+                json.dumps({key: entry[key] for key in ("row", "column") if key in entry}, default=_plain)
+            )
+        except ValidationError as error:
+            raise InputError(f"{where}.{first_problem(error)}") from None
+        except (TypeError, ValueError) as error:
+            raise InputError(f"{where}: {error}") from None
+        image = entry.get("image_dn")
+        if not isinstance(image, np.ndarray) or image.dtype != np.uint32 or image.ndim != 2 or image.size == 0:
+            raise InputError(f"{where}.image_dn: needed a uint32 array (rows, columns) that is not empty")
+        image = image.copy()
+        image.setflags(write=False)
+        parts.append(Part(origin.row, origin.column, image))
+    if problem := regions_problem([region_of(part) for part in parts], camera) or depth_problem(parts, sensor):
+        raise InputError(f"record: parts: {problem}")
+    return tuple(parts)
+
+
+def region_of(part: Part) -> NDArray[np.int64]:
+    """First and last pixel of a part, [[column, row], [column, row]]."""
+    rows, columns = part.image_dn.shape
+    return np.array([[part.column, part.row], [part.column + columns - 1, part.row + rows - 1]], dtype=np.int64)
+
+
+def regions_problem(regions: Sequence[NDArray[np.int64]], camera: Camera) -> str | None:
+    """What is wrong with a frame's regions of interest, None if nothing: two overlap, or they hold too many pixels."""
+    for index, region in enumerate(regions[1:], start=1):
+        before = np.array(regions[:index])
+        if ((region[0] <= before[:, 1]) & (before[:, 0] <= region[1])).all(axis=1).any():
+            return f"region {region.tolist()} overlaps another"
+    pixels = sum(int((region[1] - region[0] + 1).prod()) for region in regions)
+    if pixels > MAX_SENSOR_AREAS * camera.width_px * camera.height_px:
+        return f"{pixels} pixels, more than {MAX_SENSOR_AREAS} times the sensor's"
+    return None
+
+
+def depth_problem(parts: Sequence[Part], sensor: Sensor) -> str | None:
+    """What is wrong with a frame's digital numbers, None if nothing: one exceeds the sensor's bits."""
+    max_dn, limit = max(int(part.image_dn.max()) for part in parts), 2**sensor.bits - 1
+    return f"digital number {max_dn}, but {sensor.bits} bits end at {limit}" if max_dn > limit else None

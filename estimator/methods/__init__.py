@@ -1,0 +1,1 @@
+"""Variants: one positioning method a module, their catalogue, and the registry of other packages' variants."""

@@ -1,0 +1,45 @@
+"""Catalogue of this package's variants, by name."""
+
+from estimator.errors import InputError
+from estimator.methods.gravity_fit import GRAVITY_FIT
+from estimator.methods.huynh2016 import HUYNH2016, HUYNH2016_AS_PRINTED, huynh2016_with
+from estimator.methods.kim import KIM
+from estimator.methods.maximum_likelihood import ML
+from estimator.methods.nakazawa2013 import NAKAZAWA2013
+from estimator.methods.pnp import IPPE, PNP, SQPNP
+from estimator.methods.rahman2011 import RAHMAN2011
+from estimator.methods.up2p import UP2P
+from estimator.methods.variant import Variant
+from estimator.methods.yoshino2008 import YOSHINO2008
+
+VARIANTS = {
+    variant.name: variant
+    for variant in (
+        HUYNH2016,
+        HUYNH2016_AS_PRINTED,
+        YOSHINO2008,
+        NAKAZAWA2013,
+        RAHMAN2011,
+        KIM,
+        PNP,
+        IPPE,
+        SQPNP,
+        UP2P,
+        GRAVITY_FIT,
+        ML,
+    )
+}
+STAGED = {"huynh2016": huynh2016_with}
+"""Variants whose stages can be chosen after a colon, by name: a function from the whole text to the variant."""
+
+
+def variant_named(name: str) -> Variant:
+    """The variant of a name, or of `NAME:stage=value,...` (`estimator.methods.options`); raises InputError."""
+    base, colon, _ = name.partition(":")
+    if colon and base in STAGED:
+        return STAGED[base](name)
+    if colon and base in VARIANTS:
+        raise InputError(f"variant {name}: {base} has no stages to choose; those that have: {', '.join(STAGED)}")
+    if name not in VARIANTS:
+        raise InputError(f"variant {name}: unknown; allowed: {', '.join(VARIANTS)}")
+    return VARIANTS[name]

@@ -1,0 +1,111 @@
+"""MAP fit: weighted reprojection error with a Gaussian gravity prior.
+
+Spots are weighted by the covariance of their centroids, the accelerometer's reading by its standard deviation on each
+tilt axis. The model includes the eccentricity of discs and squares (`estimator.solvers.reprojection`). LEDs in a plane
+have two poses of nearly equal reprojection error, LEDs close to one line a continuum of them; both poses are initial
+values, and gravity decides. Wrong identities are excluded by consensus.
+"""
+
+from collections.abc import Sequence
+from itertools import combinations, islice
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from estimator.camera.pose import Pose
+from estimator.errors import EstimationFailure
+from estimator.io.device import DeviceFrame
+from estimator.methods.pnp import candidates, in_a_plane
+from estimator.methods.up2p import upright_pose
+from estimator.methods.variant import Estimate, Variant
+from estimator.solvers.reprojection import Observations, centroid_images, observe
+from estimator.solvers.robust_fit import Consensus, consensus
+from estimator.solvers.trilateration import determine_orientation
+from estimator.spots.correspondences import find_correspondences
+from estimator.spots.identify import Correspondence
+
+Floats = NDArray[np.float64]
+
+# Another minimum with more than a hundredth of the best one's likelihood is possible: exp(-9.21 / 2) = 1 / 100.
+AMBIGUOUS_CHI2 = 9.21
+# Every triple of 7 LEDs; of 12 LEDs, half of them outliers, one triple in nine holds inliers alone.
+MAX_TRIPLES = 72
+# Distance within which the pose from three noisy spots puts another spot.
+TRIPLE_PX = 3.0
+MAX_TRIPLE_STARTS = 3
+MIN_FOR_IPPE = 4
+
+
+def gravity_fit(frame: DeviceFrame) -> Estimate:
+    """Position, its covariance, and whether another position is nearly as likely; raises EstimationFailure."""
+    return fit_correspondences(frame, find_correspondences(frame))
+
+
+def fit_correspondences(frame: DeviceFrame, correspondences: Sequence[Correspondence]) -> Estimate:
+    """The estimate from identified spots; of the frame, camera and accelerometer are used."""
+    agreed = agreement(observe(frame, correspondences))
+    return Estimate(agreed.best.pose.position_m, covariance_m2=agreed.covariance_m2, ambiguous=ambiguous(agreed))
+
+
+def agreement(observations: Observations) -> Consensus:
+    """Consensus of spots and gravity, or of the spots alone if gravity disagrees; raises EstimationFailure."""
+    starts = _starts(observations)
+    try:
+        return consensus(observations, starts, lambda: _from_triples(observations))
+    except EstimationFailure:
+        if not determine_orientation(observations.leds_m):
+            raise
+        # The accelerometer's reading may be the outlier.
+        return consensus(observations.without_gravity(), starts, lambda: _from_triples(observations))
+
+
+def ambiguous(agreed: Consensus) -> bool:
+    """Whether another local minimum has at least a hundredth of the best one's likelihood."""
+    return any(other.cost - agreed.best.cost < AMBIGUOUS_CHI2 for other in agreed.others)
+
+
+def _starts(observations: Observations) -> list[Pose]:
+    """Initial poses: the upright one by gravity, and without gravity IPPE's two, or SQPNP's for LEDs in no plane."""
+    starts = [pose for pose in [upright_pose(observations)] if pose is not None]
+    if len(observations.leds_m) >= MIN_FOR_IPPE:
+        centre = observations.leds_m.mean(axis=0)
+        method = cv2.SOLVEPNP_IPPE if in_a_plane(observations.leds_m) else cv2.SOLVEPNP_SQPNP
+        model, image = np.ascontiguousarray(observations.leds_m - centre), np.ascontiguousarray(observations.image)
+        found = candidates(model, image, method, refined=False)
+        starts += [Pose(centre - R_cam_world.T @ shift, R_cam_world) for R_cam_world, shift in found]
+    return starts
+
+
+def _from_triples(observations: Observations) -> list[Pose]:
+    """Poses from three spots each (P3P) with the smallest reprojection errors of the other spots, truncated."""
+    count = len(observations.leds_m)
+    triples = list(combinations(range(count), 3))
+    if len(triples) > MAX_TRIPLES:
+        generator = np.random.Generator(np.random.Philox(key=count))
+        triples = [triples[k] for k in generator.choice(len(triples), MAX_TRIPLES, replace=False)]
+    gate2 = (TRIPLE_PX * observations.camera.pixel_angle_rad) ** 2
+    ranked: list[tuple[float, int, Pose]] = []
+    for triple in triples:
+        chosen = list(triple)
+        try:
+            _, vectors, shifts = cv2.solveP3P(
+                observations.leds_m[chosen], observations.image[chosen], np.eye(3), None, flags=cv2.SOLVEPNP_P3P
+            )
+        except cv2.error:
+            continue
+        for vector, shift in zip(vectors, shifts, strict=True):
+            R_cam_world = np.asarray(Rotation.from_rotvec(vector.ravel()).as_matrix())
+            pose = Pose(-R_cam_world.T @ shift.ravel(), R_cam_world)
+            offset = centroid_images(pose, observations.leds_m, observations.lift_m2)[0] - observations.image
+            error = np.minimum((offset**2).sum(axis=1), gate2).sum()
+            ranked.append((float(error), len(ranked), pose))
+    return [pose for *_, pose in islice(sorted(ranked, key=lambda one: one[:2]), MAX_TRIPLE_STARTS)]
+
+
+GRAVITY_FIT = Variant(
+    "gravity-fit",
+    "reprojection fit of position and orientation, gravity as a prior, wrong LEDs left out, with covariance",
+    gravity_fit,
+)

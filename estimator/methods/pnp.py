@@ -1,0 +1,106 @@
+"""Perspective-n-point: position from LEDs and their pixels alone, without gravity. Baseline: OpenCV defaults.
+
+Centroids stand for the images of the LEDs' centres, from which they differ slightly
+(`estimator.solvers.reprojection`), and all have equal weight.
+"""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from estimator.camera.undistort import pinhole_pixels
+from estimator.errors import EstimationFailure
+from estimator.io.device import DeviceFrame, normalized
+from estimator.methods.variant import Estimate, Variant
+from estimator.solvers.trilateration import check_pattern
+from estimator.spots.correspondences import centroids_px, find_correspondences, led_positions_m
+
+Floats = NDArray[np.float64]
+
+# Depth over length of the LEDs' pattern, from which on the model of the planar solver is wrong.
+MAX_PLANE_DEPTH = 1e-3
+
+
+def pnp(frame: DeviceFrame) -> Estimate:
+    """The best of SQPNP's pose and, for LEDs in a plane, IPPE's two; raises EstimationFailure."""
+    return _estimate(frame, (cv2.SOLVEPNP_SQPNP, cv2.SOLVEPNP_IPPE))
+
+
+def ippe(frame: DeviceFrame) -> Estimate:
+    """Infinitesimal plane-based pose estimation (Collins & Bartoli 2014): the better of its two poses."""
+    return _estimate(frame, (cv2.SOLVEPNP_IPPE,))
+
+
+def sqpnp(frame: DeviceFrame) -> Estimate:
+    """PnP as a quadratically constrained quadratic program (Terzakis & Lourakis 2020)."""
+    return _estimate(frame, (cv2.SOLVEPNP_SQPNP,))
+
+
+def _estimate(frame: DeviceFrame, methods: Sequence[int]) -> Estimate:
+    correspondences = find_correspondences(frame)
+    pixels = pinhole_pixels(centroids_px(correspondences), frame.camera)
+    return Estimate(position_from_pixels(led_positions_m(correspondences), pixels, frame.camera.matrix(), methods))
+
+
+def position_from_pixels(leds_m: Floats, pixels: Floats, K: Floats, methods: Sequence[int]) -> Floats:
+    """Position, (3,) world metres, from LEDs (n, 3) and their pixels (n, 2) in a pinhole with `K`, by OpenCV `methods`.
+
+    Each candidate is refined by Levenberg-Marquardt. Of those with every LED in front of the camera and above it, the
+    one with the smallest reprojection error is returned. IPPE is used for LEDs in a plane. Raises EstimationFailure for
+    fewer than four LEDs, LEDs on one line, LEDs in no plane if IPPE is the only method, and if no candidate is left.
+    """
+    check_pattern(leds_m, needed=4, flat=False)
+    if not in_a_plane(leds_m):
+        methods = [method for method in methods if method != cv2.SOLVEPNP_IPPE]
+        if not methods:
+            raise EstimationFailure("position", "the LEDs are not in one plane")
+    centre_m = leds_m.mean(axis=0)
+    model = np.ascontiguousarray(leds_m - centre_m)
+    # OpenCV supports no skew and has another pixel convention: pass normalized coordinates.
+    image = np.ascontiguousarray(normalized(pixels, K))
+    min_error = np.inf
+    best: Floats | None = None
+    for method in methods:
+        for R_cam_world, shift in candidates(model, image, method, refined=True):
+            p_cam = model @ R_cam_world.T + shift
+            position_m = centre_m - R_cam_world.T @ shift
+            error = float(np.linalg.norm(p_cam[:, :2] / p_cam[:, 2:] - image))
+            possible = (p_cam[:, 2] > 0).all() and position_m[2] < leds_m[:, 2].min()
+            if possible and error < min_error:
+                min_error, best = error, position_m
+    if best is None:
+        raise EstimationFailure("position", "no pose has the camera below the LEDs and the LEDs in front of it")
+    return best
+
+
+def in_a_plane(leds_m: Floats) -> bool:
+    """Whether a planar solver can be used for LEDs (n, 3)."""
+    length, _, depth = np.linalg.svd(leds_m - leds_m.mean(axis=0), compute_uv=False)
+    return bool(depth < MAX_PLANE_DEPTH * length)
+
+
+def candidates(model: Floats, image: Floats, method: int, refined: bool) -> list[tuple[Floats, Floats]]:
+    """Candidate poses by an OpenCV method, as (rotation (3, 3), translation (3,)); the method may find none.
+
+    `model` (n, 3) are points in metres relative to their centre, `image` (n, 2) their normalized image coordinates.
+    """
+    eye = np.eye(3)
+    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 50, 1e-14)
+    poses = []
+    try:
+        _, vectors, shifts, _ = cv2.solvePnPGeneric(model, image, eye, None, flags=method)
+        for vector, shift in zip(vectors, shifts, strict=True):
+            if refined:
+                vector, shift = cv2.solvePnPRefineLM(model, image, eye, None, vector, shift, criteria)
+            poses.append((np.asarray(Rotation.from_rotvec(vector.ravel()).as_matrix()), shift.ravel()))
+    except cv2.error:
+        return []
+    return poses
+
+
+PNP = Variant("pnp", "perspective-n-point (SQPNP, IPPE, Levenberg-Marquardt) on raw centroids, no gravity", pnp)
+IPPE = Variant("ippe", "perspective-n-point for LEDs in a plane: IPPE, Levenberg-Marquardt, no gravity", ippe)
+SQPNP = Variant("sqpnp", "perspective-n-point: SQPNP, Levenberg-Marquardt, no gravity", sqpnp)

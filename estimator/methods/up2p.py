@@ -1,0 +1,126 @@
+"""Upright two-point pose: gravity gives the tilt, two LEDs then determine yaw and position.
+
+`up2p` is PoseLib's upright two-point solver (Kukelova, Bujnak & Pajdla 2010) inside a RANSAC of this package, because
+PoseLib's Python interface has the solver alone. The solver assumes gravity to be exact, so the error of the reading
+displaces the other spots under the pose of a pair; the gate for inliers includes that displacement. The refinement then
+fits position and orientation to the inliers without gravity. If the inliers do not determine the orientation (fewer
+than four, or on one line), gravity is used as a prior.
+"""
+
+from collections.abc import Sequence
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.camera.leveling import MIN_ELEVATION_SINE
+from estimator.camera.pose import Pose, rotation
+from estimator.errors import EstimationFailure
+from estimator.io.device import DeviceFrame
+from estimator.methods.variant import Estimate, Variant
+from estimator.solvers.reprojection import Observations, centroid_images, observe
+from estimator.solvers.robust_fit import consensus
+from estimator.solvers.trilateration import determine_orientation
+from estimator.spots.correspondences import find_correspondences
+from estimator.spots.identify import Correspondence
+
+try:
+    import poselib
+except ImportError:
+    poselib = None
+
+Floats = NDArray[np.float64]
+
+# Every pair of 16 LEDs.
+MAX_PAIRS = 120
+# Gate for inliers: standard deviations of the accelerometer, plus pixels for the centroids.
+GATE_SIGMA = 3.0
+GATE_PX = 3.0
+MAX_PAIR_STARTS = 3
+# World axes to PoseLib's, whose vertical axis is y.
+Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+
+
+def up2p(frame: DeviceFrame) -> Estimate:
+    """Upright two-point RANSAC and refinement; raises EstimationFailure, also if PoseLib is not installed."""
+    if poselib is None:
+        raise EstimationFailure("up2p", "PoseLib is not installed (pip install vlcrender[poselib])")
+    return fit_correspondences(frame, find_correspondences(frame))
+
+
+def fit_correspondences(frame: DeviceFrame, correspondences: Sequence[Correspondence]) -> Estimate:
+    """The estimate from identified spots; of the frame, camera and accelerometer are used."""
+    observations = observe(frame, correspondences)
+    starts = _from_pairs(observations)
+    if determine_orientation(observations.leds_m):
+        observations = observations.without_gravity()
+    agreed = consensus(observations, starts[:1], lambda: starts[1:])
+    return Estimate(agreed.best.pose.position_m, covariance_m2=agreed.covariance_m2)
+
+
+def _from_pairs(observations: Observations) -> list[Pose]:
+    """Poses from two spots each with the smallest truncated reprojection errors of all spots, best first."""
+    level, above = _leveled(observations)
+    tilt_x, tilt_y = observations.tilt_rad.tolist()
+    tilt = rotation(tilt_x, tilt_y)
+    pairs = list(combinations(np.flatnonzero(above).tolist(), 2))
+    if len(pairs) > MAX_PAIRS:
+        generator = np.random.Generator(np.random.Philox(key=len(pairs)))
+        pairs = [pairs[k] for k in generator.choice(len(pairs), MAX_PAIRS, replace=False)]
+    gate = GATE_SIGMA * float(observations.tilt_sigma_rad.max()) + GATE_PX * observations.camera.pixel_angle_rad
+    ranked: list[tuple[float, int, Pose]] = []
+    for pair in pairs:
+        found = poselib.up2p(level[list(pair)] @ Y_UP.T, observations.leds_m[list(pair)] @ Y_UP.T)
+        for upright in found:
+            yaw = Y_UP.T @ upright.R @ Y_UP
+            pose = Pose(Y_UP.T @ upright.center(), tilt @ yaw)
+            image, depth = centroid_images(pose, observations.leds_m, observations.lift_m2)
+            error2 = np.where(depth > 0, ((image - observations.image) ** 2).sum(axis=1), np.inf)
+            ranked.append((float(np.minimum(error2, gate**2).sum()), len(ranked), pose))
+    return [pose for *_, pose in sorted(ranked, key=lambda one: one[:2])[:MAX_PAIR_STARTS]]
+
+
+def upright_pose(observations: Observations) -> Pose | None:
+    """Upright pose by least squares over all spots, an initial value; None if fewer than two are above the horizon.
+
+    With LEDs at one height, the leveled image is the LEDs' plane rotated by the yaw, scaled by the height and shifted,
+    which is linear in complex numbers. The position is then the point nearest to all lines of sight.
+    """
+    level, above = _leveled(observations)
+    if above.sum() < 2:
+        return None
+    rays, leds_m = level[above], observations.leds_m[above]
+    image = (rays[:, 0] + 1j * rays[:, 1]) / rays[:, 2]
+    planar = leds_m[:, 0] + 1j * leds_m[:, 1]
+    spread = planar - planar.mean()
+    product = np.vdot(spread, image - image.mean())
+    if product == 0:
+        return None
+    # Rz(yaw) maps x + iy to exp(-i yaw) (x + iy).
+    tilt_x, tilt_y = observations.tilt_rad.tolist()
+    R_cam_world = rotation(tilt_x, tilt_y, -float(np.angle(product)))
+    lines = _rays(observations)[above] @ R_cam_world
+    lines /= np.linalg.norm(lines, axis=1, keepdims=True)
+    across = np.eye(3) - lines[:, :, None] * lines[:, None, :]
+    try:
+        position_m = np.linalg.solve(across.sum(axis=0), (across @ leds_m[:, :, None]).sum(axis=0)[:, 0])
+    except np.linalg.LinAlgError:
+        return None
+    return Pose(position_m, R_cam_world)
+
+
+def _leveled(observations: Observations) -> tuple[Floats, NDArray[np.bool_]]:
+    """Unit vectors (n, 3) to the spots in leveled axes by the accelerometer, and which of them point up."""
+    rays = _rays(observations)
+    level = rays / np.linalg.norm(rays, axis=1, keepdims=True) @ rotation(*observations.tilt_rad.tolist())
+    return level, level[:, 2] > MIN_ELEVATION_SINE
+
+
+def _rays(observations: Observations) -> Floats:
+    """Vectors (n, 3) to the spots at unit depth, camera axes."""
+    return np.column_stack([observations.image, np.ones(len(observations.image))])
+
+
+UP2P = Variant(
+    "up2p", "PoseLib's upright two-point solver in RANSAC, tilt from gravity, then a fit of the spots that agree", up2p
+)

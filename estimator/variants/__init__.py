@@ -1,1 +1,0 @@
-"""Variants: one positioning method a module, their catalogue, and the registry of methods from other packages."""
