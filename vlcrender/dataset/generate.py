@@ -13,7 +13,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from vlcrender import __version__
 from vlcrender.dataset.files import (
     FRAMES,
     FRAMES_SCHEMA,
@@ -160,8 +159,7 @@ def _provenance(plan: Plan) -> dict[str, Any]:
         "recipe": recipe,
         "scene": plan.scene.settings.model_dump(mode="json"),
         "versions": {
-            "vlcrender": __version__,
-            **{package: version(package) for package in ("mitsuba", "drjit", "numpy", "OpenEXR")},
+            **{package: version(package) for package in ("vlcrender", "mitsuba", "drjit", "numpy", "OpenEXR")},
             "python": platform.python_version(),
         },
     }

@@ -1,6 +1,6 @@
 """The accelerometer: what a device at rest reads, in camera axes, with the paper's errors or a real part's."""
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,7 +8,8 @@ from pydantic import BeforeValidator, Field
 from scipy.spatial.transform import Rotation
 
 from vlcrender.camera.intrinsics import Pose, rotation_cam_world, transform
-from vlcrender.config.toml_model import Settings
+from vlcrender.config.presets import preset
+from vlcrender.config.toml_model import Settings, check
 from vlcrender.core.random_keys import stream
 
 STANDARD_GRAVITY_M_S2 = 9.80665
@@ -73,6 +74,11 @@ class Imu(Settings):
     bits: Annotated[int, Field(ge=8, le=24)] = 16
     serial: Annotated[int, Field(ge=0, lt=2**63)] = 0
     """Which device of its kind it is."""
+
+    @classmethod
+    def preset(cls, name: str) -> Self:
+        """The accelerometer of a preset, such as "bmi270". Raises InputError with the names there are."""
+        return check(preset("accelerometers", name)["accelerometer"], cls, f"accelerometer preset {name}")
 
     @property
     def lsb_m_s2(self) -> float:
