@@ -106,28 +106,64 @@ def _environment(name: str, value: str) -> Iterator[None]:
 
 def _import_drjit(variant: str) -> Any:
     """Dr.Jit with what the variant needs: an LLVM that is new enough, or CUDA. Raises InputError without it."""
-    if variant.startswith("llvm") and "drjit" not in sys.modules:
-        with _environment("DRJIT_LIBLLVM_PATH", str(find_llvm())):
-            import drjit  # loads LLVM, once a process
-    else:
+    if not variant.startswith("llvm"):
         import drjit
-    if variant.startswith("llvm"):
-        _check_llvm(drjit.detail.llvm_version()[0])
-    elif not drjit.has_backend(drjit.JitBackend.CUDA):
-        raise InputError(
-            f"VLCRENDER_VARIANT={variant}: Dr.Jit finds no CUDA device and driver; unset it to render on the processor"
-        )
+
+        if not drjit.has_backend(drjit.JitBackend.CUDA):
+            raise InputError(
+                f"VLCRENDER_VARIANT={variant}: Dr.Jit finds no CUDA device and driver; unset it to render on the "
+                f"processor"
+            )
+        return drjit
+    if "drjit" in sys.modules:
+        import drjit
+
+        if _llvm_in_use(drjit) < MIN_LLVM and not _restarted(drjit, find_llvm()):
+            _refuse_llvm(_llvm_in_use(drjit))
+        return drjit
+    with _environment("DRJIT_LIBLLVM_PATH", str(find_llvm())):
+        import drjit  # loads LLVM, once a process, in a thread of its own
+
+        found = _llvm_in_use(drjit)
+    if found < MIN_LLVM:
+        _refuse_llvm(found)
     return drjit
 
 
-def _check_llvm(loaded: int) -> None:
-    """Raise InputError if the LLVM that Dr.Jit has loaded is too old: another import of Dr.Jit or Mitsuba chose it."""
-    if loaded < MIN_LLVM:
-        found = f"LLVM {loaded}" if loaded > 0 else "no LLVM"
-        raise InputError(
-            f"Dr.Jit was imported before vlcrender and has loaded {found}; {MIN_LLVM} or newer is needed: start Python "
-            f"with DRJIT_LIBLLVM_PATH={find_llvm()}, or render once before importing mitsuba"
-        )
+def _llvm_in_use(drjit: Any) -> int:
+    """Major version of the LLVM that Dr.Jit has loaded, negative without one."""
+    drjit.has_backend(drjit.JitBackend.LLVM)  # waits until Dr.Jit has looked for LLVM; the next call does not
+    return int(drjit.detail.llvm_version()[0])
+
+
+def _restarted(drjit: Any, library: Path) -> bool:
+    """Restart Dr.Jit with another LLVM if nothing in this process has used Dr.Jit yet; whether that was possible.
+
+    A program that has imported Mitsuba for a scalar variant has loaded any LLVM that the system has, and not used it.
+    """
+    if any(name.startswith(("mitsuba.llvm_", "mitsuba.cuda_")) for name in sys.modules):
+        return False
+    try:
+        core = ctypes.CDLL(str(Path(drjit.__file__).parent / "libdrjit-core.so"))
+        whos, shutdown, init = core._Z12jit_var_whosv, core._Z12jit_shutdowni, core._Z8jit_initj
+    except (OSError, AttributeError):
+        return False  # another platform or version, whose names differ
+    whos.restype = ctypes.c_char_p
+    if b"Variables created : 0 " not in whos():
+        return False
+    shutdown(0)
+    with _environment("DRJIT_LIBLLVM_PATH", str(library)):
+        init(sum(1 << backend.value for backend in (drjit.JitBackend.CUDA, drjit.JitBackend.LLVM)))
+    return _llvm_in_use(drjit) >= MIN_LLVM
+
+
+def _refuse_llvm(loaded: int) -> None:
+    """Raise InputError: another import of Dr.Jit or Mitsuba has chosen an LLVM that is too old."""
+    found = f"LLVM {loaded}" if loaded > 0 else "no LLVM"
+    raise InputError(
+        f"Dr.Jit was imported before vlcrender and uses {found}; {MIN_LLVM} or newer is needed: start Python with "
+        f"DRJIT_LIBLLVM_PATH={find_llvm()}, or render once before importing mitsuba"
+    )
 
 
 class _Mitsuba:
