@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: demo test lint bench clean
+.PHONY: demo test lint docs bench clean
 
 demo: $(READY)
 	$(BIN)/vlcrender generate datasets/quickstart.toml --out out/quickstart
@@ -19,6 +19,11 @@ lint: $(READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+docs: $(READY)
+	$(BIN)/python docs/make_reference.py
+	$(BIN)/python docs/make_api.py
+	$(BIN)/python docs/make_notebooks.py
 
 bench: $(READY)
 	$(BIN)/python benchmarks/full_frame.py

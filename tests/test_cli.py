@@ -61,10 +61,10 @@ GENERATE_MISTAKES: dict[str, tuple[list[str], list[str]]] = {
     "seed": (["--set", "seed=-3"], ["seed = -3"]),
     "pixels": (["--set", "camera.width_px=4000.5"], ["camera.width_px = 4000.5"]),
     "principal point": (["--set", "camera.principal_point_px=[99999, 0]"], ["principal_point_px = [99999"]),
-    "windows of a kind": (["--set", "regions.kind=panels"], ["regions", "panels", "leds"]),
-    "windows without a kind": (["--set", "regions.overscan=true"], ["regions.kind is missing"]),
-    "margin": (["--set", 'windows={ kind = "leds", margin_px = -1 }'], ["regions.margin_px = -1"]),
-    "margin in mm": (["--set", 'windows={ kind = "leds", margin_mm = 1 }'], ["margin_mm", "did you mean margin_px"]),
+    "regions of a kind": (["--set", "regions.kind=panels"], ["regions", "panels", "leds"]),
+    "regions without a kind": (["--set", "regions.overscan=true"], ["regions.kind is missing"]),
+    "margin": (["--set", 'regions={ kind = "leds", margin_px = -1 }'], ["regions.margin_px = -1"]),
+    "margin in mm": (["--set", 'regions={ kind = "leds", margin_mm = 1 }'], ["margin_mm", "did you mean margin_px"]),
     "motion": (
         ["--set", "motion.angular_velocity_rad_s=[0, 0, 1]"],
         ["angular_velocity_rad_s", "angular_velocity_deg_s"],
@@ -79,7 +79,7 @@ GENERATE_MISTAKES: dict[str, tuple[list[str], list[str]]] = {
     "workers is a word": (["--workers", "many"], ["--workers", "many"]),
     "unknown option": (["--frobnicate"], ["--frobnicate"]),
     "overscan behind distortion": (
-        ["--set", 'windows={kind="leds", overscan=true}', "--set", "camera.distortion.k1=-0.05"],
+        ["--set", 'regions={kind="leds", overscan=true}', "--set", "camera.distortion.k1=-0.05"],
         ["regions.overscan = true", "distortion"],
     ),
     "unreachable": (["--set", "poses.min_leds=900"], ["frame 0", "900 LEDs", "lower min_leds"]),

@@ -1,4 +1,4 @@
-"""Random keys: the hash that every data set's bits depend on, and the numbers that kernels draw with it."""
+"""Random keys: the hash that every dataset's bits depend on, and the numbers that kernels draw with it."""
 
 import hashlib
 

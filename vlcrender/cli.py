@@ -1,34 +1,35 @@
-"""The command line of vlcrender. Errors are one line; the exit code is 2 for bad input, 130 when interrupted."""
+"""The command line of vlcrender: a client of the Python API.
 
-import json
+An error is one line. The exit code is 2 for bad input, 130 if interrupted. Each command imports the modules it needs,
+so that `--help` loads neither Mitsuba nor SciPy.
+"""
+
+import logging
 import os
 import sys
-from dataclasses import asdict
 from io import TextIOWrapper
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, CycloptsError, Parameter
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from rich.table import Table
 
-from vlcrender import __version__
-from vlcrender.camera.intrinsics import Camera
-from vlcrender.dataset.files import read_dataset_file
-from vlcrender.dataset.recipe import ScaleMode, load_plan
 from vlcrender.errors import InputError
-from vlcrender.scene.loader import load_scene
-from vlcrender.scene.visibility import ENOUGH_LEDS, level_visibility, tilted_visibility
 
 if TYPE_CHECKING:
-    from vlcrender.dataset.progress import Progress as Report
+    from vlcrender.dataset.progress import Progress
     from vlcrender.emva1288.datasheet import Datasheet
+
+
+def _version() -> str:
+    from vlcrender import __version__
+
+    return __version__
+
 
 app = App(
     name="vlcrender",
     help="Render what a tilted camera sees of ceiling LED panels, with ground truth.",
-    version=__version__,
+    version=_version,
     help_format="plaintext",
     suppress_keyboard_interrupt=False,
 )
@@ -38,28 +39,28 @@ HEIGHTS_M = (0.0, 0.75)
 
 @app.command
 def generate(
-    recipe: Path,
+    recipe: str,
     /,
     *,
     out: Path,
     set_: Annotated[list[str] | None, Parameter(name="--set", negative=())] = None,
     scale: int = 1,
-    scale_mode: ScaleMode = "binned",
+    scale_mode: Literal["binned", "same-photons"] = "binned",
     workers: int = 1,
     scheduler: str | None = None,
 ) -> None:
-    """Make the dataset of a recipe; goes on where an interrupted run stopped.
+    """Generate the dataset of a recipe; an interrupted run is continued.
 
     Parameters
     ----------
     recipe
-        Recipe file (TOML).
+        Recipe file (TOML), or the name of a recipe that comes with vlcrender, such as quickstart.
     out
         Folder of the dataset; new, empty, or an unfinished run of the same recipe.
     set_
         key=value that replaces a value of the recipe, e.g. camera.f_number=2.8. May be repeated.
     scale
-        Make this many by this many pixels one, for quick looks; has to divide the camera's width and height.
+        Bin N x N pixels into one, for quick looks; N has to divide the camera's width and height.
     scale_mode
         Whether larger pixels keep all photons (full well and gain grow with them), or as many as the small ones had
         (the exposure is shorter).
@@ -68,35 +69,56 @@ def generate(
     scheduler
         Address of a dask scheduler whose workers see the same folder.
     """
+    from vlcrender import api
+
     if workers < 1:
         raise InputError(f"--workers {workers}: is not 1 or more")
-    plan = load_plan(recipe, set_ or [], scale, scale_mode)
-    from vlcrender.dataset.generate import generate as make  # starts Mitsuba: not before the recipe is known to be good
-
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("frames"),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    bar = Progress(*columns, console=Console(stderr=True))
-    light = bar.add_task("light", total=1.0, visible=False)
-    task = bar.add_task(plan.recipe.name, total=plan.recipe.frame_count)
-
-    def draw(report: "Report") -> None:
-        bar.start()  # not before the first report: a refusal is one line
-        if report.stage == "light":
-            bar.update(light, description=report.step, completed=report.done, visible=report.done < report.total)
-        else:
-            bar.update(task, completed=report.done, total=report.total)
-
-    try:
-        made = make(plan, out, workers, scheduler, draw)
-    finally:
-        bar.stop()
+    plan = api.load_recipe(recipe, set_, scale=scale, scale_mode=scale_mode)
+    with _Bar(plan.recipe.name, plan.recipe.frame_count) as bar:
+        made = api.generate(plan, out, workers=workers, scheduler=scheduler, progress=bar.show)
     print(f"{out}: {plan.recipe.frame_count} frames{'' if made else ' (was already complete and intact)'}")
+
+
+class _Bar:
+    """Progress of a dataset on the terminal: a bar of frames, and one of the room's light while it is computed."""
+
+    def __init__(self, name: str, frames: int) -> None:
+        from rich.console import Console
+        from rich.progress import (
+            BarColumn,
+            MofNCompleteColumn,
+            Progress,
+            TextColumn,
+            TimeElapsedColumn,
+            TimeRemainingColumn,
+        )
+
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("frames"),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+        )
+        self._bar = Progress(*columns, console=Console(stderr=True))
+        self._light = self._bar.add_task("light", total=1.0, visible=False)
+        self._frames = self._bar.add_task(name, total=frames)
+
+    def __enter__(self) -> "_Bar":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._bar.stop()
+
+    def show(self, progress: "Progress") -> None:
+        """Draw what `api.generate` reports."""
+        self._bar.start()  # not before the first report: a refusal is one line
+        if progress.stage == "frames":
+            self._bar.update(self._frames, completed=progress.done, total=progress.total)
+        else:
+            share = progress.done / progress.total
+            self._bar.update(self._light, description=progress.step, completed=share, visible=share < 1)
 
 
 @app.command
@@ -108,10 +130,11 @@ def verify(directory: Path, /) -> None:
     directory
         Folder of the dataset.
     """
-    from vlcrender.dataset.verify import verify as problems_of
+    from vlcrender import api
+    from vlcrender.dataset.files import read_dataset_file
 
     dataset = read_dataset_file(directory)
-    found = problems_of(directory)
+    found = api.verify(directory)
     for problem in found:
         _complain(problem)
     if found:
@@ -120,22 +143,27 @@ def verify(directory: Path, /) -> None:
 
 
 @app.command
-def show(
-    scene: Path, /, *, out: Path | None = None, reference: Annotated[bool, Parameter(negative=())] = False
-) -> None:
-    """Draw a room's plan and a camera's view of it; print what share of poses sees four LEDs or more.
+def show(scene: str, /, *, out: Path | None = None, reference: Annotated[bool, Parameter(negative=())] = False) -> None:
+    """Draw a room's floor plan and a camera's view of it; print the share of poses that see four LEDs or more.
 
     Parameters
     ----------
     scene
-        Scene file (TOML).
+        Scene file (TOML), or the name of a scene that comes with vlcrender, such as office.
     out
-        PNG to write; the scene's name with .png in the current folder where not given.
+        PNG to write; by default the scene's name with .png in the current folder.
     reference
-        Have Mitsuba's own path integrator render the view: slow, coarse, noisy, and independent of the fast way.
+        Render the view with Mitsuba's own path integrator: slow, coarse, noisy, and independent of the fast method.
     """
+    from rich.console import Console
+    from rich.table import Table
+
+    from vlcrender.api import load_scene
+    from vlcrender.camera.intrinsics import Camera
+    from vlcrender.scene.visibility import ENOUGH_LEDS, level_visibility, tilted_visibility
+
     loaded = load_scene(scene)
-    path = out or Path(f"{scene.stem}.png")
+    path = out or Path(f"{Path(scene).stem}.png")
     if path.suffix.lower() != ".png":
         raise InputError(f"--out {path}: has to end in .png")
     camera = Camera()
@@ -149,14 +177,14 @@ def show(
     table.add_column("see enough", justify="right")
     table.add_column("share", justify="right")
     for height in HEIGHTS_M:
-        for coverage in (
+        for visibility in (
             level_visibility(camera, loaded, height, 0.0),
             level_visibility(camera, loaded, height, 90.0),
             tilted_visibility(camera, loaded, height),
         ):
-            share = f"{100 * coverage.share:.2f} %"
-            table.add_row(f"{height:g}", coverage.attitude, str(coverage.poses), str(coverage.seen), share)
-    from vlcrender.scene_plot import draw  # starts Mitsuba
+            share = f"{100 * visibility.share:.2f} %"
+            table.add_row(f"{height:g}", visibility.attitude, str(visibility.poses), str(visibility.seen), share)
+    from vlcrender.rendering.scene_plot import draw  # loads Mitsuba: after the scene is known to be good
 
     draw(loaded, camera, path, reference)
     Console(width=max(Console().width, 100)).print(table)
@@ -173,28 +201,38 @@ def datasheet(
     side_px: int = 512,
     json_: Annotated[bool, Parameter(name="--json", negative=())] = False,
 ) -> None:
-    """Measure a sensor by photon transfer on its own frames (EMVA 1288) and print what is found beside what was set.
+    """Measure a sensor by photon transfer on its own frames (EMVA 1288); print measured values beside the set ones.
 
     Parameters
     ----------
     sensor
-        Name of a preset, or a TOML file with a [sensor] table; a recipe is one.
+        Name of a preset, a TOML file with a [sensor] table, such as a recipe, or the name of a recipe that comes with
+        vlcrender.
     out
-        HTML page to write, with plots; the sensor's name with -datasheet.html in the current folder where not given.
+        HTML page to write, with plots; by default the sensor's name with -datasheet.html in the current folder.
     wavelength_nm
-        Of the light.
+        Wavelength of the light.
     side_px
         Rows and columns of the frames; with twice as many the tolerances are half as large.
     json_
         Print JSON instead of a table.
     """
-    from vlcrender.emva1288.datasheet import load_sensor, make_datasheet  # starts Mitsuba
+    import json
+    from dataclasses import asdict
+
+    from rich.console import Console
+
+    from vlcrender.config.packaged import find_file, packaged_names
+    from vlcrender.config.presets import presets
+    from vlcrender.emva1288.datasheet import load_sensor, make_datasheet
     from vlcrender.emva1288.page import page
 
     if not 32 <= side_px <= 4096:
         raise InputError(f"--side-px {side_px}: is not 32 to 4096")
     if not 200 <= wavelength_nm <= 1200:
         raise InputError(f"--wavelength-nm {wavelength_nm:g}: is not 200 to 1200")
+    if sensor not in presets("sensors") and sensor in packaged_names("recipe"):
+        sensor = str(find_file("recipe", sensor))
     name, settings = load_sensor(sensor)
     path = out or Path(f"{name}-datasheet.html")
     if not path.parent.is_dir():
@@ -210,12 +248,15 @@ def datasheet(
         print(json.dumps({"sensor": name, "conditions": sheet.conditions, "rows": rows}, indent=2, ensure_ascii=False))
     else:
         _print_datasheet(name, sheet)
-    path.write_text(page(sheet), encoding="utf-8")  # last: where it cannot be written, what was measured is shown
+    path.write_text(page(sheet), encoding="utf-8")  # last: if it cannot be written, the measurement has been shown
     if not json_:
         print(f"{path}: written")
 
 
 def _print_datasheet(name: str, sheet: "Datasheet") -> None:
+    from rich.console import Console
+    from rich.table import Table
+
     from vlcrender.emva1288.datasheet import cells
 
     table = Table(title=f"{name}: {'; '.join(sheet.conditions)}")
@@ -229,6 +270,7 @@ def _print_datasheet(name: str, sheet: "Datasheet") -> None:
 
 def main() -> None:
     """Run the command line and exit."""
+    logging.basicConfig(format="vlcrender: %(message)s", level=logging.WARNING)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal without a degree sign gets a question mark, not an error
@@ -239,7 +281,7 @@ def main() -> None:
         _complain(str(error))
         sys.exit(2)
     except BrokenPipeError:
-        # Who read our output has gone (`| head`): end quietly, and keep Python from flushing into the closed pipe.
+        # The reader has closed our output (`| head`): end quietly; keep Python from flushing into the closed pipe.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except OSError as error:
         _complain(f"{error.filename or 'file system'}: {error.strerror or error}")
@@ -248,7 +290,7 @@ def main() -> None:
         _complain("interrupted; run the same command again to go on")
         sys.exit(130)
     except Exception as error:
-        # A fault of this program's own; still not a traceback for somebody who cannot use one.
+        # A fault of this program: one line, without a traceback.
         _complain(f"internal error, please report it: {type(error).__name__}: {error}")
         sys.exit(1)
 

@@ -1,30 +1,38 @@
-"""Mitsuba and Dr.Jit with one variant, chosen once, and a usable LLVM found before the first kernel.
+"""Mitsuba and Dr.Jit in one variant, with an LLVM library that Dr.Jit 1.5 can use (17 or newer).
 
-Dr.Jit 1.5 needs LLVM 17 or newer. With an older one trivial kernels pass and real ones end the process, so the version
-is checked here. Everything else imports `mi` and `dr` from this module.
+Every other module imports `mi` and `dr` from here. `mi` is Mitsuba's namespace in the variant of this package. It
+does not depend on `mitsuba.set_variant`, which is one setting for the whole process: this module neither reads nor
+changes it, so a program may use Mitsuba in a variant of its own beside this package, in any thread.
 
-The environment variable VLCRENDER_VARIANT may choose CUDA. Its kernels round in other places and its rays are cast by
-OptiX, not Embree: results differ from LLVM's in the last bits, so a dataset is the same bit for bit only where one
+With an LLVM older than 17 trivial kernels pass and real ones end the process. So this module finds a library that is
+new enough before Dr.Jit is imported, and checks which one Dr.Jit has loaded. The environment variable
+DRJIT_LIBLLVM_PATH is set during that import only.
+
+The environment variable VLCRENDER_VARIANT may choose CUDA. CUDA kernels round in other places and OptiX casts the
+rays, not Embree: results differ from LLVM's in the last bits, so a dataset is the same bit for bit only if one
 variant made all of it. No figure in this project was measured on a GPU.
 """
 
 import ctypes
+import importlib.util
 import os
 import re
 import sys
-from contextlib import AbstractContextManager
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from vlcrender.errors import InputError
 
 MITSUBA_VARIANTS = ("llvm_ad_mono", "cuda_ad_mono")
-"""The first is taken where nothing is said. Monochromatic: numbers pass unchanged, so that a film holds cd/m2."""
+"""The default comes first. Monochromatic variants pass numbers unchanged, so that a film holds cd/m2."""
 MIN_LLVM = 17
 SYSTEM_FOLDERS = ("/usr/lib", "/usr/lib64", "/usr/local/lib", "/opt/homebrew/opt/llvm/lib", "/usr/local/opt/llvm/lib")
 
 
 def llvm_version(library: Path) -> int:
-    """Major version a libLLVM reports of itself; 0 where it cannot be loaded or is too old (< 16) to say."""
+    """Major version that a libLLVM reports; 0 if it cannot be loaded, or has no such function (older than 16)."""
     try:
         loaded = ctypes.CDLL(str(library))
         numbers = [ctypes.c_uint() for _ in range(3)]
@@ -51,7 +59,7 @@ def _number_in(name: str) -> int:
 
 
 def find_llvm() -> Path:
-    """The LLVM library to use. Raises InputError saying what to install where there is none."""
+    """The LLVM library to use. Raises InputError with what to install if there is none."""
     chosen = os.environ.get("DRJIT_LIBLLVM_PATH")
     if chosen:
         version = llvm_version(Path(chosen))
@@ -64,7 +72,7 @@ def find_llvm() -> Path:
     seen = []
     for path in candidates(Path(sys.prefix)):
         seen.append(path.name)
-        # Names lie less often than they crash: a library whose name says 14 is not loaded at all.
+        # A library whose name has an old version is not loaded at all: loading it may crash.
         if (_number_in(path.name) or MIN_LLVM) >= MIN_LLVM and llvm_version(path) >= MIN_LLVM:
             return path
     found = f"found only {', '.join(sorted(set(seen)))}" if seen else "none was found"
@@ -75,30 +83,159 @@ def find_llvm() -> Path:
 
 
 def chosen_variant() -> str:
-    """What VLCRENDER_VARIANT says, or the first of VARIANTS. Raises InputError for any other."""
+    """The value of VLCRENDER_VARIANT, by default the first of MITSUBA_VARIANTS. Raises InputError for any other."""
     variant = os.environ.get("VLCRENDER_VARIANT") or MITSUBA_VARIANTS[0]
     if variant not in MITSUBA_VARIANTS:
         raise InputError(f"VLCRENDER_VARIANT={variant}: allowed are {', '.join(MITSUBA_VARIANTS)}")
     return variant
 
 
-MITSUBA_VARIANT = chosen_variant()
-if MITSUBA_VARIANT.startswith("llvm"):
-    os.environ["DRJIT_LIBLLVM_PATH"] = str(find_llvm())
+@contextmanager
+def _environment(name: str, value: str) -> Iterator[None]:
+    """Set an environment variable and put its former value back."""
+    before = os.environ.get(name)
+    os.environ[name] = value
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[name]
+        else:
+            os.environ[name] = before
 
-import drjit as dr  # noqa: E402  the path has to be set first
-import mitsuba as mi  # noqa: E402
 
-if MITSUBA_VARIANT.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
+def _import_drjit(variant: str) -> Any:
+    """Dr.Jit with what the variant needs: an LLVM that is new enough, or CUDA. Raises InputError without it."""
+    if not variant.startswith("llvm"):
+        import drjit
+
+        if not drjit.has_backend(drjit.JitBackend.CUDA):
+            raise InputError(
+                f"VLCRENDER_VARIANT={variant}: Dr.Jit finds no CUDA device and driver; unset it to render on the "
+                f"processor"
+            )
+        return drjit
+    if "drjit" in sys.modules:
+        import drjit
+
+        if _llvm_in_use(drjit) < MIN_LLVM and not _restarted(drjit, find_llvm()):
+            _refuse_llvm(_llvm_in_use(drjit))
+        return drjit
+    with _environment("DRJIT_LIBLLVM_PATH", str(find_llvm())):
+        import drjit  # loads LLVM, once a process, in a thread of its own
+
+        found = _llvm_in_use(drjit)
+    if found < MIN_LLVM:
+        _refuse_llvm(found)
+    return drjit
+
+
+def _llvm_in_use(drjit: Any) -> int:
+    """Major version of the LLVM that Dr.Jit has loaded, negative without one."""
+    drjit.has_backend(drjit.JitBackend.LLVM)  # waits until Dr.Jit has looked for LLVM; the next call does not
+    return int(drjit.detail.llvm_version()[0])
+
+
+def _restarted(drjit: Any, library: Path) -> bool:
+    """Restart Dr.Jit with another LLVM if nothing in this process has used Dr.Jit yet; whether that was possible.
+
+    A program that has imported Mitsuba for a scalar variant has loaded any LLVM that the system has, and not used it.
+    """
+    if any(name.startswith(("mitsuba.llvm_", "mitsuba.cuda_")) for name in sys.modules):
+        return False
+    try:
+        core = ctypes.CDLL(str(Path(drjit.__file__).parent / "libdrjit-core.so"))
+        whos, shutdown, init = core._Z12jit_var_whosv, core._Z12jit_shutdowni, core._Z8jit_initj
+    except (OSError, AttributeError):
+        return False  # another platform or version, whose names differ
+    whos.restype = ctypes.c_char_p
+    if b"Variables created : 0 " not in whos():
+        return False
+    shutdown(0)
+    with _environment("DRJIT_LIBLLVM_PATH", str(library)):
+        init(sum(1 << backend.value for backend in (drjit.JitBackend.CUDA, drjit.JitBackend.LLVM)))
+    return _llvm_in_use(drjit) >= MIN_LLVM
+
+
+def _refuse_llvm(loaded: int) -> None:
+    """Raise InputError: another import of Dr.Jit or Mitsuba has chosen an LLVM that is too old."""
+    found = f"LLVM {loaded}" if loaded > 0 else "no LLVM"
     raise InputError(
-        f"VLCRENDER_VARIANT={MITSUBA_VARIANT}: no CUDA device and driver that Dr.Jit can use are found; "
-        f"unset it to render on the processor"
+        f"Dr.Jit was imported before vlcrender and uses {found}; {MIN_LLVM} or newer is needed: start Python with "
+        f"DRJIT_LIBLLVM_PATH={find_llvm()}, or render once before importing mitsuba"
     )
-mi.set_variant(MITSUBA_VARIANT)
+
+
+class _Mitsuba:
+    """Mitsuba's namespace in one variant, whatever `mitsuba.set_variant` says.
+
+    `mitsuba.NAME` is looked up in the module of the current variant, in the compiled module that all variants share,
+    or in Mitsuba's Python files, which refer to the current variant themselves. Here the first is the module of
+    `variant`, and the Python functions are those of a copy of `mitsuba.python.util` that refers to this object.
+    """
+
+    def __init__(self, variant: str) -> None:
+        """Load the variant. The current variant is neither read nor changed."""
+        import mitsuba
+        from mitsuba import mitsuba_ext, parser
+
+        self._variant = variant
+        self._parser = parser
+        self._modules = (getattr(mitsuba, variant), mitsuba_ext)
+        spec = importlib.util.find_spec("mitsuba.python.util")
+        assert spec is not None
+        assert spec.loader is not None
+        functions = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(functions)
+        vars(functions)["mi"] = self  # its global name for Mitsuba
+        self.traverse = functions.traverse
+        self.render = functions.render
+        self.SceneParameters = functions.SceneParameters
+
+    def __getattr__(self, name: str) -> Any:
+        """A name of the variant, or one that all variants share."""
+        for module in self._modules:
+            if hasattr(module, name):
+                value = getattr(module, name)
+                setattr(self, name, value)
+                return value
+        raise AttributeError(f"mitsuba in variant {self._variant} has no {name}")
+
+    def variant(self) -> str:
+        """The variant's name."""
+        return self._variant
+
+    def load_dict(self, tree: Mapping[str, Any], parallel: bool = True, optimize: bool = True) -> Any:
+        """`mitsuba.load_dict` in this variant."""
+        config = self._configuration(parallel, optimize)
+        return self._instantiated(config, self._parser.parse_dict(config, dict(tree)))
+
+    def load_file(self, path: str, parallel: bool = True, optimize: bool = True) -> Any:
+        """`mitsuba.load_file` in this variant."""
+        config = self._configuration(parallel, optimize)
+        return self._instantiated(config, self._parser.parse_file(config, path))
+
+    def _configuration(self, parallel: bool, optimize: bool) -> Any:
+        config = self._parser.ParserConfig(self._variant)
+        config.parallel, config.merge_equivalent, config.merge_meshes = parallel, optimize, optimize
+        return config
+
+    def _instantiated(self, config: Any, state: Any) -> Any:
+        self._parser.transform_all(config, state)
+        return self._parser.instantiate(config, state)
+
+
+MITSUBA_VARIANT = chosen_variant()
+if TYPE_CHECKING:
+    import drjit as dr
+    import mitsuba as mi
+else:
+    dr = _import_drjit(MITSUBA_VARIANT)
+    mi = _Mitsuba(MITSUBA_VARIANT)
 
 
 def exact_math() -> AbstractContextManager[None]:
-    """Within it kernels give the same bits on every SIMD width. Dr.Jit's flags hold for one thread only."""
+    """Scope in which kernels give the same bits on every SIMD width. Dr.Jit's flags hold for one thread only."""
     scope: AbstractContextManager[None] = dr.scoped_set_flag(dr.JitFlag.FastMath, False)
     return scope
 

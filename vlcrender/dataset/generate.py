@@ -17,7 +17,6 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from vlcrender import __version__
 from vlcrender.dataset.files import FRAMES, sha256_of, whole_file, write_json
 from vlcrender.dataset.frame_job import Job, make_frame, poses_of
 from vlcrender.dataset.progress import Progress, ProgressCallback
@@ -191,8 +190,7 @@ def _provenance(plan: Plan) -> dict[str, Any]:
         "scene": plan.scene.settings.model_dump(mode="json"),
         "data_version": DATA_VERSION,
         "versions": {
-            "vlcrender": __version__,
-            **{package: version(package) for package in ("mitsuba", "drjit", "numpy", "OpenEXR")},
+            **{package: version(package) for package in ("vlcrender", "mitsuba", "drjit", "numpy", "OpenEXR")},
             "python": platform.python_version(),
         },
     }

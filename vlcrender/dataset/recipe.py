@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 from vlcrender.camera.intrinsics import Camera
 from vlcrender.camera.rig import MAIN, Mounted, RigCamera, mounted_cameras
 from vlcrender.camera.roi import LedRegions
+from vlcrender.config.packaged import find_file
 from vlcrender.config.presets import with_presets
 from vlcrender.config.toml_model import Settings, check, read_toml
 from vlcrender.dataset.auto_exposure import Metering, NoiseLevelMetering
@@ -39,7 +40,7 @@ class Recipe(Settings):
     description: str = ""
     """One line about the dataset."""
     scene: str
-    """Path of the scene file, relative to the recipe's folder."""
+    """Path of the scene file, relative to the recipe's folder, or the name of a packaged scene."""
     seed: Annotated[int, Field(ge=0, lt=2**63)]
     """Seed of every random number of the dataset."""
     exposure_s: Annotated[float, Field(gt=0, le=100)] | None = None
@@ -159,7 +160,10 @@ def load_plan(path: Path, assignments: Iterable[str] = (), scale: int = 1, scale
         if way in keys and other not in keys:
             tree.pop(other, None)  # the assigned way to expose replaces the recipe's
     recipe = check(with_presets(tree, assignments, source), Recipe, source)
-    scene_path = Path(path.parent / recipe.scene)
+    try:
+        scene_path = find_file("scene", recipe.scene, path.parent)
+    except InputError as error:
+        raise InputError(f"{source}: scene = {error}") from None
     if not scene_path.is_file():
         raise InputError(f"{source}: scene = {recipe.scene!r}: no such file, relative to the recipe's folder")
     return Plan(scaled(recipe, scale, scale_mode), load_scene(scene_path))

@@ -136,7 +136,7 @@ class PanelLeds(LedFace):
     """Lowest and highest luminance along the normal, cd/m2, of the bare LED (also behind a diffuser). Each LED's
     luminance is drawn uniformly between the two with `luminance_seed`."""
     luminance_seed: Identity = 0
-    """Seed of the LEDs' luminances: the same seed gives the same luminances in every data set."""
+    """Seed of the LEDs' luminances: the same seed gives the same luminances in every dataset."""
     first_id: Identity
     """Identity of the first LED. Identities count up along the columns of a panel, then its rows, then along the
     columns of panels, then their rows."""

@@ -3,7 +3,7 @@
 Two models: the tilt errors of Huynh & Yoo 2016, and an inertial measurement unit with datasheet parameters.
 """
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,8 @@ from pydantic import BeforeValidator, Field
 from scipy.spatial.transform import Rotation
 
 from vlcrender.camera.intrinsics import Pose, rotation_cam_world, transform
-from vlcrender.config.toml_model import Settings
+from vlcrender.config.presets import preset
+from vlcrender.config.toml_model import Settings, check
 from vlcrender.core.random_keys import stream
 
 STANDARD_GRAVITY_M_S2 = 9.80665
@@ -82,6 +83,11 @@ class Imu(Settings):
     """Bits of the ADC over the whole range."""
     serial: Annotated[int, Field(ge=0, lt=2**63)] = 0
     """Number of the individual device: its offset, sensitivity and misalignment derive from it."""
+
+    @classmethod
+    def preset(cls, name: str) -> Self:
+        """The accelerometer of a preset, such as "bmi270". Raises InputError with the names there are."""
+        return check(preset("accelerometers", name)["accelerometer"], cls, f"accelerometer preset {name}")
 
     @property
     def lsb_m_s2(self) -> float:

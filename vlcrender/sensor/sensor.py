@@ -26,7 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from vlcrender.config.toml_model import Settings
+from vlcrender.config.presets import preset
+from vlcrender.config.toml_model import Settings, check
 from vlcrender.sensor.quantum_efficiency import SiliconOrTable
 
 Electrons = NDArray[np.float32] | NDArray[np.float64] | NDArray[np.uint32]
@@ -85,6 +86,11 @@ class Sensor(Settings):
     """Colours of the pixels (0, 0), (0, 1), (1, 0), (1, 1) as (row, column), repeated over the sensor."""
     quantum_efficiency: SiliconOrTable = "silicon"
     """Electrons per photon over wavelength: "silicon" (a 3 um deep photodiode), or a table of measured values."""
+
+    @classmethod
+    def preset(cls, name: str) -> Self:
+        """The sensor of a preset, such as "phone-1.2um". Raises InputError with the names there are."""
+        return check(preset("sensors", name)["sensor"], cls, f"sensor preset {name}")
 
     @model_validator(mode="after")
     def _black_level_leaves_room(self) -> Self:

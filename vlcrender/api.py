@@ -1,0 +1,347 @@
+"""The functions of the Python API; `vlcrender` has them all. The command line calls the same ones.
+
+Modules that need Mitsuba, SciPy or Parquet are imported inside the functions that use them, so that a mistake in a
+recipe is refused before Mitsuba is loaded.
+"""
+
+import json
+import threading
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from math import isfinite
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vlcrender.camera.intrinsics import Camera, Pose
+from vlcrender.camera.posed_camera import PosedCamera
+from vlcrender.camera.roi import LedRegions, Roi
+from vlcrender.config.packaged import find_file
+from vlcrender.errors import InputError
+from vlcrender.rendering.expected_image import ExpectedImage, Image
+from vlcrender.scene.loader import Scene
+from vlcrender.sensor.sensor import Sensor
+
+if TYPE_CHECKING:
+    from vlcrender.dataset.progress import ProgressCallback
+    from vlcrender.dataset.recipe import Plan
+    from vlcrender.dataset.schema import SpotRow
+    from vlcrender.rendering.bayer import MosaicRenderer
+    from vlcrender.rendering.renderer import Renderer
+    from vlcrender.sensor.accelerometer import Imu, TiltError
+
+ScaleMode = Literal["binned", "same-photons"]
+Overrides = Mapping[str, object] | Iterable[str]
+MAX_RENDERERS = 4
+"""Renderers that are kept, one for each scene and spectral response; the one used longest ago is dropped first."""
+MAX_EXPOSURE_S = 100.0
+MAX_SEED = 2**63
+
+
+@dataclass(frozen=True)
+class ExpectedFrame(ExpectedImage):
+    """The expected image of one camera at rest, with the truth beside it.
+
+    `parts` are what is read out: the whole sensor, or regions that share no pixel. Rates are in electrons a second.
+    """
+
+    scene: Scene
+    camera: Camera
+    pose: Pose
+    sensor: Sensor
+    """Its quantum efficiency and mosaic are in the image; nothing else of it is."""
+    regions: LedRegions | None = None
+
+    @property
+    def electrons_per_s(self) -> Image:
+        """Mean photoelectrons a second of a full frame, (height, width), float32."""
+        return self.expected_electrons(1.0)
+
+    @property
+    def R_cam_world(self) -> NDArray[np.float64]:
+        """Rotation matrix (3, 3): `p_cam = R_cam_world @ (p_world - position_m)`."""
+        return self.pose.rotation
+
+    @property
+    def truth(self) -> dict[str, Any]:
+        """The pose and every LED that lights a pixel, in the words of truth.parquet (datasets/FORMAT.md)."""
+        return {
+            "position_m": list(self.pose.position_m),
+            "R_cam_world": self.pose.rotation.ravel().tolist(),
+            "tilt_x_deg": self.pose.tilt_x_deg,
+            "tilt_y_deg": self.pose.tilt_y_deg,
+            "yaw_deg": self.pose.yaw_deg,
+            "leds": [
+                {
+                    "led": patch.led_id,
+                    "u_px": patch.center_px[0],
+                    "v_px": patch.center_px[1],
+                    "visible_fraction": patch.visible_fraction,
+                }
+                for patch in sorted(self.patches, key=lambda patch: patch.led_id)
+            ],
+        }
+
+
+@dataclass(frozen=True)
+class RawRegion:
+    """Digital numbers of one region of interest: `image_dn` (rows, columns), uint32."""
+
+    roi: Roi
+    image_dn: NDArray[np.uint32]
+
+
+@dataclass(frozen=True)
+class RawFrame:
+    """One exposure: what a device reads out and knows. The truth is in the `ExpectedFrame` it was made from."""
+
+    scene: Scene
+    camera: Camera
+    sensor: Sensor
+    accelerometer: "TiltError | Imu"
+    exposure_s: float
+    parts: tuple[RawRegion, ...]
+    """The whole sensor, or the regions that were read out, by first row, then column."""
+    accelerometer_m_s2: NDArray[np.float64]
+    """Reading (3,) of the accelerometer at rest, in camera axes."""
+    spots: "tuple[SpotRow, ...]"
+    """Decoded identities: `led`, and a rough pixel `u_px`, `v_px`."""
+
+    @property
+    def image_dn(self) -> NDArray[np.uint32]:
+        """Digital numbers of a full frame, (height, width). Raises InputError if regions alone were read out."""
+        if len(self.parts) != 1 or self.parts[0].roi != Roi.of_sensor(self.camera):
+            raise InputError(f"image_dn: the frame has {len(self.parts)} regions; read image_dn of each of its parts")
+        return self.parts[0].image_dn
+
+    def record(self) -> dict[str, Any]:
+        """The frame in the words of datasets/FORMAT.md, for `estimator.frame`; nothing of the truth is in it.
+
+        Keys: `camera`, `sensor`, `accelerometer` and `led_map` as in dataset.json, `exposure_s`, `accelerometer_m_s2`
+        and `spots` as in frames.parquet, and `parts`: `row`, `column` and `image_dn` of each region.
+        """
+        from vlcrender.camera.rig import mounted_cameras
+        from vlcrender.dataset.schema import AccelerometerEntry, SensorEntry, camera_entry, led_map
+
+        (mounted,) = mounted_cameras(self.camera, ())
+        device = AccelerometerEntry(kind=self.accelerometer.kind, error_deg=self.accelerometer.error_deg)
+        return {
+            "camera": camera_entry(mounted).model_dump(mode="json"),
+            "sensor": SensorEntry(**self.sensor.acting()).model_dump(mode="json"),
+            "accelerometer": device.model_dump(mode="json"),
+            "led_map": [entry.model_dump(mode="json") for entry in led_map(self.scene.leds)],
+            "exposure_s": self.exposure_s,
+            "accelerometer_m_s2": self.accelerometer_m_s2.tolist(),
+            "spots": [spot.model_dump() for spot in self.spots],
+            "parts": [
+                {"row": part.roi.row, "column": part.roi.column, "image_dn": part.image_dn} for part in self.parts
+            ],
+        }
+
+
+def load_scene(name_or_path: str | Path) -> Scene:
+    """Read and check a scene: the name of one that comes with the package, such as "office", or a TOML file.
+
+    A file of this path wins over a name. Raises InputError naming file, key and value.
+    """
+    from vlcrender.scene.loader import load_scene as load
+
+    return load(find_file("scene", name_or_path))
+
+
+def load_recipe(
+    name_or_path: str | Path,
+    overrides: Overrides | None = None,
+    *,
+    scale: int = 1,
+    scale_mode: ScaleMode = "binned",
+) -> "Plan":
+    """Read and check a recipe: the name of one that comes with the package, such as "quickstart", or a TOML file.
+
+    Returns a `Plan`: the recipe, with `overrides` and presets put in, and its scene. `overrides` maps dotted keys to
+    values, `{"poses.count": 20}`, or lists `key=value` texts as after `--set`. With `scale` N, N x N pixels are binned
+    into one; `scale_mode` says whether larger pixels keep all photons ("binned") or the exposure is shortened
+    ("same-photons"). Raises InputError naming file, key and value.
+    """
+    from vlcrender.dataset.recipe import load_plan
+
+    return load_plan(find_file("recipe", name_or_path), _assignments(overrides), scale, scale_mode)
+
+
+def render(
+    scene: Scene,
+    camera: Camera,
+    pose: Pose,
+    *,
+    sensor: Sensor | None = None,
+    regions: LedRegions | None = None,
+) -> ExpectedFrame:
+    """Render the expected image: mean photoelectrons a second of every pixel, without noise, and the truth.
+
+    Of the `sensor`, by default `Sensor()`, quantum efficiency and mosaic count. With `regions` the regions around the
+    LEDs are rendered alone. The scene's light is computed once and kept in the cache folder; renderers are kept for
+    each scene object and spectral response. Raises InputError if the camera is not inside the room, or if overscan is
+    asked of a camera with distortion.
+    """
+    sensor = sensor or Sensor()
+    if regions is not None and regions.overscan and camera.distortion is not None:
+        raise InputError("regions.overscan = true: a camera with distortion is not defined far beyond its sensor")
+    image = _renderer(scene, sensor).expected_image(PosedCamera(camera, pose), regions)
+    return ExpectedFrame(image.parts, scene, camera, pose, sensor, regions)
+
+
+def expose(
+    mean: ExpectedFrame,
+    sensor: Sensor,
+    exposure_s: float,
+    seed: int,
+    accelerometer: "TiltError | Imu | None" = None,
+    *,
+    frame: int = 0,
+) -> RawFrame:
+    """Expose an expected image: noise, saturation and quantization of a sensor, as digital numbers.
+
+    Noise depends on `seed`, `frame` and the pixel: the result has the bits of frame number `frame` of a dataset with
+    this seed, one camera and no repeats. `accelerometer` is `TiltError()` by default, with 0.1 deg of error. If the
+    quantum efficiency or the mosaic of `sensor` differs from those that `mean` was rendered with, the view is rendered
+    again with the sensor's. Raises InputError for an exposure time or a seed out of range.
+    """
+    from vlcrender.core.random_keys import random_key, stream
+    from vlcrender.dataset.downlink import decoded_spots
+    from vlcrender.sensor.accelerometer import TiltError
+    from vlcrender.sensor.signal_chain import expose as digital_numbers
+
+    exposure_s = float(exposure_s)
+    if not (isfinite(exposure_s) and 0 < exposure_s <= MAX_EXPOSURE_S):
+        raise InputError(f"exposure_s = {exposure_s:g}: has to be above 0 and at most {MAX_EXPOSURE_S:g}")
+    for name, number in (("seed", seed), ("frame", frame)):
+        if not 0 <= int(number) < MAX_SEED:
+            raise InputError(f"{name} = {number}: has to be an integer from 0 to 2**63 - 1")
+    if _spectral_response(sensor) != _spectral_response(mean.sensor):
+        mean = render(mean.scene, mean.camera, mean.pose, sensor=sensor, regions=mean.regions)
+    device = accelerometer or TiltError()
+    noise = random_key(int(seed), int(frame), "shot-noise")
+    parts = tuple(
+        RawRegion(
+            part.roi,
+            digital_numbers(
+                sensor,
+                part.expected_electrons(exposure_s),
+                noise,
+                part.roi.row,
+                part.roi.column,
+                exposure_s=exposure_s,
+            ),
+        )
+        for part in mean.parts
+    )
+    return RawFrame(
+        mean.scene,
+        mean.camera,
+        sensor,
+        device,
+        exposure_s,
+        parts,
+        device.reading_m_s2(mean.pose, stream(int(seed), int(frame), "accelerometer")),
+        tuple(decoded_spots(mean.parts, mean.camera.width_px, stream(int(seed), int(frame), "demodulator"))),
+    )
+
+
+def generate(
+    recipe: "str | Path | Plan",
+    out: str | Path,
+    *,
+    overrides: Overrides | None = None,
+    workers: int = 1,
+    scale: int = 1,
+    scale_mode: ScaleMode = "binned",
+    scheduler: str | None = None,
+    progress: "ProgressCallback | None" = None,
+) -> bool:
+    """Generate the dataset of a recipe in the folder `out`. An interrupted run is continued.
+
+    `recipe` is a packaged name, the path of a TOML file, or what `load_recipe` returns; `overrides`, `scale` and
+    `scale_mode` are those of `load_recipe`. `workers` processes make frames, or the workers of a dask `scheduler` (its
+    address); the bits are the same for any number. `progress` is called with `Progress` reports. Returns False if the
+    dataset was already complete and intact. Raises InputError for bad input, or if `out` holds anything else.
+    """
+    if workers < 1:
+        raise InputError(f"workers = {workers}: has to be 1 or more")
+    if isinstance(recipe, str | Path):
+        plan = load_recipe(recipe, overrides, scale=scale, scale_mode=scale_mode)
+    elif overrides is None and scale == 1:
+        plan = recipe
+    else:
+        raise InputError("overrides, scale: are for a recipe's name or path; give them to load_recipe")
+    from vlcrender.dataset.generate import generate as make  # loads Mitsuba: after the recipe is known to be good
+
+    return make(plan, Path(out), workers, scheduler, progress)
+
+
+def verify(directory: str | Path) -> list[str]:
+    """Check that a dataset is complete and intact and its truth consistent: a line for each problem, or no line.
+
+    Raises InputError if the folder has no readable dataset.json.
+    """
+    from vlcrender.dataset.verify import verify as problems_of
+
+    return problems_of(Path(directory))
+
+
+def _spectral_response(sensor: Sensor) -> str:
+    return sensor.model_dump_json(include={"quantum_efficiency", "mosaic"})
+
+
+_renderers: "dict[tuple[int, str], Renderer | MosaicRenderer]" = {}
+"""By the scene's identity, which stays taken because a renderer holds its scene; used longest ago first."""
+_renderers_lock = threading.Lock()
+
+
+def _renderer(scene: Scene, sensor: Sensor) -> "Renderer | MosaicRenderer":
+    """The renderer of a scene and a spectral response, made or kept from before."""
+    from vlcrender.light.lightmap import bake
+    from vlcrender.rendering.bayer import MosaicRenderer
+    from vlcrender.rendering.renderer import Renderer
+    from vlcrender.sensor.radiometry import detectors
+
+    key = id(scene), _spectral_response(sensor)
+    with _renderers_lock:
+        renderer = _renderers.pop(key, None)
+        if renderer is None:
+            light = bake(scene)
+            of_colours = tuple(Renderer(scene, light, detector) for detector in detectors(sensor))
+            renderer = of_colours[0] if sensor.mosaic == "none" else MosaicRenderer(of_colours, sensor.mosaic)
+        _renderers[key] = renderer
+        while len(_renderers) > MAX_RENDERERS:
+            del _renderers[next(iter(_renderers))]
+    return renderer
+
+
+def _assignments(overrides: Overrides | None) -> list[str]:
+    """`key=value` texts, values as TOML has them."""
+    if overrides is None:
+        return []
+    if isinstance(overrides, str):
+        raise InputError(
+            f"overrides = {overrides!r}: has to be a mapping of keys to values, or a list of key=value texts"
+        )
+    if isinstance(overrides, Mapping):
+        return [f"{key}={_toml(value, key)}" for key, value in overrides.items()]
+    return list(overrides)
+
+
+def _toml(value: object, key: str) -> str:
+    """A value as TOML has it. Raises InputError for one that TOML has not."""
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{json.dumps(str(k))} = {_toml(v, key)}" for k, v in value.items()) + "}"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(_toml(item, key) for item in value) + "]"
+    if isinstance(value, Path):
+        value = str(value)
+    if isinstance(value, bool | int | float | str):
+        return json.dumps(value, ensure_ascii=False)
+    raise InputError(f"overrides: {key} = {value!r}: has to be a number, a text, true or false, a list or a table")
