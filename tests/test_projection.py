@@ -10,7 +10,12 @@ from vlcrender.camera.projection import Equidistant, Perspective, Projection
 from vlcrender.camera.rig import mounted_cameras
 
 BARREL = Perspective(Distortion(k1=-0.3))
-LENSES: dict[str, Projection] = {"pinhole": Perspective(), "barrel": BARREL, "fish-eye": Equidistant()}
+LENSES: dict[str, Projection] = {
+    "pinhole": Perspective(),
+    "barrel": BARREL,
+    "tangential": Perspective(Distortion(k1=-0.2, k2=0.05, p1=0.01, p2=-0.02)),
+    "fish-eye": Equidistant(),
+}
 
 
 @pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
