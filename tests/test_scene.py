@@ -128,7 +128,7 @@ def test_a_bad_scene_is_refused_in_one_line(tmp_path: Path, old: str, new: str, 
 
 def test_a_renamed_key_is_found_in_arrays_of_tables(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(RENAMED_KEYS, "led.radius_m", "led.half_width_m")
-    with pytest.raises(InputError, match="^test: key led.radius_m was renamed: write led.half_width_m$"):
+    with pytest.raises(InputError, match=r"^test: key led\.radius_m was renamed: write led\.half_width_m$"):
         check(tomllib.loads(TABLE1), SceneSettings, "test")
 
 
