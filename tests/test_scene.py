@@ -12,7 +12,7 @@ from pydantic import BaseModel
 
 from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.posed_camera import PosedCamera
-from vlcrender.config.toml_model import check
+from vlcrender.config.toml_model import RENAMED_KEYS, check
 from vlcrender.errors import InputError
 from vlcrender.scene.loader import Scene, build_scene, load_scene
 from vlcrender.scene.schema import SceneSettings
@@ -125,6 +125,12 @@ BAD_TABLE1 = [
 )
 def test_a_bad_scene_is_refused_in_one_line(tmp_path: Path, old: str, new: str, message: str) -> None:
     assert_refused(tmp_path, TABLE1, old, new, message)
+
+
+def test_a_renamed_key_is_found_in_arrays_of_tables(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(RENAMED_KEYS, "led.radius_m", "led.half_width_m")
+    with pytest.raises(InputError, match=r"^test: key led\.radius_m was renamed: write led\.half_width_m$"):
+        check(tomllib.loads(TABLE1), SceneSettings, "test")
 
 
 BAD_OFFICE = [

@@ -96,21 +96,22 @@ def _xml_shapes(path: Path, where: str) -> list[_Shape]:
     """The shapes of a Mitsuba scene file with their transformations, albedo by their BSDFs."""
     try:
         _check_mesh_files(path, where)
-        shapes = list(mi.load_file(str(path), optimize=False).shapes())
+        shapes = [_xml_shape(shape, where) for shape in mi.load_file(str(path), optimize=False).shapes()]
     except (RuntimeError, UnicodeDecodeError) as error:
         raise InputError(f"{where}: Mitsuba cannot load it: {_one_line(error)}") from None
     if not shapes:
         raise InputError(f"{where}: holds no shape")
-    checked = []
-    for shape in shapes:
-        of_shape = f"{where}: shape {shape.id()!r}"
-        if not shape.is_mesh():
-            raise InputError(f"{of_shape} is no mesh; allowed are ply, obj, serialized, cube and rectangle")
-        if shape.is_emitter():
-            raise InputError(f"{of_shape} is an emitter; light comes from LEDs, glazing and ambient alone")
-        vertices, faces = _mesh_arrays(shape)
-        checked.append(_Shape(of_shape, vertices, faces, _albedo(shape, faces)))
-    return checked
+    return shapes
+
+
+def _xml_shape(shape: "mi.Mesh", where: str) -> _Shape:
+    of_shape = f"{where}: shape {shape.id()!r}"
+    if not shape.is_mesh():
+        raise InputError(f"{of_shape} is no mesh; allowed are ply, obj, serialized, cube and rectangle")
+    if shape.is_emitter():
+        raise InputError(f"{of_shape} is an emitter; light comes from LEDs, glazing and ambient alone")
+    vertices, faces = _mesh_arrays(shape)
+    return _Shape(of_shape, vertices, faces, _albedo(shape, faces))
 
 
 def _check_mesh_files(path: Path, where: str) -> None:
