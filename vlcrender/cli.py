@@ -87,10 +87,10 @@ def generate(
 
     def draw(report: "Report") -> None:
         bar.start()  # not before the first report: a refusal is one line
-        if report.stage == "light":
-            bar.update(light, description=report.step, completed=report.done, visible=report.done < report.total)
-        else:
+        if report.stage == "frames":
             bar.update(task, completed=report.done, total=report.total)
+        else:
+            bar.update(light, description=report.stage, completed=report.done, visible=report.done < report.total)
 
     try:
         made = make(plan, out, workers, scheduler, draw)
