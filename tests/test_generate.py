@@ -122,9 +122,9 @@ def test_progress_reports_the_light_and_then_each_frame(tmp_path: Path, monkeypa
     plan = load_plan(ROOT / "datasets/table1.toml", [*SMALL[:4], "poses.columns=2", "poses.rows=1"])
     reports: list[Progress] = []
     generate(plan, tmp_path / "set", progress=reports.append)
-    light = [report for report in reports if report.stage == "light"]
+    light = [report for report in reports if report.stage != "frames"]
     assert reports[: len(light)] == light
-    assert light[0].step == "light from the LEDs"
+    assert light[0] == Progress("light from the LEDs", 0.0, 1.0)
     assert all(0 <= report.done <= report.total == 1 for report in light)
     assert reports[len(light) :] == [Progress("frames", 1, 2), Progress("frames", 2, 2)]
 

@@ -118,7 +118,7 @@ class _Bar:
             self._bar.update(self._frames, completed=progress.done, total=progress.total)
         else:
             share = progress.done / progress.total
-            self._bar.update(self._light, description=progress.step, completed=share, visible=share < 1)
+            self._bar.update(self._light, description=progress.stage, completed=share, visible=share < 1)
 
 
 @app.command

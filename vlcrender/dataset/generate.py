@@ -19,7 +19,7 @@ from pydantic import ValidationError
 
 from vlcrender.dataset.files import FRAMES, sha256_of, whole_file, write_json
 from vlcrender.dataset.frame_job import Job, make_frame, poses_of
-from vlcrender.dataset.progress import Progress, ProgressCallback
+from vlcrender.dataset.progress import FRAMES_STAGE, Progress, ProgressCallback
 from vlcrender.dataset.recipe import Plan, Recipe
 from vlcrender.dataset.schema import (
     DATA_VERSION,
@@ -83,15 +83,15 @@ def generate(
     missing = [frame for frame in range(total) if frame not in done]
     if done:
         log.info("%s: resumed with %d of %d frames", directory, len(done), total)
-        report(Progress("frames", len(done), total))
+        report(Progress(FRAMES_STAGE, len(done), total))
     # Into the cache, from which every worker reads it.
-    bake(plan.scene, progress=lambda step, share: report(Progress("light", share, 1.0, step)))
+    bake(plan.scene, progress=lambda step, share: report(Progress(step, share, 1.0)))
     with (directory / "journal.jsonl").open("a", encoding="utf-8") as journal:
         for record in _records(job, missing, workers, scheduler):
             done[record.frame] = record
             journal.write(record.model_dump_json() + "\n")
             journal.flush()
-            report(Progress("frames", len(done), total))
+            report(Progress(FRAMES_STAGE, len(done), total))
     _finish(plan, directory, provenance, [done[frame] for frame in sorted(done)])
     return True
 

@@ -2,21 +2,20 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+
+FRAMES_STAGE = "frames"
 
 
 @dataclass(frozen=True)
 class Progress:
     """A report: `done` of `total` of a stage is finished."""
 
-    stage: Literal["light", "frames"]
-    """The room's light is computed before the first frame."""
+    stage: str
+    """"frames", or before the first frame a step of the room's light, such as "reflected light"."""
     done: float
-    """Number of finished frames; share of the present step of the light."""
+    """Number of finished frames; share of a step of the light."""
     total: float
-    """Number of frames; 1 for light."""
-    step: str = ""
-    """Step of the light, such as "reflected light"; empty for frames."""
+    """Number of frames; 1 for a step of the light."""
 
 
 ProgressCallback = Callable[[Progress], None]
