@@ -65,7 +65,7 @@ def starts(leds_m: Floats, directions: Floats) -> list[Pose]:
     """
     leveling = _tilt_grid()
     rays = directions @ leveling
-    up = (rays[..., 2] >= MIN_ELEVATION_SINE).all(axis=-1)
+    up: NDArray[np.bool_] = np.asarray((rays[..., 2] >= MIN_ELEVATION_SINE).all(axis=-1))
     spots = (rays[..., 0] + 1j * rays[..., 1]) / np.where(up[..., None], rays[..., 2], 1.0)
     centred = spots - spots.mean(axis=-1, keepdims=True)
     ceiling = leds_m[:, 0] + 1j * leds_m[:, 1]
