@@ -1,4 +1,4 @@
-"""The dataset is read as the format says, and anything else is refused in one line."""
+"""Reader of the dataset format: valid files are read, invalid ones refused in one line."""
 
 import contextlib
 import copy
@@ -37,7 +37,7 @@ def folder(good: Path, tmp_path: Path) -> Path:
 
 
 def refused(folder: Path) -> str:
-    """The one line that says why the dataset cannot be read."""
+    """Message of the error when the dataset is read."""
     with pytest.raises(InputError) as caught:
         read_dataset(folder)
     assert "\n" not in str(caught.value)
