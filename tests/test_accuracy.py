@@ -1,4 +1,4 @@
-"""What the whole chain is worth on full-size frames, beside what can be expected of it."""
+"""Accuracy of the whole chain on full-size frames, compared with the expected errors."""
 
 from pathlib import Path
 
@@ -66,7 +66,7 @@ def test_without_noise_huynh2016_errs_only_by_what_a_pixel_can_explain(ideal: Pa
         estimate = VARIANTS["huynh2016"].estimate(read_frame(dataset, record))
         error = np.linalg.norm(estimate.position_m - position)
 
-        # 1. Expected of whole pixels: each coordinate off by up to half a pixel, evenly.
+        # 1. Expected of whole pixels: each coordinate in error by up to half a pixel, uniformly distributed.
         rounded = [
             np.linalg.norm(
                 from_pixels(dataset, record.frame, ids, exact + generator.uniform(-0.5, 0.5, exact.shape)) - position
@@ -89,7 +89,7 @@ def test_without_noise_huynh2016_errs_only_by_what_a_pixel_can_explain(ideal: Pa
             ]
         )
         predicted = np.linalg.norm(from_pixels(dataset, record.frame, ids, ellipses) - position)
-        # What is left: brightness that falls across the disc (cos^4) and rounding to digital numbers, 0.02 px together,
+        # The remainder: illumination across the disc (cos^4) and rounding to digital numbers, 0.02 px together,
         # 1/15 of the even half pixel's 0.29 px rms.
         left = np.median(rounded) / 15
         print(

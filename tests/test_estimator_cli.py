@@ -1,4 +1,4 @@
-"""The commands and the page: what they print, and that every error is one line with exit code 2."""
+"""Command line and report: output, and every error in one line with exit code 2."""
 
 import json
 import os
@@ -66,7 +66,7 @@ def test_score_prints_json(dataset: Path, capsys: pytest.CaptureFixture[str]) ->
 
 
 def test_compare_prints_a_line_a_number(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """PnP, which answers three frames of three, against one that answers none."""
+    """PnP, which succeeds on three frames of three, against a variant that fails on all."""
     folder = small_dataset(tmp_path)
     assert main(["run", str(folder), "--variant", "pnp"]) == 0
     lost = [

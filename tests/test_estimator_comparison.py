@@ -1,4 +1,4 @@
-"""Two variants on the same frames: by hand, and against what is known of the signed-rank test."""
+"""Paired comparison of two variants: by hand, and by closed forms of the signed-rank test."""
 
 from collections.abc import Sequence
 

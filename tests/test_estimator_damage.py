@@ -35,7 +35,7 @@ def folder(good: Path, tmp_path: Path) -> Path:
 def judge(folder: Path, capsys: pytest.CaptureFixture[str]) -> int:
     """The exit code of all that reads the damaged file; 2 comes with one line that names a file of the dataset."""
     codes = []
-    # The page is made of scores.json as it is, before `score` would write it anew.
+    # The report uses scores.json unchanged, before `score` would write it again.
     for command in (["report", str(folder), "--out", str(folder / "report.html")], ["score", str(folder)]):
         capsys.readouterr()
         codes.append(main(command))

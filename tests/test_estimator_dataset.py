@@ -1,4 +1,4 @@
-"""The dataset is read as the format says, and anything else is refused in one line."""
+"""Reader of the dataset format: valid files are read, invalid ones refused in one line."""
 
 import contextlib
 import copy
@@ -37,7 +37,7 @@ def folder(good: Path, tmp_path: Path) -> Path:
 
 
 def refused(folder: Path) -> str:
-    """The one line that says why the dataset cannot be read."""
+    """Message of the error when the dataset is read."""
     with pytest.raises(InputError) as caught:
         read_dataset(folder)
     assert "\n" not in str(caught.value)
@@ -388,3 +388,26 @@ def test_a_failed_row_has_a_reason_and_no_position() -> None:
     for change in ({"status": "failed"}, {"reason": "x: y"}, {"position_m": None}, {"status": "unsure"}):
         with pytest.raises(ValueError, match="1 validation error"):
             EstimateRow(**{**good, **change})
+
+
+def test_another_version_is_refused_in_one_line_that_names_4(folder: Path) -> None:
+    for version in (3, 5):
+        change_json(folder, lambda c, version=version: c.update(version=version, led_map=None))
+        with pytest.raises(InputError, match=f"version {version} of the format, needed 4$"):
+            read_dataset(folder)
+
+
+def test_a_frame_is_read_with_those_of_the_rig_s_other_cameras(folder: Path) -> None:
+    change_json(folder, lambda c: c["cameras"].update(right=c["cameras"]["main"]))
+    records = pq.read_table(folder / "frames.parquet")
+    rows = records.to_pylist()
+    rows[1].update(shot=0, camera="right")
+    rows[2].update(shot=1)
+    pq.write_table(pa.Table.from_pylist(rows, records.schema), folder / "frames.parquet")
+    dataset = read_dataset(folder)
+    first, second = (read_frame(dataset, number) for number in (0, 1))
+    (other,) = first.other_cameras
+    assert np.array_equal(other.parts[0].image_dn, second.parts[0].image_dn)
+    assert other.other_cameras == ()
+    assert read_frame(dataset, 2).other_cameras == ()
+    assert read_frame(dataset, 0, with_other_cameras=False).other_cameras == ()

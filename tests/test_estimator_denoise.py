@@ -1,4 +1,4 @@
-"""Algorithm 1 put right is a mean of neighbours, and nothing else; as printed it is none; and what else there is."""
+"""Denoisers: Algorithm 1 corrected is a mean of neighbours, as printed it is not; and the others."""
 
 import numpy as np
 import pytest

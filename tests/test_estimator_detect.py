@@ -1,4 +1,4 @@
-"""Where a spot is, how sure that is, and what is said about spots that cannot be trusted."""
+"""Detection: centroids, their covariances, and flags of LED images that are cut or saturated."""
 
 import cv2
 import numpy as np
@@ -225,7 +225,7 @@ def test_the_centroid_of_a_square_includes_its_vertices(yaw_deg: float) -> None:
     readout = Readout(0, 0, image, image, np.zeros(image.shape, bool))
     (around,) = detect([readout], image.size, 0, any_square=True)
     (without,) = detect([readout], image.size, 0)
-    # float32 electrons summed in double precision: what is left is their rounding, 1e-7.
+    # float32 electrons summed in double precision: the remaining error is their rounding, 1e-7.
     assert np.hypot(around.u_px - exact[0], around.v_px - exact[1]) < 1e-5
     assert np.hypot(without.u_px - exact[0], without.v_px - exact[1]) > 1e-3
 

@@ -80,7 +80,7 @@ def test_two_equal_poses_are_ambiguous_and_gravity_resolves_them() -> None:
     leds = grid(2, 2, 0.06, (3, 2, 3.0))
     view = view_of((3, 2, 3.0), 3.0, 15, 0, 10, (800, 600, 3000.0))
     unsure = draws(view, leds, 0.1, 20.0, 60)
-    # The draws of 20 deg are not small; what matters is that no answer is far off without the flag.
+    # Errors of 20 deg are not small; no estimate may have a large error without the flag.
     far = [np.linalg.norm(a.position_m - view.position_m) > 0.5 for a in unsure]
     flagged = [a.ambiguous for a in unsure]
     assert any(flagged)
@@ -96,7 +96,7 @@ def test_an_accelerometer_without_error_is_exact() -> None:
     leds = grid(4, 1, 0.14, (3, 2, 3.0))
     view = view_of((3, 2, 3.0), 2.8, 25, -15, 40)
     answer = fit_correspondences(device(view, 0.0), simulated(view, leds))
-    # Pixels are exact; 1e-5 deg is what the reading is taken to be good to.
+    # Pixels are exact; the reading has a standard deviation of 1e-5 deg.
     np.testing.assert_allclose(answer.position_m, view.position_m, atol=1e-7)
 
 

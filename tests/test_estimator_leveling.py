@@ -1,4 +1,4 @@
-"""Gravity takes the tilt out, exactly and in the right direction."""
+"""Leveling by gravity: exact, and in the right direction."""
 
 import numpy as np
 import pytest

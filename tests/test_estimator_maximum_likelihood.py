@@ -1,4 +1,4 @@
-"""Maximum likelihood on pixels: exact without noise, as good as it says with noise, and robust where LEDs are not."""
+"""Maximum likelihood: exact without noise, consistent covariance with noise, robust against missing LEDs."""
 
 import json
 from dataclasses import replace
@@ -176,7 +176,7 @@ def test_leds_that_the_model_does_not_explain_are_left_out() -> None:
 
 
 def test_gravity_and_two_leds_fix_a_position_and_one_does_not() -> None:
-    """The reading's 0.5 deg make 26 mm at 3 m along each axis; what the discs' shapes say of the tilt makes it less."""
+    """The reading's 0.5 deg cause 26 mm at 3 m along each axis; the shapes of the discs reduce it."""
     view = view_of(TARGET, 3.0, 10.0, 5.0, 30.0)
     leds_m = SIX[:2] + [0.07, 0.07, 0.0]
     image = poisson(render(view, leds_m, 0.01, 4000.0, samples=SAMPLES), 2)

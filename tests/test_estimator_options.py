@@ -1,4 +1,4 @@
-"""A variant's name with stages chosen: what is allowed, what is refused, and that the name is a file's."""
+"""Options of a variant's name: allowed and refused ones, and names as file names."""
 
 import itertools
 

@@ -43,7 +43,7 @@ def test_pnp_works_with_leds_at_different_heights() -> None:
 
 
 def test_pnp_puts_the_camera_below_the_leds() -> None:
-    """Seen from above, the same LEDs have a pose that fits, and it is not taken."""
+    """From above, the same LEDs have a pose that fits; it is excluded."""
     leds = grid(3, 3, 0.2, (3, 2, 2.7))
     view = view_of((3, 2, 2.7), 2.5)
     mirrored = view.project(leds)

@@ -34,7 +34,7 @@ def edge_of_disc(diameter: float, offsets: Floats) -> Floats:
 
 
 def edge_of_kernel(kernel: Floats, factor: int, offsets: Floats) -> Floats:
-    """The same by the kernel, on pixels `factor` times factor whose means are then taken."""
+    """The same by the kernel, on pixels subdivided by `factor`, then averaged."""
     line = kernel.sum(axis=0)
     away = (np.arange(len(line)) - len(line) // 2) / factor
     within = (np.arange(factor) + 0.5) / factor - 0.5
@@ -85,7 +85,7 @@ def test_the_airy_patterns_light_is_where_its_closed_form_says() -> None:
 
 
 def test_a_measured_kernel_is_used_unchanged() -> None:
-    """On factor pixels it has nothing between whole ones."""
+    """On subdivided pixels the kernel has values at whole-pixel shifts alone."""
     rows = [[0.0, 0.1, 0.0], [0.2, 0.4, 0.1], [0.0, 0.2, 0.0]]
     lens = LensBlur(camera(psf="measured", psf_kernel=rows), np.array([3.0]))
     assert lens.factors.tolist() == [1]

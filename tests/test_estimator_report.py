@@ -84,7 +84,7 @@ def test_frames_are_numbered_in_round_steps(frames: int, step: int) -> None:
 
 
 def test_odd_scores_make_a_page_too(tmp_path: Path) -> None:
-    """No variant, no frame, nothing answered, one perfect frame, an error beyond all bounds."""
+    """No variant, no frame, all frames failed, one exact frame, a huge error."""
     for variants in (
         [],
         [scored([])],

@@ -1,4 +1,4 @@
-"""Errors by hand, failures counted, nothing dropped."""
+"""Scores: errors by hand, failures counted, no frame dropped."""
 
 import json
 import os
@@ -98,7 +98,7 @@ def test_the_bound_is_held_against_the_frames_that_have_it_and_succeeded() -> No
 
 
 def test_reported_covariances_and_ambiguity_are_counted() -> None:
-    """An error of one and of two standard deviations: 1 and 4, mean 2.5; the third frame says nothing of itself."""
+    """An error of one and of two standard deviations: 1 and 4, mean 2.5; the third frame reports no covariance."""
     x, y, z = TRUTH
     covariance_m2 = (1e-4, 0.0, 0.0, 0.0, 1e-4, 0.0, 0.0, 0.0, 1e-4)
     rows = [ok(k, (x + 0.01 * (k + 1), y, z)).model_copy(update={"covariance_m2": covariance_m2}) for k in range(2)]
@@ -111,7 +111,7 @@ def test_reported_covariances_and_ambiguity_are_counted() -> None:
 
 
 def test_failing_the_worst_frames_lowers_the_success_rate_and_no_error_of_all() -> None:
-    """The ok frames' own summary falls to a tenth; what counts all frames does not."""
+    """The summary of the ok frames falls to a tenth; those over all frames do not."""
     x, y, z = TRUTH
     rows = [ok(k, (x + (0.01 if k < 15 else 1.0), y, z)) for k in range(20)]
     complete = score_variant("x", rows, truths(20), LEDS)

@@ -1,4 +1,4 @@
-"""Scores as words: rounding, units, what is infinite and what is missing."""
+"""Cells of score tables: rounding, units, infinite and missing values."""
 
 from test_estimator_score import LEDS, TRUTH, failed, ok, truths
 

@@ -1,4 +1,4 @@
-"""Two parallel cameras: vectors from disparity, and what rahman2011 and kim make of them."""
+"""Stereo: vectors from disparity, and the positions by rahman2011 and kim."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -108,7 +108,7 @@ def test_two_leds_have_a_yaw_and_one_has_none() -> None:
 
 
 def frame_of(offset_m: tuple[float, float, float] = (0, 0, 0), R_cam_rig: Array = LEVEL) -> DeviceFrame:
-    """A frame with nothing in it but where its camera sits."""
+    """A frame without content, with a camera at a place on the rig."""
     camera = Camera.model_construct(offset_m=offset_m, R_cam_rig=tuple(map(tuple, R_cam_rig)))
     return DeviceFrame((), camera, Sensor.model_construct(), (0.0, 0.0, 9.8), 0.0, 1e-3, (), {})
 
@@ -127,7 +127,7 @@ def test_the_partner_is_the_parallel_camera_with_the_longest_baseline() -> None:
 
 
 def test_the_baseline_is_in_the_cameras_own_axes() -> None:
-    """Both turned by 90 deg: what is along x of the rig is along -y of theirs."""
+    """Both turned by 90 deg: x of the rig is -y of the cameras."""
     one, other = frame_of((0, 0, 0), turned(90)), frame_of((0.1, 0, 0), turned(90))
     np.testing.assert_allclose(stereo_partner(replace(one, other_cameras=(other,)))[1], [0, -0.1], atol=1e-15)
 

@@ -1,4 +1,4 @@
-"""Poses from gravity and two LEDs, and what the exact methods say of the same exact points."""
+"""Upright two-point pose: exact for exact points, and in agreement with other methods."""
 
 import cv2
 import numpy as np
@@ -27,7 +27,7 @@ def random_view(rng: np.random.Generator, leds_m: Array) -> View:
 
 
 def test_up2p_sqpnp_and_the_range_fit_agree_on_exact_points() -> None:
-    """Three ways that share nothing but the points, at 200 poses: to a micrometre."""
+    """Three independent methods at 200 poses agree to a micrometre."""
     rng = np.random.default_rng(11)
     for _ in range(200):
         leds = grid(4, 3, 0.13, (3.5, 3.6, 3.5)) + np.append(rng.uniform(-0.03, 0.03, 2), 0)

@@ -1,4 +1,4 @@
-"""Several processes give what one gives."""
+"""Worker processes give the same rows as one process."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The rivals of Table 3 on rendered frames of the camera that each needs: the recipes of datasets/, at fewer pixels."""
+"""The rivals of Table 3 on rendered frames of the cameras they need: the recipes of datasets/, at fewer pixels."""
 
 from collections.abc import Sequence
 from pathlib import Path

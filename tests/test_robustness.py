@@ -215,7 +215,7 @@ MAY_BE_WRONG = {
     "gravity reads wrong": WRONG_TILT,
     "upside down": WRONG_TILT,
 }
-"""Cases in which a variant may be wrong, unless it is a robust one."""
+"""Cases in which a variant may have a large error, unless it is a robust one."""
 WRONG_ALWAYS = {"huynh2016-as-printed": "its printed equations are wrong, even without noise"}
 
 

@@ -1,4 +1,4 @@
-"""What an accelerometer's error costs huynh2016, predicted to first order and measured on images."""
+"""Error of huynh2016 by the accelerometer's error: predicted to first order, and measured on images."""
 
 from dataclasses import replace
 from pathlib import Path

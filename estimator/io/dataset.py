@@ -221,8 +221,18 @@ def read_frame(dataset: Dataset, frame: FrameRecord | int, *, with_other_cameras
     )
     if not with_other_cameras:
         return made
-    others = [other for other in dataset.frames if other.shot == record.shot and other.frame != record.frame]
+    others = [other for other in _shot(dataset, record) if other.frame != record.frame]
     return replace(made, other_cameras=tuple(read_frame(dataset, other, with_other_cameras=False) for other in others))
+
+
+def _shot(dataset: Dataset, record: FrameRecord) -> tuple[FrameRecord, ...]:
+    """Records of the frames of a record's shot, which are consecutive."""
+    first = end = record.frame
+    while first > 0 and dataset.frames[first - 1].shot == record.shot:
+        first -= 1
+    while end < len(dataset.frames) and dataset.frames[end].shot == record.shot:
+        end += 1
+    return dataset.frames[first:end]
 
 
 def _read_exr(folder: Path, record: FrameRecord, camera: Camera) -> tuple[Part, ...]:

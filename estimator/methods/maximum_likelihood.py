@@ -44,7 +44,7 @@ MAX_DEVIANCE_RATIO = 1.01
 # Signal-to-noise ratio of an LED's amplitude below which it is not used.
 MIN_SIGNAL_TO_NOISE = 5.0
 # Among LEDs that are not explained, those with at least this share of the largest excess are excluded together.
-WORST_SHARE = 0.25
+MIN_EXCLUDED_SHARE = 0.25
 # Accuracy of centroids, with the model error: determines which LEDs' images are certain at the start.
 START_SIGMA_PX = 0.05
 MIN_FOR_CONSENSUS = 3
@@ -224,7 +224,7 @@ def _unexplained(result: _ScoringResult) -> Mask:
     if result.faint.any():
         return result.faint
     excess = np.where(result.used, result.excess, 0.0)
-    return np.asarray((excess > 0) & (excess >= WORST_SHARE * excess.max()))
+    return np.asarray((excess > 0) & (excess >= MIN_EXCLUDED_SHARE * excess.max()))
 
 
 ML = Variant(

@@ -4,6 +4,8 @@ An LED, the projection centre and the LED's image lie on one line: `p_cam = R (a
 the projection of `p_cam`. Each LED gives two equations in the six unknowns, p and R.
 """
 
+from functools import cache
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -61,10 +63,9 @@ def starts(leds_m: Floats, directions: Floats) -> list[Pose]:
     yaw, height and position. Tilts are therefore tried on a grid. Each local minimum of the misfit of the similarity is
     an initial pose. LEDs at different heights are treated as LEDs at their mean height.
     """
-    axis = np.radians(np.arange(-MAX_START_DEG, MAX_START_DEG + START_STEP_DEG / 2, START_STEP_DEG))
-    leveling = np.array([[rotation(tilt_x, tilt_y) for tilt_y in axis] for tilt_x in axis])
+    leveling = _tilt_grid()
     rays = directions @ leveling
-    up = (rays[..., 2] >= MIN_ELEVATION_SINE).all(axis=-1)
+    up: NDArray[np.bool_] = np.asarray((rays[..., 2] >= MIN_ELEVATION_SINE).all(axis=-1))
     spots = (rays[..., 0] + 1j * rays[..., 1]) / np.where(up[..., None], rays[..., 2], 1.0)
     centred = spots - spots.mean(axis=-1, keepdims=True)
     ceiling = leds_m[:, 0] + 1j * leds_m[:, 1]
@@ -83,6 +84,13 @@ def starts(leds_m: Floats, directions: Floats) -> list[Pose]:
         position_m = np.array([place.real, place.imag, leds_m[:, 2].mean() - 1 / abs(scale[i, j])])
         poses.append(Pose(position_m, R_cam_world))
     return poses
+
+
+@cache
+def _tilt_grid() -> Floats:
+    """Rotations of the grid of tilts, (n, n, 3, 3), the same for every frame."""
+    axis = np.radians(np.arange(-MAX_START_DEG, MAX_START_DEG + START_STEP_DEG / 2, START_STEP_DEG))
+    return np.array([[rotation(tilt_x, tilt_y) for tilt_y in axis.tolist()] for tilt_x in axis.tolist()])
 
 
 def fit_pose(leds_m: Floats, image: Floats, projection: Projection, start: Pose) -> tuple[Pose, float] | None:
