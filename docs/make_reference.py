@@ -117,10 +117,10 @@ def tables_of(schema: Schema, kind: str) -> list[Table]:
 
 
 def undescribed(schema: Schema) -> list[str]:
-    """Keys without a description, as TABLE.key; the constant keys format, version and kind explain themselves."""
-    models = {"": schema, **schema.get("$defs", {})}
+    """Keys without a description, as MODEL.key; the constant keys format, version and kind explain themselves."""
+    models = {schema["title"]: schema, **schema.get("$defs", {})}
     return sorted(
-        f"{model}.{key}".lstrip(".")
+        f"{model}.{key}"
         for model, tree in models.items()
         for key, node in tree.get("properties", {}).items()
         if "description" not in node and "const" not in node

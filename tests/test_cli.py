@@ -148,6 +148,18 @@ def test_show_draws_and_counts(tmp_path: Path) -> None:
     assert " 36 " in result.stdout  # of 122 500 level poses, as the errata say
 
 
+def test_packaged_names_stand_for_files(tmp_path: Path) -> None:
+    """In a folder that has no file of the name; a recipe's sensor may be measured by the recipe's name too."""
+    refused = run("vlcrender", "generate", "quick", "--out", "x", cwd=tmp_path)
+    assert_refused(refused, "quick: is neither a file nor one of the recipes there are", "quickstart", "table1")
+    assert_refused(run("vlcrender", "show", "offic", cwd=tmp_path), "offic: is neither", "scenes", "office")
+    small = [*SETS, "--set", "poses.count=1"]
+    assert run("vlcrender", "generate", "quickstart", "--out", "set", *small, cwd=tmp_path).returncode == 0
+    measured = run("vlcrender", "datasheet", "quickstart", "--side-px", "32", cwd=tmp_path)
+    assert measured.returncode == 0, measured.stderr
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["quickstart-datasheet.html", "set"]
+
+
 def test_unknown_commands_are_refused() -> None:
     assert_refused(run("vlcrender", "genrate"), "genrate")
     assert_refused(run("estimator", "estimate"), "estimate")
