@@ -118,7 +118,7 @@ from vlcrender.dataset.generate import generate
 from vlcrender.dataset.recipe import load_plan
 plan = load_plan(Path("datasets/quickstart.toml"), sys.argv[4:])
 seen = []
-generate(plan, out, workers, progress=lambda done, total: seen.append(variant == "unset" or mitsuba.variant()))
+generate(plan, out, workers, progress=lambda report: seen.append(variant == "unset" or mitsuba.variant()))
 import mitsuba
 print(json.dumps({
     "variant": mitsuba.variant(),

@@ -10,15 +10,12 @@ import OpenEXR
 from numpy.typing import NDArray
 
 from vlcrender.camera.intrinsics import Camera
-from vlcrender.camera.roi import Roi
+from vlcrender.camera.roi import RegionImage, Roi
 from vlcrender.dataset.files import sha256_of
 from vlcrender.errors import InputError
 
-RegionPixels = tuple[Roi, NDArray[np.uint32] | NDArray[np.float32]]
-"""A region and its pixels (rows, columns)."""
 
-
-def write_exr(path: Path, images: Sequence[RegionPixels], sensor: Roi, attributes: Mapping[str, Any]) -> str:
+def write_exr(path: Path, images: Sequence[RegionImage], sensor: Roi, attributes: Mapping[str, Any]) -> str:
     """Write regions of a sensor, one channel (Y), losslessly, and return the file's SHA-256.
 
     The file appears whole or not at all. Raises InputError where it cannot be written.

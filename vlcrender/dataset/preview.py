@@ -6,14 +6,13 @@ from pathlib import Path
 import numpy as np
 from matplotlib.image import imsave
 
-from vlcrender.camera.roi import Roi
-from vlcrender.dataset.exr import RegionPixels
+from vlcrender.camera.roi import RegionImage, Roi
 
 MAX_SIDE_PX = 800
 """Largest width and height of a preview."""
 
 
-def write_preview(path: Path, images: Sequence[RegionPixels], sensor: Roi, white_dn: int, black_dn: int = 0) -> None:
+def write_preview(path: Path, images: Sequence[RegionImage], sensor: Roi, white_dn: int, black_dn: int = 0) -> None:
     """Write a small grey picture: block means above the black level, gamma 2.2.
 
     It shows the sensor and all regions; pixels outside the regions are black.
