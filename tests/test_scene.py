@@ -194,7 +194,7 @@ def test_half_widths_are_radii_of_discs_and_half_sides_of_squares() -> None:
     leds = build_scene(check(tree, SceneSettings, "test"), "test").leds
     assert leds.half_widths_m.tolist() == [0.01, 0.01]
     assert leds.areas_m2 == pytest.approx([np.pi * 1e-4, 4e-4])
-    assert leds.reaches_m == pytest.approx([0.01, np.sqrt(2) * 0.01])
+    assert leds.circumradii_m == pytest.approx([0.01, np.sqrt(2) * 0.01])
 
 
 def test_a_room_without_leds_is_refused(tmp_path: Path) -> None:

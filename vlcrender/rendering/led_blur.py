@@ -86,7 +86,7 @@ def led_blur(leds: Leds, posed: PosedCamera) -> LedBlur:
     led_depths_m = np.maximum(posed.focus_depths_m(leds.centers_m), MIN_DEPTH_M)
     depth_m: dict[int, float] = {}
     by_depth: dict[float, LedKernel] = {}
-    for i in candidate_leds(posed, leds.centers_m, leds.reaches_m, BLUR_MARGIN_PX).tolist():
+    for i in candidate_leds(posed, leds.centers_m, leds.circumradii_m, BLUR_MARGIN_PX).tolist():
         depth = float(np.exp(np.round(np.log(led_depths_m[i]) / DEPTH_STEP) * DEPTH_STEP))
         if split_for(camera, depth) > 1:
             # A narrow disc may change more within a step than it is wide. Without a focus depth has no effect.

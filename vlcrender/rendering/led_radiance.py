@@ -63,7 +63,7 @@ def led_images(
     overscan = regions is not None and regions.overscan
     margin_px = _overscan_px(camera) if overscan else blurs.radius_px
     imaged = []
-    for i in candidate_leds(posed, leds.centers_m, leds.reaches_m, margin_px).tolist():
+    for i in candidate_leds(posed, leds.centers_m, leds.circumradii_m, margin_px).tolist():
         image = coverage_of_led(posed, face_of_led(leds, i), margin_px)
         if image is None:
             continue

@@ -60,7 +60,7 @@ def specular_reflections(
     leds, glazing, camera = scene.leds, scene.glazings[number], posed.camera
     mirrored = posed.at(mirrored_pose(posed.pose, glazing))
     found = []
-    for i in candidate_leds(mirrored, leds.centers_m, leds.reaches_m).tolist():
+    for i in candidate_leds(mirrored, leds.centers_m, leds.circumradii_m).tolist():
         image = coverage_of_led(mirrored, face_of_led(leds, i))
         if image is None:
             continue

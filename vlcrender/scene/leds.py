@@ -41,7 +41,7 @@ class Leds:
         return np.where(self.squares, 4.0, np.pi) * self.half_widths_m**2
 
     @property
-    def reaches_m(self) -> NDArray[np.float64]:
+    def circumradii_m(self) -> NDArray[np.float64]:
         """Distance from each centre to the farthest luminous point, (n,).
 
         The rim of a disc, a corner of a square or of the lit part of a diffuser.

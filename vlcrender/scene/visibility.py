@@ -47,7 +47,9 @@ def leds_in_view(posed: PosedCamera, scene: Scene, margin_px: float = 0.0) -> ND
     angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     rim = np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=1)
     # The 24-gon about the circle: a sensor that contains it contains the circle.
-    points = leds.centers_m[candidates, None, :] + rim * (leds.reaches_m[candidates, None, None] / np.cos(np.pi / 24))
+    points = leds.centers_m[candidates, None, :] + rim * (
+        leds.circumradii_m[candidates, None, None] / np.cos(np.pi / 24)
+    )
     pixels = posed.project(points)
     inside = (pixels >= margin_px) & (pixels <= np.array([camera.width_px, camera.height_px]) - margin_px)
     seen = inside.all(axis=(-1, -2)) & (posed.pose.position_m[2] < leds.centers_m[candidates, 2])
