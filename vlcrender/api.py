@@ -233,11 +233,17 @@ def expose(
         RawRegion(
             part.roi,
             digital_numbers(
-                sensor, part.expected_electrons(exposure_s), noise, part.roi.row, part.roi.column, exposure_s
+                sensor,
+                part.expected_electrons(exposure_s),
+                noise,
+                part.roi.row,
+                part.roi.column,
+                exposure_s=exposure_s,
             ),
         )
         for part in mean.parts
     )
+    spots = decoded_spots(mean.parts, mean.camera.width_px, stream(int(seed), int(frame), "demodulator"))
     return RawFrame(
         mean.scene,
         mean.camera,
@@ -246,7 +252,7 @@ def expose(
         exposure_s,
         parts,
         device.reading_m_s2(mean.pose, stream(int(seed), int(frame), "accelerometer")),
-        tuple(decoded_spots(mean.parts, mean.camera.width_px, stream(int(seed), int(frame), "demodulator"))),
+        tuple(dict(spot) for spot in spots),
     )
 
 
