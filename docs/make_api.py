@@ -59,7 +59,7 @@ def _members(target: griffe.Class) -> Iterator[str]:
     for name, member in target.members.items():
         if name.startswith("_") or name == "model_config":
             continue
-        text = " ".join(_docstring(member).split())
+        text = _summary(member)
         if isinstance(member, griffe.Function):
             yield f"`{_signature(member)}`: {text}"
         elif isinstance(member, griffe.Attribute):
@@ -79,7 +79,30 @@ def _signature(function: griffe.Function) -> str:
 
 
 def _docstring(target: griffe.Object | griffe.Alias) -> str:
-    return target.docstring.value.strip() if target.docstring is not None else ""
+    """The docstring, Markdown: sections of the numpydoc convention become lists."""
+    return "\n\n".join(filter(None, (_section(section) for section in _sections(target))))
+
+
+def _summary(target: griffe.Object | griffe.Alias) -> str:
+    """The docstring without its lists, in one line."""
+    texts = [section.value for section in _sections(target) if section.kind is griffe.DocstringSectionKind.text]
+    return " ".join(" ".join(texts).split())
+
+
+def _sections(target: griffe.Object | griffe.Alias) -> list[griffe.DocstringSection]:
+    return [] if target.docstring is None else target.docstring.parse("numpy", warnings=False)
+
+
+def _section(section: griffe.DocstringSection) -> str:
+    if section.kind is griffe.DocstringSectionKind.text:
+        return str(section.value).strip()
+    if section.kind is griffe.DocstringSectionKind.examples:
+        return "\n\n".join(str(text) for _, text in section.value)
+    lines = []
+    for item in section.value:
+        name = str(getattr(item, "name", "") or item.annotation or "")
+        lines.append(f"- `{name}`: {' '.join(item.description.split())}")
+    return f"{section.kind.value.capitalize()}:\n\n" + "\n".join(lines)
 
 
 def files() -> dict[Path, str]:

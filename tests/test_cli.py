@@ -1,4 +1,4 @@
-"""The commands as a user meets them: every mistake is one line that names it, and exit code 2."""
+"""The command line: every mistake is one line that names it, and exit code 2."""
 
 import json
 import os
@@ -93,7 +93,7 @@ def test_generate_refuses(tmp_path: Path, mistake: str) -> None:
     assert not (tmp_path / "x").exists()
 
 
-def test_generate_refuses_recipes_that_are_no_recipes(tmp_path: Path) -> None:
+def test_generate_refuses_files_that_are_not_recipes(tmp_path: Path) -> None:
     assert_refused(run("vlcrender", "generate", "no.toml", "--out", "x", cwd=tmp_path), "no.toml", "No such file")
     assert_refused(run("vlcrender", "generate", TABLE1, "--out", "x", cwd=tmp_path), "table1.toml", "format")
     (tmp_path / "binary.toml").write_bytes(bytes(range(256)))
@@ -102,7 +102,7 @@ def test_generate_refuses_recipes_that_are_no_recipes(tmp_path: Path) -> None:
     assert_refused(run("vlcrender", "generate", cwd=tmp_path), "RECIPE")
 
 
-def test_generate_does_not_write_where_it_may_not(tmp_path: Path) -> None:
+def test_generate_refuses_an_output_folder_below_a_file(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("mine")
     out = str(tmp_path / "file" / "below")
     assert_refused(run("vlcrender", "generate", RECIPE, "--out", out, *SETS), str(tmp_path / "file"))
@@ -121,7 +121,7 @@ def test_a_recipe_with_an_out_of_room_pose_is_refused(tmp_path: Path) -> None:
     )
 
 
-def test_verify_accepts_what_is_intact_and_names_what_is_not(dataset: Path, tmp_path: Path) -> None:
+def test_verify_accepts_an_intact_data_set_and_names_damage(dataset: Path, tmp_path: Path) -> None:
     assert run("vlcrender", "verify", str(dataset)).returncode == 0
     assert_refused(run("vlcrender", "verify", str(tmp_path)), str(tmp_path), "dataset.json")
     damaged = copy_of(dataset, tmp_path)
@@ -218,7 +218,7 @@ def test_a_terminal_without_degree_signs_gets_question_marks(tmp_path: Path) -> 
 
 
 def test_a_page_that_cannot_be_written_costs_no_measurement(tmp_path: Path) -> None:
-    """A folder is refused before the measurement; a full disk, which no check foresees, comes after what was found."""
+    """A folder is refused before the measurement; a full disk is noticed after the results are printed."""
     assert_refused(run_here("datasheet", "ideal", "--out", str(tmp_path)), f"--out {tmp_path}: is a folder")
     result = run_here("datasheet", "ideal", "--side-px", "32", "--out", "/dev/full")
     assert_refused(result, "No space left")
@@ -230,14 +230,14 @@ def test_messages_with_line_breaks_are_one_line(tmp_path: Path) -> None:
         assert_refused(run_here("generate", RECIPE, "--out", str(tmp_path / "x"), "--set", assignment), "b")
 
 
-def test_a_folder_whose_name_is_no_text_is_refused(tmp_path: Path) -> None:
+def test_a_folder_whose_name_is_not_utf_8_is_refused(tmp_path: Path) -> None:
     out = os.fsencode(tmp_path) + b"/x\xff"
     code = "from vlcrender.cli import main; main()"
     command = [sys.executable, "-c", code, "generate", RECIPE, "--out", out, *SETS]
     assert_refused(subprocess.run(command, cwd=ROOT, capture_output=True, text=True), "--out", "UTF-8")
 
 
-def test_who_reads_no_further_is_no_error(tmp_path: Path) -> None:
+def test_a_closed_pipe_is_no_error(tmp_path: Path) -> None:
     code = "from vlcrender.cli import main; main()"
     page = str(tmp_path / "page.html")
     command = [sys.executable, "-c", code, "datasheet", "ideal", "--side-px", "32", "--json", "--out", page]

@@ -237,6 +237,7 @@ def expose(
         )
         for part in mean.parts
     )
+    spots = decoded_spots(mean.parts, mean.camera.width_px, stream(int(seed), int(frame), "demodulator"))
     return RawFrame(
         mean.scene,
         mean.camera,
@@ -245,7 +246,7 @@ def expose(
         exposure_s,
         parts,
         device.reading_m_s2(mean.pose, stream(int(seed), int(frame), "accelerometer")),
-        tuple(decoded_spots(mean.parts, mean.camera.width_px, stream(int(seed), int(frame), "demodulator"))),
+        tuple(dict(spot) for spot in spots),
     )
 
 

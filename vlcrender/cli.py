@@ -60,7 +60,7 @@ def generate(
     set_
         key=value that replaces a value of the recipe, e.g. camera.f_number=2.8. May be repeated.
     scale
-        Bin N x N pixels into one, for quick looks; N has to divide the camera's width and height.
+        Bin N x N pixels into one, for previews; N has to divide the camera's width and height.
     scale_mode
         Whether larger pixels keep all photons (full well and gain grow with them), or as many as the small ones had
         (the exposure is shorter).
@@ -72,7 +72,7 @@ def generate(
     from vlcrender import api
 
     if workers < 1:
-        raise InputError(f"--workers {workers}: is not 1 or more")
+        raise InputError(f"--workers {workers}: has to be 1 or more")
     plan = api.load_recipe(recipe, set_, scale=scale, scale_mode=scale_mode)
     with _Bar(plan.recipe.name, plan.recipe.frame_count) as bar:
         made = api.generate(plan, out, workers=workers, scheduler=scheduler, progress=bar.show)
@@ -228,17 +228,17 @@ def datasheet(
     from vlcrender.emva1288.page import page
 
     if not 32 <= side_px <= 4096:
-        raise InputError(f"--side-px {side_px}: is not 32 to 4096")
+        raise InputError(f"--side-px {side_px}: has to be from 32 to 4096")
     if not 200 <= wavelength_nm <= 1200:
-        raise InputError(f"--wavelength-nm {wavelength_nm:g}: is not 200 to 1200")
+        raise InputError(f"--wavelength-nm {wavelength_nm:g}: has to be from 200 to 1200")
     if sensor not in presets("sensors") and sensor in packaged_names("recipe"):
         sensor = str(find_file("recipe", sensor))
     name, settings = load_sensor(sensor)
     path = out or Path(f"{name}-datasheet.html")
     if not path.parent.is_dir():
-        raise InputError(f"--out {path}: no such folder as {path.parent}")
+        raise InputError(f"--out {path}: there is no folder {path.parent}")
     if path.is_dir():
-        raise InputError(f"--out {path}: is a folder; the name of a file is needed")
+        raise InputError(f"--out {path}: is a folder; give the name of a file")
     with Console(stderr=True).status("measuring") as status:
         sheet = make_datasheet(
             name, settings, wavelength_nm, side_px, lambda frames: status.update(f"measuring: {frames} frames")

@@ -5,8 +5,9 @@ does not depend on `mitsuba.set_variant`, which is one setting for the whole pro
 changes it, so a program may use Mitsuba in a variant of its own beside this package, in any thread.
 
 With an LLVM older than 17 trivial kernels pass and real ones end the process. So this module finds a library that is
-new enough before Dr.Jit is imported, and checks which one Dr.Jit has loaded. The environment variable
-DRJIT_LIBLLVM_PATH is set during that import only.
+new enough before Dr.Jit is imported, and checks which one Dr.Jit has loaded. If a program has imported Dr.Jit before,
+with an older one, Dr.Jit is restarted, or refused if it has been used. The environment variable DRJIT_LIBLLVM_PATH is
+set only while Dr.Jit loads LLVM.
 
 The environment variable VLCRENDER_VARIANT may choose CUDA. CUDA kernels round in other places and OptiX casts the
 rays, not Embree: results differ from LLVM's in the last bits, so a dataset is the same bit for bit only if one
@@ -132,7 +133,7 @@ def _import_drjit(variant: str) -> Any:
 
 def _llvm_in_use(drjit: Any) -> int:
     """Major version of the LLVM that Dr.Jit has loaded, negative without one."""
-    drjit.has_backend(drjit.JitBackend.LLVM)  # waits until Dr.Jit has looked for LLVM; the next call does not
+    drjit.has_backend(drjit.JitBackend.LLVM)  # waits for Dr.Jit's search for LLVM; the next call does not
     return int(drjit.detail.llvm_version()[0])
 
 
