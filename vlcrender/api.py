@@ -246,7 +246,7 @@ def expose(
         exposure_s,
         parts,
         device.reading_m_s2(mean.pose, stream(int(seed), int(frame), "accelerometer")),
-        tuple(dict(spot) for spot in spots),
+        tuple(spots),
     )
 
 
