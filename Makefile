@@ -45,5 +45,11 @@ $(READY): requirements.txt pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
 	touch $@
 
+# Not in CI: the map takes about ten minutes, each mutant a few seconds to minutes; runs go on where they stopped.
+mutants: $(READY)
+	test -f out/mutants/coverage.sqlite || $(BIN)/python tests/mutation/run.py map
+	$(BIN)/python tests/mutation/run.py chosen
+	$(BIN)/python tests/mutation/run.py sample --count 150 --seed 7
+
 clean:
 	rm -rf .venv out

@@ -1,0 +1,294 @@
+"""Mutation testing: does a test fail where the code is changed?
+
+    python tests/mutation/run.py map                        which tests execute which lines (once, some ten minutes)
+    python tests/mutation/run.py chosen [--only NAME]       the kept lists, chosen_*.toml
+    python tests/mutation/run.py sample --count 150 --seed 7
+
+Each mutant is one change to one file of a copy of the checkout. The tests that execute the changed line run against it,
+quickest first, up to the first failure: killed. A mutant whose tests all pass survived: a test is missing, or the
+change is equivalent (equivalent.toml says why). Runs go on where they stopped: results are kept in
+out/mutants/results.jsonl under a hash of the mutated source and of the tests.
+"""
+
+import argparse
+import concurrent.futures
+import hashlib
+import json
+import os
+import random
+import shutil
+import sqlite3
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import tomllib
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+HERE = Path(__file__).parent
+ROOT = HERE.parent.parent
+sys.path.insert(0, str(HERE))
+from operators import sites  # noqa: E402  beside this file
+
+OUT = ROOT / "out/mutants"
+PACKAGES = ("vlcrender", "estimator")
+MAX_TEST_S = 240.0
+"""Recorded time of the tests that one mutant is held against; the quickest are taken."""
+PATIENCE = 4.0
+"""A mutant that takes this many times the recorded time, and a minute, hangs: killed."""
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """One change: the mutated source of `file`, whose changed text starts in `line`."""
+
+    name: str
+    file: str
+    line: int
+    source: str
+    change: str
+
+    @property
+    def digest(self) -> str:
+        """Of file and mutated source."""
+        return hashlib.sha256(f"{self.file}\0{self.source}".encode()).hexdigest()[:16]
+
+
+def chosen(names: Iterable[str]) -> list[Mutant]:
+    """The kept lists; SystemExit where an entry no longer fits its file."""
+    wanted = set(names)
+    mutants = []
+    for entry in tomllib.loads((HERE / "chosen.toml").read_text())["mutant"]:
+        if wanted and entry["name"] not in wanted:
+            continue
+        source = (ROOT / entry["file"]).read_text()
+        if source.count(entry["old"]) != 1:
+            sys.exit(
+                f"chosen.toml: {entry['name']}: {source.count(entry['old'])} places in {entry['file']}, needed one"
+            )
+        start = source.index(entry["old"])
+        line = source.count("\n", 0, start) + 1 + _first_difference(entry["old"], entry["new"])
+        mutated = source.replace(entry["old"], entry["new"])
+        mutants.append(Mutant(entry["name"], entry["file"], line, mutated, f"{entry['old']} -> {entry['new']}"))
+    return mutants
+
+
+def _first_difference(old: str, new: str) -> int:
+    """The line of `old`, from 0, in which `new` starts to differ."""
+    same = next((i for i, (a, b) in enumerate(zip(old, new, strict=False)) if a != b), min(len(old), len(new)) - 1)
+    return old.count("\n", 0, max(same, 0))
+
+
+def sample(count: int, seed: int) -> list[Mutant]:
+    """Sites drawn evenly over all sites of both packages."""
+    places = []
+    for file in sorted(str(p.relative_to(ROOT)) for package in PACKAGES for p in (ROOT / package).rglob("*.py")):
+        source = (ROOT / file).read_text()
+        places += [(file, site, source) for site in sites(source)]
+    mutants = []
+    for file, site, source in random.Random(seed).sample(places, min(count, len(places))):
+        old = source[site.start : site.end].strip()
+        name = f"{file}:{site.line}:{site.start}"
+        mutants.append(Mutant(name, file, site.line, site.applied(source), f"{old} -> {site.replacement.strip()}"))
+    return mutants
+
+
+class Map:
+    """Which tests execute which lines, and how long each takes; made by `map`."""
+
+    def __init__(self) -> None:
+        """Read what `make_map` recorded."""
+        if not (OUT / "coverage.sqlite").exists():
+            sys.exit("no map of tests yet: run `python tests/mutation/run.py map` first")
+        self._times = json.loads((OUT / "times.json").read_text())
+        self._rows: dict[str, dict[int, set[str]]] = {}
+        connection = sqlite3.connect(OUT / "coverage.sqlite")
+        contexts = dict(connection.execute("select id, context from context"))
+        query = "select path, context_id, numbits from line_bits join file on file.id = line_bits.file_id"
+        for path, context, bits in connection.execute(query):
+            test = contexts[context].split("|")[0]
+            if not test:
+                continue
+            lines = self._rows.setdefault(str(Path(path).resolve().relative_to(ROOT)), {})
+            for line in (8 * i + bit for i, byte in enumerate(bits) for bit in range(8) if byte >> bit & 1):
+                lines.setdefault(line, set()).add(test)
+
+    def tests(self, file: str, line: int) -> tuple[list[str], float]:
+        """Tests that execute a line, quickest first, and their time; of a line run at import, the whole file's."""
+        lines = self._rows.get(file, {})
+        near = lines.get(line) or set().union(*lines.values()) if lines else set()
+        ordered = sorted(near, key=lambda test: (self._times.get(test, 1.0), test))
+        total, taken = 0.0, []
+        for test in ordered:
+            total += self._times.get(test, 1.0)
+            if taken and total > MAX_TEST_S:
+                break
+            taken.append(test)
+        return taken, min(total, MAX_TEST_S)
+
+
+def make_map() -> None:
+    """Run all tests once under coverage.py with a context a test, and keep lines, branches and times."""
+    OUT.mkdir(parents=True, exist_ok=True)
+    settings = OUT / "coverage.ini"
+    settings.write_text(
+        f"[run]\nbranch = false\nsource = {','.join(PACKAGES)}\ndata_file = {OUT / 'coverage.sqlite'}\n"
+    )
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--cov", "--cov-context=test"]
+    command += [f"--cov-config={settings}", "--cov-report=", f"--junitxml={OUT / 'times.xml'}"]
+    subprocess.run(command, cwd=ROOT, check=False, env=_environment(ROOT))
+    import xml.etree.ElementTree as Tree
+
+    times: dict[str, float] = {}
+    for case in Tree.parse(OUT / "times.xml").iter("testcase"):
+        name = f"{case.get('classname', '').replace('.', '/')}.py::{case.get('name')}"
+        times[name] = float(case.get("time", 1.0))
+    (OUT / "times.json").write_text(json.dumps(times))
+
+
+def _environment(root: Path) -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": str(root), "PYTHONDONTWRITEBYTECODE": "1"}
+
+
+class Sandboxes:
+    """Copies of the checkout, one a thread, in which files are changed."""
+
+    def __init__(self) -> None:
+        """Start with none."""
+        self._of_thread = threading.local()
+        self._folder = Path(tempfile.mkdtemp(prefix="vlcrender-mutants-"))
+        self._count = 0
+        self._lock = threading.Lock()
+
+    def mine(self) -> Path:
+        """This thread's copy, made at the first call."""
+        if not hasattr(self._of_thread, "path"):
+            with self._lock:
+                self._count += 1
+                path = self._folder / str(self._count)
+            listed = subprocess.run(
+                ["git", "ls-files", "-co", "--exclude-standard"], cwd=ROOT, check=True, capture_output=True
+            )
+            for name in listed.stdout.decode().splitlines():
+                if (ROOT / name).is_file():
+                    (path / name).parent.mkdir(parents=True, exist_ok=True)
+                    shutil.copy2(ROOT / name, path / name)
+            self._of_thread.path = path
+        return Path(self._of_thread.path)
+
+    def remove(self) -> None:
+        """Delete all copies."""
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+
+def judge(mutant: Mutant, tests: Map, sandboxes: Sandboxes) -> dict[str, object]:
+    """Run the tests of a mutant: killed by which, or survived."""
+    names, seconds = tests.tests(mutant.file, mutant.line)
+    result: dict[str, object] = {"name": mutant.name, "change": mutant.change, "tests": len(names)}
+    if not names:
+        return {**result, "outcome": "survived", "by": "no test executes this line", "s": 0.0}
+    root = sandboxes.mine()
+    target = root / mutant.file
+    original = target.read_text()
+    start = time.monotonic()
+    try:
+        target.write_text(mutant.source)
+        command = [sys.executable, "-P", "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "--no-header", *names]
+        with tempfile.TemporaryDirectory() as cache:
+            done = subprocess.run(
+                command,
+                cwd=root,
+                env={**_environment(root), "VLCRENDER_CACHE": cache},
+                capture_output=True,
+                text=True,
+                timeout=60 + PATIENCE * seconds,
+                start_new_session=True,
+            )
+    except subprocess.TimeoutExpired:
+        return {**result, "outcome": "killed", "by": "time", "s": time.monotonic() - start}
+    finally:
+        target.write_text(original)
+    took = time.monotonic() - start
+    if done.returncode == 0:
+        return {**result, "outcome": "survived", "by": "", "s": took}
+    failed = [line for line in done.stdout.splitlines() if line.startswith(("FAILED", "ERROR"))]
+    return {**result, "outcome": "killed", "by": failed[0][:160] if failed else f"exit {done.returncode}", "s": took}
+
+
+def run(mutants: list[Mutant], workers: int) -> int:
+    """Judge all mutants that have no result yet; print each and the score. The number of survivors."""
+    tests, sandboxes = Map(), Sandboxes()
+    state = _digest_of_tests()
+    kept = OUT / "results.jsonl"
+    known = {}
+    if kept.exists():
+        for line in kept.read_text().splitlines():
+            row = json.loads(line)
+            # A kill stays one; a survivor is tried again when tests have changed.
+            if row["outcome"] == "killed" or row["state"] == state:
+                known[row["digest"]] = row
+    explained = {}
+    if (HERE / "equivalent.toml").exists():
+        entries = tomllib.loads((HERE / "equivalent.toml").read_text()).get("mutant", [])
+        explained = {(entry["file"], entry["change"]): entry["why"] for entry in entries}
+    lock, outcomes, survivors = threading.Lock(), Counter[str](), []
+    try:
+        with concurrent.futures.ThreadPoolExecutor(workers) as pool:
+            pending = {pool.submit(lambda m=m: known.get(m.digest) or judge(m, tests, sandboxes)): m for m in mutants}
+            for future in concurrent.futures.as_completed(pending):
+                mutant, row = pending[future], future.result()
+                outcome = str(row["outcome"])
+                why = explained.get((mutant.file, mutant.change))
+                if outcome == "survived" and why:
+                    outcome = "equivalent"
+                with lock:
+                    outcomes[outcome] += 1
+                    if mutant.digest not in known:
+                        with kept.open("a") as file:
+                            file.write(json.dumps({**row, "digest": mutant.digest, "state": state}) + "\n")
+                    if outcome == "survived":
+                        survivors.append(mutant.name)
+                    print(f"{outcome:10} {mutant.name}: {mutant.change!r} {row['by']} ({row['s']:.0f} s)", flush=True)
+    finally:
+        sandboxes.remove()
+    counted = outcomes["killed"] + outcomes["survived"]
+    print(
+        f"{outcomes['killed']} of {counted} killed ({100 * outcomes['killed'] / max(counted, 1):.1f} %), "
+        f"{outcomes['equivalent']} equivalent and not counted"
+    )
+    return len(survivors)
+
+
+def _digest_of_tests() -> str:
+    digest = hashlib.sha256()
+    for path in sorted((ROOT / "tests").glob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def main() -> None:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(description="Mutation testing of vlcrender and estimator")
+    commands = parser.add_subparsers(dest="command", required=True)
+    commands.add_parser("map")
+    of_chosen = commands.add_parser("chosen")
+    of_chosen.add_argument("--only", action="append", default=[])
+    of_sample = commands.add_parser("sample")
+    of_sample.add_argument("--count", type=int, default=150)
+    of_sample.add_argument("--seed", type=int, default=1)
+    for command in (of_chosen, of_sample):
+        command.add_argument("--workers", type=int, default=2)
+    arguments = parser.parse_args()
+    if arguments.command == "map":
+        make_map()
+        return
+    mutants = chosen(arguments.only) if arguments.command == "chosen" else sample(arguments.count, arguments.seed)
+    sys.exit(1 if run(mutants, arguments.workers) else 0)
+
+
+if __name__ == "__main__":
+    main()
