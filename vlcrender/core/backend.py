@@ -11,7 +11,9 @@ set only while Dr.Jit loads LLVM.
 
 The environment variable VLCRENDER_VARIANT may choose CUDA. CUDA kernels round in other places and OptiX casts the
 rays, not Embree: results differ from LLVM's in the last bits, so a dataset is the same bit for bit only if one
-variant made all of it. No figure in this project was measured on a GPU.
+variant made all of it. On one NVIDIA H200, 70 of 24.8 million digital numbers of five frames (three of office200, one
+each of quickstart and fisheye) differ from LLVM's; expected images of two views differ by 2e-4 of the shot noise's
+standard deviation (RMS), by 0.14 in the worst pixel. All other figures in this project were measured with LLVM.
 """
 
 import ctypes
