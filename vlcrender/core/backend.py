@@ -214,9 +214,16 @@ class _Mitsuba:
         return self._instantiated(config, self._parser.parse_dict(config, dict(tree)))
 
     def load_file(self, path: str, parallel: bool = True, optimize: bool = True) -> Any:
-        """`mitsuba.load_file` in this variant."""
+        """`mitsuba.load_file` in this variant: files that the file names are looked up beside it first."""
         config = self._configuration(parallel, optimize)
-        return self._instantiated(config, self._parser.parse_file(config, path))
+        before = self.file_resolver()
+        beside = self.FileResolver(before)
+        beside.prepend(str(Path(path).resolve().parent))
+        self.set_file_resolver(beside)  # of this thread
+        try:
+            return self._instantiated(config, self._parser.parse_file(config, path))
+        finally:
+            self.set_file_resolver(before)
 
     def _configuration(self, parallel: bool, optimize: bool) -> Any:
         config = self._parser.ParserConfig(self._variant)
