@@ -15,7 +15,7 @@ import OpenEXR
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from estimator_synthetic import FRAMES_SCHEMA, small_dataset, write_exr
+from estimator_synthetic import FRAMES_SCHEMA, write_exr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -27,8 +27,8 @@ Rows = list[dict[str, Any]]
 
 
 @pytest.fixture(scope="module")
-def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return small_dataset(tmp_path_factory.mktemp("dataset"))
+def good(synthetic_set: Path) -> Path:
+    return synthetic_set
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from estimator_synthetic import grid, small_dataset, view_of, write_dataset
+from estimator_synthetic import grid, view_of, write_dataset
 
 from estimator.errors import EstimationFailure
 from estimator.evaluate.batch import estimate_dataset, estimate_frame
@@ -21,8 +21,8 @@ from estimator.spots.denoise import DENOISERS
 
 
 @pytest.fixture(scope="module")
-def noisy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return small_dataset(tmp_path_factory.mktemp("noisy"))
+def noisy(synthetic_set: Path) -> Path:
+    return synthetic_set
 
 
 def estimate(folder: Path) -> dict[str, tuple[EstimateRow, ...]]:
@@ -38,14 +38,13 @@ def errors_m(folder: Path, rows: tuple[EstimateRow, ...]) -> list[float]:
     ]
 
 
-def test_without_noise_the_corrected_variants_err_by_the_ellipse_alone(tmp_path: Path) -> None:
+def test_without_noise_the_corrected_variants_err_by_the_ellipse_alone(exact_synthetic_set: Path) -> None:
     """A disc's image has its centroid off the image of its centre by some f (r / h)^2 tan(tilt) = 0.01 px here; digital
     numbers round at 1/4000 of the LED. One pixel is 2 mm on the ceiling, and 20 LEDs share the error.
     """
-    folder = small_dataset(tmp_path, noise=False)
-    rows = estimate(folder)
-    assert max(errors_m(folder, rows["huynh2016"])) < 1e-3
-    assert max(errors_m(folder, rows["pnp"])) < 1e-3
+    rows = estimate(exact_synthetic_set)
+    assert max(errors_m(exact_synthetic_set, rows["huynh2016"])) < 1e-3
+    assert max(errors_m(exact_synthetic_set, rows["pnp"])) < 1e-3
 
 
 def test_a_full_frame_is_good_to_a_millimetre(tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from estimator_synthetic import small_dataset
+from conftest import copy_of
 
 from estimator.errors import InputError
 from estimator.evaluate.batch import estimate_dataset
@@ -14,8 +14,8 @@ from estimator.methods.catalogue import VARIANTS
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = small_dataset(tmp_path_factory.mktemp("workers"))
+def folder(synthetic_set: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = copy_of(synthetic_set, tmp_path_factory.mktemp("workers"))
     (folder / "frames/000001.exr").unlink()  # one frame that cannot be read
     return folder
 
