@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: demo test lint docs bench clean
+.PHONY: check demo test lint docs bench mutants clean
 
 demo: $(READY)
 	$(BIN)/vlcrender generate datasets/quickstart.toml --out out/quickstart

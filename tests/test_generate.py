@@ -116,7 +116,7 @@ def test_progress_reports_the_light_and_then_each_frame(tmp_path: Path, monkeypa
     generate(plan, tmp_path / "set", progress=reports.append)
     light = [report for report in reports if report.stage != "frames"]
     assert reports[: len(light)] == light
-    assert light[0] == Progress("light from the LEDs", 0.0, 1.0)
+    assert light[0] == Progress("direct light of LEDs", 0.0, 1.0)
     assert all(0 <= report.done <= report.total == 1 for report in light)
     assert reports[len(light) :] == [Progress("frames", 1, 2), Progress("frames", 2, 2)]
 
