@@ -1,5 +1,9 @@
 """Worker processes give the same rows as one process."""
 
+import signal
+import threading
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import pytest
@@ -7,10 +11,11 @@ from conftest import copy_of
 
 from estimator.errors import InputError
 from estimator.evaluate.batch import estimate_dataset
-from estimator.evaluate.workers import estimate_with_workers
+from estimator.evaluate.workers import _interrupts_deferred, estimate_with_workers
 from estimator.io.dataset import read_dataset
 from estimator.io.estimates import EstimateRow
 from estimator.methods.catalogue import VARIANTS
+from vlcrender.dataset.generate import _interrupts_deferred as _interrupts_of_generate_deferred
 
 
 @pytest.fixture(scope="module")
@@ -39,3 +44,25 @@ def test_any_number_of_workers_gives_the_same_answers_in_order(folder: Path, wor
 def test_an_unknown_name_is_refused_before_a_process_starts(folder: Path) -> None:
     with pytest.raises(InputError, match="variant best: unknown"):
         estimate_with_workers(read_dataset(folder), ["best"], 2, on_frame=lambda: None)
+
+
+@pytest.mark.parametrize(
+    "deferred", [_interrupts_deferred, _interrupts_of_generate_deferred], ids=["estimator", "vlcrender"]
+)
+def test_an_interrupt_that_another_thread_receives_is_raised_after_the_block(
+    deferred: Callable[[], AbstractContextManager[None]],
+) -> None:
+    """A mask alone does not hold it: Python handles signals in the main thread, whichever thread received them."""
+    begun, reached_the_end = threading.Event(), False
+    receiver = threading.Thread(target=lambda: begun.wait() and signal.raise_signal(signal.SIGINT))
+    receiver.start()
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt), deferred():
+            begun.set()
+            receiver.join()
+            reached_the_end = True
+        assert reached_the_end
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -13,8 +13,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from conftest import ROOT
-from conftest import copy_of
+from conftest import ROOT, copy_of
 from estimator_synthetic import Array, View, description, grid, poisson, render, view_of
 
 from estimator.errors import InputError
