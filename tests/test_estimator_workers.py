@@ -53,16 +53,21 @@ def test_an_interrupt_that_another_thread_receives_is_raised_after_the_block(
     deferred: Callable[[], AbstractContextManager[None]],
 ) -> None:
     """A mask alone does not hold it: Python handles signals in the main thread, whichever thread received them."""
-    begun, reached_the_end = threading.Event(), False
+    begun, finished = threading.Event(), threading.Event()
     receiver = threading.Thread(target=lambda: begun.wait() and signal.raise_signal(signal.SIGINT))
     receiver.start()
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        with pytest.raises(KeyboardInterrupt), deferred():
+
+    def block() -> None:
+        with deferred():
             begun.set()
             receiver.join()
-            reached_the_end = True
-        assert reached_the_end
+            finished.set()
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            block()
+        assert finished.is_set()
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     finally:
         signal.signal(signal.SIGINT, before)
