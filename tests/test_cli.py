@@ -137,6 +137,7 @@ def test_show_refuses(tmp_path: Path) -> None:
     assert_refused(run("vlcrender", "show", TABLE1, "--out", "no/such/x.png", cwd=tmp_path), "no/such")
 
 
+@pytest.mark.slow
 def test_show_draws_and_counts(tmp_path: Path) -> None:
     result = run("vlcrender", "show", TABLE1, "--out", str(tmp_path / "table1.png"))
     assert result.returncode == 0, result.stderr
@@ -170,6 +171,7 @@ def test_help_is_no_error(program: str) -> None:
     assert "Usage" in helped.stdout
 
 
+@pytest.mark.slow
 def test_the_console_script_generates_a_data_set(tmp_path: Path) -> None:
     out = str(tmp_path / "set")
     made = script("vlcrender", "generate", RECIPE, "--out", out, *SETS, "--set", "poses.count=1")
@@ -205,6 +207,7 @@ def test_the_whole_chain_on_small_frames_without_the_truth(rendered_set: Path, t
     assert not [word for word in ('src="http', 'href="http', "url(http") if word in page], "the page has to stand alone"
 
 
+@pytest.mark.slow
 def test_a_terminal_without_degree_signs_gets_question_marks(tmp_path: Path) -> None:
     page = tmp_path / "ünï.html"
     ascii_only = {**os.environ, "PYTHONIOENCODING": "ascii"}
@@ -228,11 +231,13 @@ def test_messages_with_line_breaks_are_one_line(tmp_path: Path) -> None:
         assert_refused(refused, "b")
 
 
+@pytest.mark.slow
 def test_a_folder_whose_name_is_not_utf_8_is_refused(tmp_path: Path) -> None:
     out = os.fsencode(tmp_path) + b"/x\xff"
     assert_refused(script("vlcrender", "generate", RECIPE, "--out", out, *SETS), "--out", "UTF-8")
 
 
+@pytest.mark.slow
 def test_a_closed_pipe_is_no_error(tmp_path: Path) -> None:
     page = str(tmp_path / "page.html")
     reading, writing = os.pipe()

@@ -50,6 +50,7 @@ def test_score_prints_a_row_a_variant(dataset: Path, capsys: pytest.CaptureFixtu
     assert "synthetic <&>" in out
 
 
+@pytest.mark.slow
 def test_score_prints_to_a_terminal_without_a_micro_sign(dataset: Path) -> None:
     command = [sys.executable, "-c", "import sys; from estimator.cli import main; sys.exit(main())", "score"]
     environment = {**os.environ, "PYTHONIOENCODING": "ascii"}

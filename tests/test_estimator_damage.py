@@ -43,6 +43,7 @@ def judge(folder: Path, capsys: pytest.CaptureFixture[str]) -> int:
     return max(codes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("file", ["estimates/pnp.parquet", "truth.parquet", "scores.json"])
 @settings(max_examples=40, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 @given(data=st.data())

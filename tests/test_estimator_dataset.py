@@ -157,6 +157,7 @@ def test_a_wrong_value_is_named(folder: Path, key: str, change: Callable[[dict[s
     assert key in message
 
 
+@pytest.mark.slow
 def test_all_wrong_types_everywhere_in_the_json_are_input_errors(folder: Path) -> None:
     """Each value of the document replaced by each of a few others: read or refused, never another exception."""
     original = json.loads((folder / "dataset.json").read_text())

@@ -135,7 +135,7 @@ CRASHES = {
 }
 
 
-@pytest.mark.parametrize("workers", ["1", "2"])
+@pytest.mark.parametrize("workers", ["1", pytest.param("2", marks=pytest.mark.slow)])
 def test_a_crash_on_a_frame_is_a_failed_frame_and_the_run_goes_on(
     install: Install, synthetic_set: Path, tmp_path: Path, workers: str
 ) -> None:
@@ -149,6 +149,7 @@ def test_a_crash_on_a_frame_is_a_failed_frame_and_the_run_goes_on(
     assert pq.read_table(folder / "estimates/pnp.parquet")["status"].to_pylist() == ["ok"] * 3
 
 
+@pytest.mark.slow
 def test_a_worker_that_dies_is_one_line_and_nothing_is_written(
     install: Install, synthetic_set: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -165,6 +166,7 @@ def test_nothing_is_imported_that_is_not_asked_for(install: Install, synthetic_s
     assert "slow" not in sys.modules
 
 
+@pytest.mark.slow
 def test_an_interrupt_leaves_nothing_half_done(install: Install, synthetic_set: Path, tmp_path: Path) -> None:
     """The whole process group gets SIGINT, as from a terminal, while a worker is within its first frame.
 

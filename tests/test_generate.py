@@ -48,6 +48,7 @@ def test_the_same_recipe_gives_the_same_bytes(made: Path, tmp_path: Path) -> Non
     assert len(digests(made)) == 3
 
 
+@pytest.mark.slow
 def test_two_workers_give_the_same_bytes_as_one(made: Path, tmp_path: Path) -> None:
     generate(small_plan("expected=true"), tmp_path / "pool", workers=2)
     assert digests(tmp_path / "pool") == digests(made)
@@ -55,6 +56,7 @@ def test_two_workers_give_the_same_bytes_as_one(made: Path, tmp_path: Path) -> N
         assert pq.read_table(tmp_path / "pool" / table).equals(pq.read_table(made / table))
 
 
+@pytest.mark.slow
 def test_one_thread_gives_the_same_bytes_as_all(made: Path, tmp_path: Path) -> None:
     """In a process of its own with every library held to one thread."""
     code = (
@@ -109,6 +111,7 @@ def test_an_interrupted_run_resumes(made: Path, tmp_path: Path, caplog: pytest.L
     assert verify(directory) == []
 
 
+@pytest.mark.slow
 def test_progress_reports_the_light_and_then_each_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("VLCRENDER_CACHE", str(tmp_path / "cache"))
     plan = load_plan(ROOT / "datasets/table1.toml", [*SMALL[:4], "poses.columns=2", "poses.rows=1"])
@@ -313,6 +316,7 @@ def test_an_impossible_camera_is_refused_in_one_line(
     assert "dataset.json" in str(refusal.value)
 
 
+@pytest.mark.slow
 def test_a_dead_worker_is_one_line_and_the_run_resumes(made: Path, tmp_path: Path) -> None:
     def kill_one(report: Progress) -> None:
         if (report.stage, report.done) == ("frames", 1):
@@ -332,6 +336,7 @@ def started_with_workers(directory: Path) -> subprocess.Popen[str]:
     return started("vlcrender", "generate", str(RECIPE), "--out", str(directory), "--workers", "2", *sets)
 
 
+@pytest.mark.slow
 def test_an_interrupt_while_workers_start_is_one_line(tmp_path: Path) -> None:
     """Ctrl-C goes to the whole group of processes, also to children that are still importing.
 
@@ -348,6 +353,7 @@ def test_an_interrupt_while_workers_start_is_one_line(tmp_path: Path) -> None:
     assert "Traceback" not in output, output
 
 
+@pytest.mark.slow
 def test_workers_exit_with_their_parent(tmp_path: Path) -> None:
     """A kill that cannot be caught. They share its output, which ends with the last of them."""
     process = started_with_workers(tmp_path / "set")

@@ -323,6 +323,7 @@ pose = [{ position_m = [1.6, 3.5, 1.2], tilt_x_deg = 5.0, tilt_y_deg = -40.0 }]
 """
 
 
+@pytest.mark.slow
 def test_specular_reflections_of_the_renderer_are_left_out(tmp_path: Path) -> None:
     """At -40 deg, grazing the glazing, some reflections are bright enough to be detected beside the LEDs."""
     (tmp_path / "pane.toml").write_text((ROOT / "scenes/office.toml").read_text() + PANE)
