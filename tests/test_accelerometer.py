@@ -66,6 +66,7 @@ TERMS: dict[str, tuple[dict[str, float], tuple[float, float, float]]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("term", TERMS)
 def test_each_term_alone_spreads_the_readings_of_level_devices_as_its_formula(term: str) -> None:
     """Gravity is along z: cross-axis affects x and y alone, scale z alone. Means are 0 within 5 standard errors."""

@@ -49,6 +49,7 @@ def image_of_a_circle_centre(
     return np.linalg.solve(conic[:2, :2], -conic[:2, 2])
 
 
+@pytest.mark.slow
 def test_without_noise_huynh2016_errs_only_by_what_a_pixel_can_explain(ideal: Path) -> None:
     dataset = read_dataset(ideal)
     truth = pq.read_table(ideal / "truth.parquet").to_pylist()

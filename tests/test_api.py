@@ -41,6 +41,7 @@ def test_importing_and_help_load_no_heavy_package() -> None:
     assert loaded_after(f"{call}\ntry:\n    main()\nexcept SystemExit:\n    pass") == []
 
 
+@pytest.mark.slow
 def test_a_scene_is_loaded_without_mitsuba() -> None:
     assert loaded_after("import vlcrender as vr; vr.load_scene('office'); vr.Sensor.preset('phone-1.2um')") == []
     assert "mitsuba" not in loaded_after("import vlcrender as vr; vr.load_recipe('quickstart')")

@@ -38,6 +38,7 @@ def test_a_machine_with_only_llvm_14_and_15_is_told_what_to_install(
     assert "\n" not in str(refusal.value)
 
 
+@pytest.mark.slow
 def test_a_path_that_is_no_llvm_is_one_line_and_exit_code_2(tmp_path: Path) -> None:
     fake = tmp_path / "libLLVM-19.so"
     fake.write_bytes(b"not a library")
@@ -58,6 +59,7 @@ def test_a_path_that_is_no_llvm_is_one_line_and_exit_code_2(tmp_path: Path) -> N
 CUDA_HERE = backend.dr.has_backend(backend.dr.JitBackend.CUDA)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("variant", "message"),
     [
@@ -181,6 +183,7 @@ def test_a_variant_that_the_user_has_set_stays_and_changes_no_bit(
     assert there["digests"] == alone["digests"]
 
 
+@pytest.mark.slow
 def test_an_old_llvm_that_a_program_has_used_is_refused_in_one_line(tmp_path: Path, own_llvm: int) -> None:
     if not 0 < own_llvm < 17:
         pytest.skip("Dr.Jit finds no LLVM by itself here, or a new one")

@@ -35,6 +35,7 @@ def test_colours_of_pixels(mosaic: str, tile: list[list[int]]) -> None:
     assert np.array_equal(colour_of_pixels(mosaic, Roi(-3, -5, 9, 13))[3:, 5:], whole), "beyond the sensor too"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("regions", [None, LedRegions(kind="leds")], ids=["full", "regions"])
 def test_each_pixel_agrees_with_a_sensor_of_its_colour(office: Scene, regions: LedRegions | None) -> None:
     """Through a defocused lens: blur comes before the filters."""

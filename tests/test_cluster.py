@@ -16,6 +16,7 @@ def digests(directory: Path) -> dict[str, str]:
     return {path.name: sha256_of(path) for path in sorted((directory / "frames").iterdir())}
 
 
+@pytest.mark.slow
 def test_the_threads_of_a_cluster_make_the_same_bytes(tmp_path: Path) -> None:
     """Worker threads: kernel settings are per thread in Dr.Jit. Worker processes are tested without dask."""
     plan = load_plan(ROOT / "datasets/quickstart.toml", [*SMALL, "poses.count=4"])

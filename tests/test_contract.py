@@ -174,6 +174,7 @@ def median_errors_m(directory: Path) -> dict[str, float]:
     }
 
 
+@pytest.mark.slow
 def test_a_distorted_set_is_estimated_as_well_as_a_straight_one(tmp_path: Path) -> None:
     """The same poses and LEDs through a lens that moves image points at the corners, 250 px off the centre, by 7 px.
 

@@ -86,6 +86,7 @@ def edge_slopes(camera: Camera, center_m: np.ndarray, box: Roi) -> np.ndarray:
     return slopes
 
 
+@pytest.mark.slow
 def test_bound_agrees_with_the_information_of_moving_edges(renderer: Renderer, small_camera: Camera) -> None:
     """By the transport theorem, with all nuisances in one matrix; the renderer gives the amplitudes only.
 

@@ -62,6 +62,7 @@ TRUTH: dict[str, tuple[float, Callable[[Measurement], Quantity]]] = {
 }
 
 
+@pytest.mark.slow
 def test_photon_transfer_finds_a_camera_of_numpy_and_states_its_own_error() -> None:
     """Over 30 cameras the deviations over the stated errors have a mean of 0 and a spread of 1.
 
@@ -119,6 +120,7 @@ def test_lines_and_ratios_carry_their_errors() -> None:
     assert Quantity(6.0, 0.3).times(Quantity(2.0, 0.2)) == pytest.approx((12.0, 12 * np.hypot(0.05, 0.1)))
 
 
+@pytest.mark.slow
 def test_saturation_agrees_with_random_draws(rng: np.random.Generator) -> None:
     """Limits of well and ADC close to each other: the mean of many draws clipped by both, to 5 standard errors."""
     sensor = Sensor(**{**FULL, "full_well_e": 6390.0, "read_noise_e": 10.0})
@@ -197,6 +199,7 @@ def test_missing_read_noise_is_rejected(full: Datasheet) -> None:
     assert row_of(compare(full.sensor, full.efficiency, silent.measurement), "sigma_d").passed is False
 
 
+@pytest.mark.slow
 def test_shot_noise_alone_has_nothing_else_set() -> None:
     """At 1 e/DN the dark frames are all alike, and the rest is Poisson."""
     sheet = make_datasheet("shot", Sensor(), side_px=256)
@@ -228,6 +231,7 @@ def test_noise_clipped_in_the_dark_is_reported_as_off() -> None:
     assert row_of(sheet.rows, "sigma_d").passed is False
 
 
+@pytest.mark.slow
 def test_a_data_sheet_is_the_same_each_time_and_another_device_s_is_not() -> None:
     first, again, other = (make_datasheet("x", Sensor(**FULL, serial=s), side_px=32).rows for s in (1, 1, 2))
     assert first == again

@@ -97,6 +97,7 @@ def test_four_points_illuminate_as_the_diffuser_does(diffuser: Diffuser) -> None
                 assert points == pytest.approx(lux(x, y, fine, place), rel=error)
 
 
+@pytest.mark.slow
 def test_the_image_of_a_diffuser_has_the_luminance_and_the_flux_of_the_model() -> None:
     scene = panelled(diffuser=True, frame=False)
     camera = Camera(width_px=500, height_px=400, pixel_pitch_um=16.0)
@@ -137,6 +138,7 @@ def test_a_rim_hides_leds_from_the_side(slope: float, share: float) -> None:
     assert sum(patch.visible_fraction for patch in seen) == pytest.approx(share, abs=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frame", [False, True], ids=["diffuser", "frame and diffuser"])
 def test_diffusers_and_frames_agree_with_the_reference(frame: bool) -> None:
     scene = panelled(diffuser=True, frame=frame)

@@ -96,6 +96,7 @@ def test_emva1288_finds_our_gain_and_dark_noise(tmp_path: Path) -> None:
     assert abs(found.QE / 100 - EFFICIENCY) < SIGMAS * EFFICIENCY * ours / gain
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", [{"gain_e_per_dn": 2.03}, {"read_noise_e": 0.0}, {"read_noise_e": 6.3}])
 def test_emva1288_tells_another_sensor_from_ours(tmp_path: Path, change: dict[str, float]) -> None:
     """The tolerances above are tight enough to see a gain 1.5 % off, and read noise 5 % more or none."""

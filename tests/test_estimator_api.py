@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from estimator_synthetic import description, grid, poisson, render, small_dataset, view_of
+from conftest import copy_of
+from estimator_synthetic import description, grid, poisson, render, view_of
 
 import estimator as est
 
@@ -18,8 +19,8 @@ HEAVY = ("cv2", "matplotlib", "scipy", "pandas", "mitsuba", "vlcrender")
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return small_dataset(tmp_path_factory.mktemp("api") / "set")
+def folder(synthetic_set: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return copy_of(synthetic_set, tmp_path_factory.mktemp("api"))
 
 
 def record() -> dict[str, Any]:

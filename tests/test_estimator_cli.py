@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from estimator_synthetic import small_dataset
+from conftest import copy_of
 
 import estimator
 from estimator.cli import main
@@ -19,12 +19,11 @@ from estimator.methods.catalogue import VARIANTS
 
 
 @pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = small_dataset(tmp_path_factory.mktemp("cli"))
+def dataset(scored_set: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = copy_of(scored_set, tmp_path_factory.mktemp("cli"))
     (folder / "previews").mkdir()
     for index in range(3):
         cv2.imwrite(str(folder / f"previews/{index:06d}.png"), np.full((30, 40), 50, np.uint8))
-    assert main(["run", str(folder)]) == 0
     return folder
 
 
@@ -32,8 +31,8 @@ def test_run_writes_the_estimates_of_each_variant(dataset: Path) -> None:
     assert sorted(path.stem for path in (dataset / "estimates").iterdir()) == sorted(VARIANTS)
 
 
-def test_run_takes_some_variants(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = small_dataset(tmp_path)
+def test_run_takes_some_variants(synthetic_set: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = copy_of(synthetic_set, tmp_path)
     assert main(["run", str(folder), "--variant", "pnp", "--variant", "pnp"]) == 0
     assert [path.name for path in (folder / "estimates").iterdir()] == ["pnp.parquet"]
     assert capsys.readouterr().out.startswith("pnp: 3 of 3 frames ok")
@@ -51,6 +50,7 @@ def test_score_prints_a_row_a_variant(dataset: Path, capsys: pytest.CaptureFixtu
     assert "synthetic <&>" in out
 
 
+@pytest.mark.slow
 def test_score_prints_to_a_terminal_without_a_micro_sign(dataset: Path) -> None:
     command = [sys.executable, "-c", "import sys; from estimator.cli import main; sys.exit(main())", "score"]
     environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
@@ -65,9 +65,11 @@ def test_score_prints_json(dataset: Path, capsys: pytest.CaptureFixture[str]) ->
     assert {v["variant"]: v["ok"] for v in scores["variants"]}["pnp"] == 3
 
 
-def test_compare_prints_a_line_a_number(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_compare_prints_a_line_a_number(
+    synthetic_set: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """PnP, which succeeds on three frames of three, against a variant that fails on all."""
-    folder = small_dataset(tmp_path)
+    folder = copy_of(synthetic_set, tmp_path)
     assert main(["run", str(folder), "--variant", "pnp"]) == 0
     lost = [
         EstimateRow(frame=k, status="failed", reason="a: b", position_m=None, ranges=(), time_s=0) for k in range(3)
@@ -175,8 +177,8 @@ def test_a_user_s_error_is_one_line_and_exit_code_2(
     assert words in output.err
 
 
-def test_damage_is_one_line_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = small_dataset(tmp_path)
+def test_damage_is_one_line_too(synthetic_set: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = copy_of(synthetic_set, tmp_path)
     (folder / "dataset.json").write_text('{"format": "vlcrender-dataset"}')
     assert main(["run", str(folder)]) == 2
     output = capsys.readouterr()

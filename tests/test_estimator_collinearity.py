@@ -58,6 +58,7 @@ def test_leds_at_different_heights_are_used() -> None:
     np.testing.assert_allclose(found, view.position_m, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_leds_nearly_on_a_line_rarely_lead_to_a_wrong_pose() -> None:
     """Table 1's, 100 random poses: 0.1 % were lost of 1000, so more than 2 have a probability of 2e-4."""
     rng = np.random.default_rng(6)
@@ -124,6 +125,7 @@ def test_a_start_without_images_gives_no_pose() -> None:
     assert fit_pose(PANEL, perspective(view, PANEL), Perspective(), Pose(np.array(view.position_m), away)) is None
 
 
+@pytest.mark.slow
 def test_spots_that_no_pose_explains_are_refused_or_fitted_without_a_crash() -> None:
     rng = np.random.default_rng(3)
     outcomes = set()

@@ -10,7 +10,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from estimator_synthetic import small_dataset
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -20,11 +19,8 @@ from estimator.io.estimates import write_estimates
 
 
 @pytest.fixture(scope="module")
-def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = small_dataset(tmp_path_factory.mktemp("good"))
-    assert main(["run", str(folder)]) == 0
-    assert main(["score", str(folder)]) == 0
-    return folder
+def good(scored_set: Path) -> Path:
+    return scored_set
 
 
 @pytest.fixture
@@ -47,6 +43,7 @@ def judge(folder: Path, capsys: pytest.CaptureFixture[str]) -> int:
     return max(codes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("file", ["estimates/pnp.parquet", "truth.parquet", "scores.json"])
 @settings(max_examples=40, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 @given(data=st.data())

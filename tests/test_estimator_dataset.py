@@ -15,7 +15,7 @@ import OpenEXR
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from estimator_synthetic import FRAMES_SCHEMA, small_dataset, write_exr
+from estimator_synthetic import FRAMES_SCHEMA, write_exr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -27,8 +27,8 @@ Rows = list[dict[str, Any]]
 
 
 @pytest.fixture(scope="module")
-def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return small_dataset(tmp_path_factory.mktemp("dataset"))
+def good(synthetic_set: Path) -> Path:
+    return synthetic_set
 
 
 @pytest.fixture
@@ -157,6 +157,7 @@ def test_a_wrong_value_is_named(folder: Path, key: str, change: Callable[[dict[s
     assert key in message
 
 
+@pytest.mark.slow
 def test_all_wrong_types_everywhere_in_the_json_are_input_errors(folder: Path) -> None:
     """Each value of the document replaced by each of a few others: read or refused, never another exception."""
     original = json.loads((folder / "dataset.json").read_text())

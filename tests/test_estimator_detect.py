@@ -65,6 +65,7 @@ def test_a_uniform_disc_has_its_centroid_at_its_centre(
         np.testing.assert_allclose([(spot.u_px, spot.v_px)], view.project(led), atol=5 * edge)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("denoised", [False, True])
 @pytest.mark.parametrize(("led_e", "background_e"), [(4000.0, 40.0), (60.0, 2.0)])
 def test_scatter_agrees_with_the_stated_covariance(denoised: bool, led_e: float, background_e: float) -> None:

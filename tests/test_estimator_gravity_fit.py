@@ -32,6 +32,7 @@ def nees(answers: list[Estimate], view: View) -> Array:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("leds", "sigma_px", "error_deg"),
     [

@@ -83,6 +83,7 @@ def share_by_points(one: Led, lens: Camera, rois: RoiStack, blur_px: float = 0.0
     return share / len(shifts)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", ["disc", "square"])
 @pytest.mark.parametrize("distorted", [False, True])
 def test_a_sharp_face_covers_what_its_points_do(shape: str, distorted: bool) -> None:
@@ -101,6 +102,7 @@ def test_a_sharp_face_covers_what_its_points_do(shape: str, distorted: bool) -> 
     assert np.all(share[expected == 0] < 0.01)
 
 
+@pytest.mark.slow
 def test_a_defocused_face_is_its_points_spread_over_discs() -> None:
     """A disc of 6 px on pixels of its half, good to 0.7 % at a straight edge; points, at 15 a pixel and 200 shifts, to
     half a percent.

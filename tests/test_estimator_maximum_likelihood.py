@@ -99,6 +99,7 @@ FULL: dict[str, object] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("leds", [6, 2])
 @pytest.mark.parametrize("sensor", [SHOT, FULL], ids=["shot", "full"])
 def test_errors_agree_with_the_covariance(sensor: dict[str, object], leds: int) -> None:

@@ -3,9 +3,7 @@
 import os
 import re
 import signal
-import subprocess
 import sys
-import time
 import tomllib
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -13,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from estimator_synthetic import small_dataset
+from conftest import HANG_S, ROOT, copy_of, started, wait_until
 
 from estimator.cli import main
 from estimator.methods.catalogue import VARIANTS
@@ -49,7 +47,7 @@ def block(language: str) -> str:
 
 
 def test_the_document_s_example_runs_and_is_good(
-    install: Install, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    install: Install, synthetic_set: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """As pnp in the tests of variants: some 0.02 px of 1500, widened by the pattern's narrowness and tilt."""
     code, project = block("python"), tomllib.loads(block("toml"))
@@ -60,7 +58,7 @@ def test_the_document_s_example_runs_and_is_good(
     assert [line.split()[0] for line in lines] == [*VARIANTS, "turned"]
     assert lines[-1].endswith("scale the height. (external: turned 0.1)")
     assert "external" not in "".join(lines[:-1])
-    folder = small_dataset(tmp_path / "set")
+    folder = copy_of(synthetic_set, tmp_path / "set")
     assert main(["run", str(folder), "--variant", "turned"]) == 0
     found = pq.read_table(folder / "estimates/turned.parquet")["position_m"].to_pylist()
     truth = pq.read_table(folder / "truth.parquet")["position_m"].to_pylist()
@@ -92,7 +90,7 @@ BAD_PLUGINS: dict[str, tuple[str, dict[str, str], str]] = {
 
 @pytest.mark.parametrize("case", BAD_PLUGINS)
 def test_a_bad_plugin_is_one_line_and_the_others_run(
-    install: Install, tmp_path: Path, capsys: pytest.CaptureFixture[str], case: str
+    install: Install, synthetic_set: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], case: str
 ) -> None:
     source, entries, words = BAD_PLUGINS[case]
     install("bad", source, entries)
@@ -105,7 +103,8 @@ def test_a_bad_plugin_is_one_line_and_the_others_run(
     assert output.err.startswith("estimator: warning: variant ")
     assert words in output.err
     (name,) = entries
-    assert main(["run", str(small_dataset(tmp_path / "set")), "--variant", name]) == (0 if name in VARIANTS else 2)
+    folder = copy_of(synthetic_set, tmp_path / "set")
+    assert main(["run", str(folder), "--variant", name]) == (0 if name in VARIANTS else 2)
     output = capsys.readouterr()
     assert output.err.count("\n") == 1
 
@@ -136,13 +135,13 @@ CRASHES = {
 }
 
 
-@pytest.mark.parametrize("workers", ["1", "2"])
+@pytest.mark.parametrize("workers", ["1", pytest.param("2", marks=pytest.mark.slow)])
 def test_a_crash_on_a_frame_is_a_failed_frame_and_the_run_goes_on(
-    install: Install, tmp_path: Path, workers: str
+    install: Install, synthetic_set: Path, tmp_path: Path, workers: str
 ) -> None:
     source = "".join(f"def f{k}(frame):\n{body}\n" for k, body in enumerate(CRASHES.values())).replace(" f(", " f2(")
     install("crashing", source, {f"crash{k}": f"crashing:f{k}" for k in range(len(CRASHES))})
-    folder = small_dataset(tmp_path / "set")
+    folder = copy_of(synthetic_set, tmp_path / "set")
     assert main(["run", str(folder), "--workers", workers]) == 0
     for k, why in enumerate(CRASHES):
         rows = pq.read_table(folder / f"estimates/crash{k}.parquet").to_pylist()
@@ -150,54 +149,50 @@ def test_a_crash_on_a_frame_is_a_failed_frame_and_the_run_goes_on(
     assert pq.read_table(folder / "estimates/pnp.parquet")["status"].to_pylist() == ["ok"] * 3
 
 
+@pytest.mark.slow
 def test_a_worker_that_dies_is_one_line_and_nothing_is_written(
-    install: Install, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    install: Install, synthetic_set: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     install("deadly", "import os\n\ndef f(frame):\n    os._exit(5)\n", {"deadly": "deadly:f"})
-    folder = small_dataset(tmp_path / "set")
+    folder = copy_of(synthetic_set, tmp_path / "set")
     assert main(["run", str(folder), "--workers", "2", "--variant", "deadly"]) == 2
     assert "a worker process died" in capsys.readouterr().err.splitlines()[-1]
     assert not (folder / "estimates").exists()
 
 
-def test_nothing_is_imported_that_is_not_asked_for(install: Install, tmp_path: Path) -> None:
+def test_nothing_is_imported_that_is_not_asked_for(install: Install, synthetic_set: Path, tmp_path: Path) -> None:
     install("slow", "raise AssertionError('imported')", {"slow": "slow:f"})
-    assert main(["run", str(small_dataset(tmp_path / "set")), "--variant", "pnp"]) == 0
+    assert main(["run", str(copy_of(synthetic_set, tmp_path / "set")), "--variant", "pnp"]) == 0
     assert "slow" not in sys.modules
 
 
-def test_an_interrupt_leaves_nothing_half_done(tmp_path: Path) -> None:
-    """A variant that sleeps; the whole process group gets SIGINT as from a terminal, once the first frame is begun."""
-    site = tmp_path / "site"
-    (site / "sleepy-0.1.dist-info").mkdir(parents=True)
-    begun = tmp_path / "begun"
-    source = f"import pathlib, time\ndef f(frame):\n    pathlib.Path({str(begun)!r}).touch()\n    time.sleep(1)\n"
-    (site / "sleepy.py").write_text(source)
-    (site / "sleepy-0.1.dist-info/METADATA").write_text("Metadata-Version: 2.1\nName: sleepy\nVersion: 0.1\n")
-    (site / "sleepy-0.1.dist-info/entry_points.txt").write_text(f"[{GROUP}]\nsleepy = sleepy:f\n")
-    folder = small_dataset(tmp_path / "set")
-    program = [sys.executable, "-c", "import sys; from estimator.cli import main; sys.exit(main())"]
-    paths = [str(site), str(Path(__file__).parent.parent), os.environ.get("PYTHONPATH", "")]
-    process = subprocess.Popen(
-        [*program, "run", str(folder), "--variant", "sleepy", "--workers", "2"],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
+@pytest.mark.slow
+def test_an_interrupt_leaves_nothing_half_done(install: Install, synthetic_set: Path, tmp_path: Path) -> None:
+    """The whole process group gets SIGINT, as from a terminal, while a worker is within its first frame.
+
+    The variant announces its first frame and goes on once the interrupt has been sent: the parent waits for the frames
+    that are being estimated.
+    """
+    begun, sent = tmp_path / "begun", tmp_path / "sent"
+    source = (
+        "import pathlib, time\n\ndef f(frame):\n"
+        f"    pathlib.Path({str(begun)!r}).touch()\n"
+        f"    while not pathlib.Path({str(sent)!r}).exists():\n"
+        "        time.sleep(0.01)\n"
     )
+    install("waiting", source, {"waiting": "waiting:f"})
+    folder = copy_of(synthetic_set, tmp_path / "set")
+    paths = os.pathsep.join([str(tmp_path / "site-waiting"), str(ROOT), os.environ.get("PYTHONPATH", "")])
+    arguments = ("run", str(folder), "--variant", "waiting", "--workers", "2")
+    process = started("estimator", *arguments, environment={**os.environ, "PYTHONPATH": paths})
     try:
-        for _ in range(600):
-            if begun.exists() or process.poll() is not None:
-                break
-            time.sleep(0.05)
+        wait_until(begun.exists, process)
         os.killpg(process.pid, signal.SIGINT)
-        out, err = process.communicate(timeout=30)
+        sent.touch()
+        output, _ = process.communicate(timeout=HANG_S)
     finally:
         process.kill()
-    assert begun.exists()
-    assert process.returncode == 130
-    assert out == ""
-    assert err.splitlines()[-1] == "estimator: interrupted"
-    assert "Traceback" not in err
+    assert process.returncode == 130, output
+    assert output.splitlines()[-1] == "estimator: interrupted"
+    assert "Traceback" not in output
     assert not (folder / "estimates").exists()

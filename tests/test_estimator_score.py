@@ -7,7 +7,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from estimator_synthetic import small_dataset
+from conftest import copy_of
 
 from estimator.errors import InputError
 from estimator.evaluate.score import Scores, read_or_score, score, score_variant
@@ -128,8 +128,8 @@ def test_failing_the_worst_frames_lowers_the_success_rate_and_no_error_of_all() 
 
 
 @pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = small_dataset(tmp_path_factory.mktemp("scored"))
+def dataset(synthetic_set: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = copy_of(synthetic_set, tmp_path_factory.mktemp("scored"))
     write_estimates(folder, "one", [ok(0, TRUTH, 3.0), failed(1, "a: <b>"), ok(2, TRUTH)])
     return folder
 
@@ -169,9 +169,9 @@ def test_scores_are_made_again_only_where_estimates_are_newer_or_other(dataset: 
     assert read_or_score(dataset).variants[0].ok == 3
 
 
-def test_scores_are_made_again_where_the_truth_is_newer(tmp_path: Path) -> None:
+def test_scores_are_made_again_where_the_truth_is_newer(synthetic_set: Path, tmp_path: Path) -> None:
     """As when a dataset is made again, with bounds."""
-    folder = small_dataset(tmp_path)
+    folder = copy_of(synthetic_set, tmp_path)
     write_estimates(folder, "one", [ok(frame, TRUTH) for frame in range(3)])
     assert score(folder).variants[0].rows[0].bound_m is None
     table = pq.read_table(folder / "truth.parquet")
@@ -183,8 +183,8 @@ def test_scores_are_made_again_where_the_truth_is_newer(tmp_path: Path) -> None:
     assert read_or_score(folder).variants[0].rows[0].bound_m == pytest.approx(2e-3)
 
 
-def test_what_cannot_be_scored_is_named(tmp_path: Path) -> None:
-    folder = small_dataset(tmp_path)
+def test_what_cannot_be_scored_is_named(synthetic_set: Path, tmp_path: Path) -> None:
+    folder = copy_of(synthetic_set, tmp_path)
     with pytest.raises(InputError, match="no estimates to score"):
         score(folder)
     write_estimates(folder, "short", [ok(0, TRUTH)])

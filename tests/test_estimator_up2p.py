@@ -26,6 +26,7 @@ def random_view(rng: np.random.Generator, leds_m: Array) -> View:
     return view_of(leds_m.mean(axis=0), height_m, *tilts, rng.uniform(-180, 180), (4000, 3000, 15000.0))
 
 
+@pytest.mark.slow
 def test_up2p_sqpnp_and_the_range_fit_agree_on_exact_points() -> None:
     """Three independent methods at 200 poses agree to a micrometre."""
     rng = np.random.default_rng(11)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from estimator_synthetic import grid, small_dataset, view_of, write_dataset
+from estimator_synthetic import grid, view_of, write_dataset
 
 from estimator.errors import EstimationFailure
 from estimator.evaluate.batch import estimate_dataset, estimate_frame
@@ -21,8 +21,8 @@ from estimator.spots.denoise import DENOISERS
 
 
 @pytest.fixture(scope="module")
-def noisy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return small_dataset(tmp_path_factory.mktemp("noisy"))
+def noisy(synthetic_set: Path) -> Path:
+    return synthetic_set
 
 
 def estimate(folder: Path) -> dict[str, tuple[EstimateRow, ...]]:
@@ -38,16 +38,16 @@ def errors_m(folder: Path, rows: tuple[EstimateRow, ...]) -> list[float]:
     ]
 
 
-def test_without_noise_the_corrected_variants_err_by_the_ellipse_alone(tmp_path: Path) -> None:
+def test_without_noise_the_corrected_variants_err_by_the_ellipse_alone(exact_synthetic_set: Path) -> None:
     """A disc's image has its centroid off the image of its centre by some f (r / h)^2 tan(tilt) = 0.01 px here; digital
     numbers round at 1/4000 of the LED. One pixel is 2 mm on the ceiling, and 20 LEDs share the error.
     """
-    folder = small_dataset(tmp_path, noise=False)
-    rows = estimate(folder)
-    assert max(errors_m(folder, rows["huynh2016"])) < 1e-3
-    assert max(errors_m(folder, rows["pnp"])) < 1e-3
+    rows = estimate(exact_synthetic_set)
+    assert max(errors_m(exact_synthetic_set, rows["huynh2016"])) < 1e-3
+    assert max(errors_m(exact_synthetic_set, rows["pnp"])) < 1e-3
 
 
+@pytest.mark.slow
 def test_a_full_frame_is_good_to_a_millimetre(tmp_path: Path) -> None:
     """4000 x 3000 pixels, f = 15000 px, shot noise: a disc of 50 px radius and 4000 e a pixel has its centroid to
     25 / sqrt(3e7) = 0.005 px, 1 um on the ceiling, which the distance of 3 m to a pattern of 0.6 m makes some 10 um.
@@ -61,6 +61,7 @@ def test_a_full_frame_is_good_to_a_millimetre(tmp_path: Path) -> None:
         assert rows[name][0].time_s < 5.0
 
 
+@pytest.mark.slow
 def test_a_full_frame_at_60_degrees_on_both_axes_has_the_ellipses_bias_alone(tmp_path: Path) -> None:
     """Noise-free, 75.5 deg off the vertical: the centroids' offsets from the images of the centres differ by 0.002 px
     from LED to LED. By simulation a pixel costs the two steps 1.8 m at this pose (12 m away, 0.36 x 0.6 m of LEDs), and
@@ -149,6 +150,7 @@ def test_the_literal_algorithm_1_shifts_every_spot_up_and_left(noisy: Path) -> N
         np.testing.assert_allclose(off, -2.5, atol=0.15 + 0.1)  # 0.1 px: four sigma of the noise in the edges
 
 
+@pytest.mark.slow
 def test_estimates_do_not_change_without_truth_and_provenance(noisy: Path, tmp_path: Path) -> None:
     blind = Path(shutil.copytree(noisy, tmp_path / "blind"))
     (blind / "truth.parquet").unlink()
@@ -162,6 +164,7 @@ def test_estimates_do_not_change_without_truth_and_provenance(noisy: Path, tmp_p
     assert answers(blind) == answers(noisy)
 
 
+@pytest.mark.slow
 def test_pnp_does_not_use_gravity_and_the_paper_does(noisy: Path, tmp_path: Path) -> None:
     """Two degrees of tilt error cost the paper's method about 60 mm and more (errata to Table 2)."""
     folder = Path(shutil.copytree(noisy, tmp_path / "off"))

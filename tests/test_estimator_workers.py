@@ -1,21 +1,26 @@
 """Worker processes give the same rows as one process."""
 
+import signal
+import threading
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import pytest
-from estimator_synthetic import small_dataset
+from conftest import copy_of
 
 from estimator.errors import InputError
 from estimator.evaluate.batch import estimate_dataset
-from estimator.evaluate.workers import estimate_with_workers
+from estimator.evaluate.workers import _interrupts_deferred, estimate_with_workers
 from estimator.io.dataset import read_dataset
 from estimator.io.estimates import EstimateRow
 from estimator.methods.catalogue import VARIANTS
+from vlcrender.dataset.generate import _interrupts_deferred as _interrupts_of_generate_deferred
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = small_dataset(tmp_path_factory.mktemp("workers"))
+def folder(synthetic_set: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = copy_of(synthetic_set, tmp_path_factory.mktemp("workers"))
     (folder / "frames/000001.exr").unlink()  # one frame that cannot be read
     return folder
 
@@ -25,7 +30,7 @@ def without_times(rows: dict[str, tuple[EstimateRow, ...]]) -> dict[str, list[st
     return {name: [row.model_dump_json(exclude={"time_s"}) for row in of_variant] for name, of_variant in rows.items()}
 
 
-@pytest.mark.parametrize("workers", [1, 2, 7])
+@pytest.mark.parametrize("workers", [1, 2, pytest.param(7, marks=pytest.mark.slow)])
 def test_any_number_of_workers_gives_the_same_answers_in_order(folder: Path, workers: int) -> None:
     dataset = read_dataset(folder)
     alone = estimate_dataset(dataset, list(VARIANTS.values()), on_frame=lambda: None)
@@ -39,3 +44,30 @@ def test_any_number_of_workers_gives_the_same_answers_in_order(folder: Path, wor
 def test_an_unknown_name_is_refused_before_a_process_starts(folder: Path) -> None:
     with pytest.raises(InputError, match="variant best: unknown"):
         estimate_with_workers(read_dataset(folder), ["best"], 2, on_frame=lambda: None)
+
+
+@pytest.mark.parametrize(
+    "deferred", [_interrupts_deferred, _interrupts_of_generate_deferred], ids=["estimator", "vlcrender"]
+)
+def test_an_interrupt_that_another_thread_receives_is_raised_after_the_block(
+    deferred: Callable[[], AbstractContextManager[None]],
+) -> None:
+    """A mask alone does not hold it: Python handles signals in the main thread, whichever thread received them."""
+    begun, finished = threading.Event(), threading.Event()
+    receiver = threading.Thread(target=lambda: begun.wait() and signal.raise_signal(signal.SIGINT))
+    receiver.start()
+
+    def block() -> None:
+        with deferred():
+            begun.set()
+            receiver.join()
+            finished.set()
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            block()
+        assert finished.is_set()
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -8,8 +8,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
@@ -18,19 +16,15 @@ import OpenEXR
 import psutil
 import pyarrow.parquet as pq
 import pytest
-from conftest import ROOT, SMALL
+from conftest import HANG_S, ROOT, SMALL, small_plan, started, wait_until
 
 from vlcrender.dataset.generate import generate
 from vlcrender.dataset.progress import Progress, ProgressCallback
-from vlcrender.dataset.recipe import Plan, load_plan
+from vlcrender.dataset.recipe import load_plan
 from vlcrender.dataset.verify import verify
 from vlcrender.errors import InputError
 
 RECIPE = ROOT / "datasets/quickstart.toml"
-
-
-def small_plan(*assignments: str) -> Plan:
-    return load_plan(RECIPE, [*SMALL, "poses.count=3", *assignments])
 
 
 def digests(directory: Path) -> dict[str, str]:
@@ -38,10 +32,8 @@ def digests(directory: Path) -> dict[str, str]:
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    directory = tmp_path_factory.mktemp("made") / "set"
-    assert generate(small_plan("expected=true"), directory)
-    return directory
+def made(rendered_set: Path) -> Path:
+    return rendered_set
 
 
 def test_a_dataset_is_complete_and_intact(made: Path) -> None:
@@ -56,6 +48,7 @@ def test_the_same_recipe_gives_the_same_bytes(made: Path, tmp_path: Path) -> Non
     assert len(digests(made)) == 3
 
 
+@pytest.mark.slow
 def test_two_workers_give_the_same_bytes_as_one(made: Path, tmp_path: Path) -> None:
     generate(small_plan("expected=true"), tmp_path / "pool", workers=2)
     assert digests(tmp_path / "pool") == digests(made)
@@ -63,10 +56,11 @@ def test_two_workers_give_the_same_bytes_as_one(made: Path, tmp_path: Path) -> N
         assert pq.read_table(tmp_path / "pool" / table).equals(pq.read_table(made / table))
 
 
+@pytest.mark.slow
 def test_one_thread_gives_the_same_bytes_as_all(made: Path, tmp_path: Path) -> None:
     """In a process of its own with every library held to one thread."""
     code = (
-        "from pathlib import Path; from test_generate import small_plan; from vlcrender.core.backend import dr; "
+        "from pathlib import Path; from conftest import small_plan; from vlcrender.core.backend import dr; "
         "from vlcrender.dataset.generate import generate; dr.set_thread_count(1); "
         f"generate(small_plan('expected=true'), Path({str(tmp_path / 'one')!r}))"
     )
@@ -117,6 +111,7 @@ def test_an_interrupted_run_resumes(made: Path, tmp_path: Path, caplog: pytest.L
     assert verify(directory) == []
 
 
+@pytest.mark.slow
 def test_progress_reports_the_light_and_then_each_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("VLCRENDER_CACHE", str(tmp_path / "cache"))
     plan = load_plan(ROOT / "datasets/table1.toml", [*SMALL[:4], "poses.columns=2", "poses.rows=1"])
@@ -163,7 +158,8 @@ def test_foreign_files_are_never_overwritten(made: Path, tmp_path: Path, state: 
     assert {p: p.read_bytes() for p in [directory, *directory.rglob("*")] if p.is_file()} == before
 
 
-def test_impossible_poses_are_refused_before_the_first_frame(tmp_path: Path) -> None:
+def test_impossible_poses_are_refused_before_the_first_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vlcrender.dataset.pose_sampling.TRIES", 100)
     plan = load_plan(RECIPE, [*SMALL, "poses.min_leds=500"])
     with pytest.raises(InputError, match=r"frame 0: no position .* 500 LEDs"):
         generate(plan, tmp_path / "never")
@@ -320,6 +316,7 @@ def test_an_impossible_camera_is_refused_in_one_line(
     assert "dataset.json" in str(refusal.value)
 
 
+@pytest.mark.slow
 def test_a_dead_worker_is_one_line_and_the_run_resumes(made: Path, tmp_path: Path) -> None:
     def kill_one(report: Progress) -> None:
         if (report.stage, report.done) == ("frames", 1):
@@ -334,32 +331,12 @@ def test_a_dead_worker_is_one_line_and_the_run_resumes(made: Path, tmp_path: Pat
 
 
 def started_with_workers(directory: Path) -> subprocess.Popen[str]:
-    """A command line in a session of its own, as a terminal starts one, that makes many frames with two workers."""
-    code = "from vlcrender.cli import main; main()"
+    """A command line that makes many frames with two workers."""
     sets = [part for assignment in (*SMALL, "poses.count=300") for part in ("--set", assignment)]
-    return subprocess.Popen(
-        [sys.executable, "-c", code, "generate", RECIPE, "--out", directory, "--workers", "2", *sets],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        start_new_session=True,
-        cwd=ROOT,
-    )
+    return started("vlcrender", "generate", str(RECIPE), "--out", str(directory), "--workers", "2", *sets)
 
 
-HANG_S = 600.0
-"""Ends a test whose event never happens; no test waits for it on any machine that works."""
-
-
-def wait_until(happened: Callable[[], bool], process: subprocess.Popen[str]) -> None:
-    """Wait for an event; fail where the process ends first."""
-    end = time.monotonic() + HANG_S
-    while not happened():
-        assert process.poll() is None, process.communicate()[0]
-        assert time.monotonic() < end, "the event never happened"
-        time.sleep(0.01)
-
-
+@pytest.mark.slow
 def test_an_interrupt_while_workers_start_is_one_line(tmp_path: Path) -> None:
     """Ctrl-C goes to the whole group of processes, also to children that are still importing.
 
@@ -376,6 +353,7 @@ def test_an_interrupt_while_workers_start_is_one_line(tmp_path: Path) -> None:
     assert "Traceback" not in output, output
 
 
+@pytest.mark.slow
 def test_workers_exit_with_their_parent(tmp_path: Path) -> None:
     """A kill that cannot be caught. They share its output, which ends with the last of them."""
     process = started_with_workers(tmp_path / "set")

@@ -101,6 +101,7 @@ def share_kept(scale: float) -> float:
     return float(4 * ((2 * j1(x) / x) ** 2).sum() * (half_side / 4000) ** 2 * np.pi / 4 / scale**2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CAMERAS)
 def test_an_edge_errs_by_less_than_a_twentieth_of_the_shot_noise(name: str) -> None:
     """Against the closed form of a disc behind a disc, or rings of the Airy pattern, at 64 x 64 points a pixel."""

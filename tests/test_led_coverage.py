@@ -204,6 +204,7 @@ LENSES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("camera", LENSES.values(), ids=LENSES)
 @pytest.mark.parametrize("shape", [Disc(1.0), Rectangle((1.5, 1.5)), Rectangle((2.0, 1.0), 30.0)], ids=str)
 @pytest.mark.parametrize("where", [(0.5, 0.5), (0.9, 0.85), (0.98, 0.1)])
@@ -287,6 +288,7 @@ COARSE_LENSES = LENSES | {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("camera", COARSE_LENSES.values(), ids=COARSE_LENSES)
 def test_candidates_include_every_led_that_lights_a_pixel(camera: Camera, rng: np.random.Generator) -> None:
     centers = np.column_stack([rng.uniform(0, 7, (250, 2)), rng.uniform(2.5, 3.5, 250)])

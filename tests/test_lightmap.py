@@ -113,6 +113,7 @@ def test_white_furnace(albedo: float) -> None:
     assert lux.mean() == pytest.approx(expected, rel=5e-3)
 
 
+@pytest.mark.slow
 def test_energy_balance(tmp_path: Path) -> None:
     """The surfaces absorb the flux that the LEDs emit."""
     scene = scene_of(led=[lamp(position_m=[3.5, 3.5, 3.0])], bake={"texel_m": 0.2, "paths": 512})
@@ -124,6 +125,7 @@ def test_energy_balance(tmp_path: Path) -> None:
     assert absorbed == pytest.approx(flux, rel=0.01)
 
 
+@pytest.mark.slow
 def test_light_reflected_by_the_floor_onto_the_ceiling_agrees_with_a_form_factor(tmp_path: Path) -> None:
     """One bounce by hand: only the floor reflects; the ceiling gets rho E / pi * cos cos / d^2 of each part of it."""
     reflectance = {"floor": 0.5, "ceiling": 0.0, "walls": 0.0}

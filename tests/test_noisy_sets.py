@@ -97,6 +97,7 @@ def test_the_dataset_states_the_sensor_parameters_in_effect(made: Path) -> None:
     assert warm["dark_current_e_s"] == pytest.approx(4e6)
 
 
+@pytest.mark.slow
 def test_two_workers_give_the_same_bytes(made: Path, tmp_path: Path) -> None:
     generate(noisy_plan(), tmp_path / "pool", workers=2)
     assert digests(tmp_path / "pool") == digests(made)
@@ -120,6 +121,7 @@ class Crash(Exception):
     pass
 
 
+@pytest.mark.slow
 def test_a_resumed_run_has_the_same_bytes(made: Path, tmp_path: Path) -> None:
     def stop(report: Progress) -> None:
         if (report.stage, report.done) == ("frames", 3):
@@ -132,6 +134,7 @@ def test_a_resumed_run_has_the_same_bytes(made: Path, tmp_path: Path) -> None:
     assert verify(tmp_path / "set") == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", ["seed=2017", "sensor.serial=13"])
 def test_another_seed_or_individual_shares_no_frame(change: str, made: Path, tmp_path: Path) -> None:
     other = tmp_path / "other"

@@ -58,6 +58,7 @@ def blocks(*images: np.ndarray) -> list[np.ndarray]:
     return [image.reshape(9, 10, 12, 10).mean(axis=(1, 3)).ravel() for image in images]
 
 
+@pytest.mark.slow
 def test_furniture_occludes_leds_and_is_lit_as_in_the_reference(tmp_path: Path) -> None:
     (tmp_path / "box.obj").write_text(BOX)
     piece = {"file": "box.obj", "position_m": [1.6, 1.4, 1.6], "yaw_deg": 20.0, "reflectance": 0.6}
@@ -95,6 +96,7 @@ def test_furniture_occludes_leds_and_is_lit_as_in_the_reference(tmp_path: Path) 
     assert abs((mine - theirs).mean()) < 5 * np.sqrt(spread.mean() / 100 / len(mine)) + 0.005 * theirs.mean()
 
 
+@pytest.mark.slow
 def test_light_reflected_by_a_glazing_agrees_with_the_reference() -> None:
     """A glazing of index 3 reflects 40 % and more of the light of an LED half a metre before it onto the floor."""
     led = {"id": 1, "position_m": [0.5, 1.5, 2.5], "radius_m": 0.15, "luminance_cd_m2": 8000.0}

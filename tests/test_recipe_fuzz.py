@@ -91,6 +91,7 @@ def smaller(plan: Plan) -> None:
         assert made.camera.width_px == 400
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     st.lists(st.sampled_from([(key, toml(value)) for key, value in PLAUSIBLE.items()]), max_size=4),
@@ -105,6 +106,7 @@ def test_any_assignment_is_valid_or_refused(sound: list[tuple[str, str]], odd: l
     valid_or_refused(QUICKSTART, [f"{key}={value}" for key, value in sound + odd])
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     st.dictionaries(

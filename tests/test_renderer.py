@@ -140,6 +140,7 @@ def daylight() -> Renderer:
     return Renderer(build_scene(check({**tree, "glazing": [glazing]}, SceneSettings, "daylight"), "daylight"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", VIEWS)
 def test_agrees_with_mitsubas_path_integrator(name: str, office_renderer: Renderer, daylight: Renderer) -> None:
     camera, pose = VIEWS[name]
@@ -180,6 +181,7 @@ def test_agrees_with_mitsubas_path_integrator(name: str, office_renderer: Render
     assert abs((means[:, 0] - means[:, 1]).mean()) < 5 * noise + 0.0034 * means[:, 1].mean()
 
 
+@pytest.mark.slow
 def test_narrow_defocus_agrees_with_mitsuba_and_needs_split_pixels(
     office_renderer: Renderer, monkeypatch: pytest.MonkeyPatch
 ) -> None:

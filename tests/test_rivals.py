@@ -56,6 +56,7 @@ def errors_m(folder: Path, name: str) -> list[float]:
     ]
 
 
+@pytest.mark.slow
 def test_a_fish_eye_is_located(fish_eye: Path) -> None:
     """LEDs of 4 px radius and 3000 e: centroids to 0.02 px of 286 px to the image distance, 0.1 mm at 2 m.
 

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from conftest import ROOT
-from estimator_synthetic import Array, View, description, grid, poisson, render, small_dataset, view_of
+from conftest import ROOT, copy_of
+from estimator_synthetic import Array, View, description, grid, poisson, render, view_of
 
 from estimator.errors import InputError
 from estimator.evaluate.batch import estimate_dataset, estimate_frame
@@ -287,16 +287,16 @@ def test_regions_give_the_same(tmp_path: Path) -> None:
         assert key in WRONG_ALWAYS or row.status == "failed" or error_m(row, whole) < RIGHT_M
 
 
-def test_a_truncated_image_is_a_named_failure_of_every_variant(tmp_path: Path) -> None:
-    folder = small_dataset(tmp_path)
+def test_a_truncated_image_is_a_named_failure_of_every_variant(synthetic_set: Path, tmp_path: Path) -> None:
+    folder = copy_of(synthetic_set, tmp_path)
     path = folder / "frames/000001.exr"
     path.write_bytes(path.read_bytes()[:5000])
     for rows in estimate_dataset(read_dataset(folder), list(VARIANTS.values()), on_frame=lambda: None).values():
         assert rows[1].reason.startswith("read: frames/000001.exr: damaged")
 
 
-def test_a_reading_that_is_no_number_is_refused_by_name(tmp_path: Path) -> None:
-    folder = small_dataset(tmp_path)
+def test_a_reading_that_is_no_number_is_refused_by_name(synthetic_set: Path, tmp_path: Path) -> None:
+    folder = copy_of(synthetic_set, tmp_path)
     table = pq.read_table(folder / "frames.parquet")
     rows = table.to_pylist()
     rows[2]["accelerometer_m_s2"][1] = float("nan")
@@ -323,6 +323,7 @@ pose = [{ position_m = [1.6, 3.5, 1.2], tilt_x_deg = 5.0, tilt_y_deg = -40.0 }]
 """
 
 
+@pytest.mark.slow
 def test_specular_reflections_of_the_renderer_are_left_out(tmp_path: Path) -> None:
     """At -40 deg, grazing the glazing, some reflections are bright enough to be detected beside the LEDs."""
     (tmp_path / "glazing.toml").write_text((ROOT / "scenes/office.toml").read_text() + GLAZING)

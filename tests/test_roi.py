@@ -36,6 +36,7 @@ def pixels_of(whole: np.ndarray, roi: Roi) -> np.ndarray:
     return whole[roi.row : roi.end_row, roi.column : roi.end_column]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("pose", "regions"),
     [

@@ -204,6 +204,7 @@ def test_a_room_without_leds_is_refused(tmp_path: Path) -> None:
         load_scene(path)
 
 
+@pytest.mark.slow
 @settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
 def test_a_damaged_scene_file_gives_a_scene_or_one_line(tmp_path: Path, data: st.DataObject) -> None:

@@ -65,6 +65,7 @@ def test_read_noise_is_normal_and_new_in_every_frame(sigma: float) -> None:
     assert abs(np.corrcoef(first, second)[0, 1]) < 4 / np.sqrt(N)
 
 
+@pytest.mark.slow
 def test_prnu_spreads_the_mean_and_not_the_electrons() -> None:
     """Temporal variance of a pixel of response 1 + p is (1 + p) mu; multiplied electrons would have (1 + p)^2 mu."""
     mu, prnu = 400.0, 0.1
@@ -261,6 +262,7 @@ def test_a_region_gets_the_noise_of_the_whole_frame(rng: np.random.Generator) ->
     assert np.array_equal(beyond[7:-7, 7:-7], frame)
 
 
+@pytest.mark.slow
 def test_threads_make_no_difference(tmp_path: Path) -> None:
     """One thread, two, and all, each in a process of its own."""
     code = (

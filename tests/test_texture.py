@@ -139,6 +139,7 @@ def test_a_texture_has_the_documented_origin_and_axes(
     assert np.abs(found - pixel).max() < 0.5
 
 
+@pytest.mark.slow
 def test_a_texture_agrees_with_the_reference(tmp_path: Path) -> None:
     """An image without symmetry on the ceiling, a panel cut into it, seen slanted and lit by an LED."""
     image = np.linspace(0.1, 0.9, 12).reshape(3, 4)[:, [2, 0, 3, 1]]
@@ -171,6 +172,7 @@ def test_a_texture_agrees_with_the_reference(tmp_path: Path) -> None:
     assert np.ptp(theirs) > 0.5 * theirs.mean()
 
 
+@pytest.mark.slow
 def test_a_textured_room_absorbs_the_flux_of_the_leds(tmp_path: Path) -> None:
     """Energy balance with a texture on the floor with pixels as large as texels, at other positions."""
     image = np.array([[0.1, 0.9], [0.8, 0.2]])

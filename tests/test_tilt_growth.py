@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from estimator_synthetic import GRAVITY_M_S2, Array, grid, small_dataset, view_of
+from estimator_synthetic import GRAVITY_M_S2, Array, grid, view_of
 
 from estimator.camera.leveling import level
 from estimator.camera.pose import rotation
@@ -19,9 +19,9 @@ STEP = 1e-6
 
 
 @pytest.fixture(scope="module")
-def quiet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def quiet(exact_synthetic_set: Path) -> Path:
     """Frames without noise: level, tilted, and tilted the other way and turned."""
-    return small_dataset(tmp_path_factory.mktemp("quiet"), noise=False)
+    return exact_synthetic_set
 
 
 def position_at(dataset: Dataset, leds: list[dict[str, float]], tilt: Array) -> Array:

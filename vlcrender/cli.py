@@ -7,6 +7,8 @@ so that `--help` loads neither Mitsuba nor SciPy.
 import logging
 import os
 import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from io import TextIOWrapper
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -166,6 +168,8 @@ def show(scene: str, /, *, out: Path | None = None, reference: Annotated[bool, P
     path = out or Path(f"{Path(scene).stem}.png")
     if path.suffix.lower() != ".png":
         raise InputError(f"--out {path}: has to end in .png")
+    if not path.parent.is_dir():
+        raise InputError(f"--out {path}: there is no folder {path.parent}")
     camera = Camera()
     across, down = camera.view_angles_deg()
     table = Table(
@@ -268,14 +272,14 @@ def _print_datasheet(name: str, sheet: "Datasheet") -> None:
     Console(width=max(Console().width, 100)).print(table)
 
 
-def main() -> None:
-    """Run the command line and exit."""
-    logging.basicConfig(format="vlcrender: %(message)s", level=logging.WARNING)
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line, by default with the arguments of this process; exit unless the code is 0."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal without a degree sign gets a question mark, not an error
     try:
-        app(exit_on_error=False, print_error=False)
+        with _log_on_stderr():
+            app(arguments, exit_on_error=False, print_error=False)
         sys.stdout.flush()
     except (CycloptsError, InputError) as error:
         _complain(str(error))
@@ -293,6 +297,25 @@ def main() -> None:
         # A fault of this program: one line, without a traceback.
         _complain(f"internal error, please report it: {type(error).__name__}: {error}")
         sys.exit(1)
+
+
+class _LineHandler(logging.Handler):
+    """Writes a log record as one line on the current stderr."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write the record."""
+        _complain(record.getMessage())
+
+
+@contextmanager
+def _log_on_stderr() -> Iterator[None]:
+    """Show warnings on stderr, also those of other packages."""
+    handler = _LineHandler(logging.WARNING)
+    logging.getLogger().addHandler(handler)
+    try:
+        yield
+    finally:
+        logging.getLogger().removeHandler(handler)
 
 
 def _complain(message: str) -> None:

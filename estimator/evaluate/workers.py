@@ -4,9 +4,10 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 
 import cv2
 
@@ -37,13 +38,8 @@ def estimate_with_workers(
         workers, multiprocessing.get_context("spawn"), _start, (dataset, tuple(names), max(1, _cores() // workers))
     )
     try:
-        # Child processes start with the first task. They inherit the mask, so that an interrupt reaches the parent
-        # alone and the children print no traceback. An interrupt in between is delivered after unmasking.
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        try:
+        with _interrupts_deferred():  # submit() starts child processes
             tasks = [pool.submit(_work, records) for records in todo]
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
         for records, task in zip(todo, tasks, strict=True):
             for name, of_shot in task.result().items():
                 rows[name] += of_shot
@@ -54,6 +50,28 @@ def estimate_with_workers(
     finally:
         pool.shutdown(cancel_futures=True)
     return {name: tuple(of_variant) for name, of_variant in rows.items()}
+
+
+@contextmanager
+def _interrupts_deferred() -> Iterator[None]:
+    """Deliver an interrupt (SIGINT) after this block; child processes started in it never receive one.
+
+    Children inherit the blocked signal: the parent alone handles an interrupt, and no child prints a traceback. The
+    handler is needed beside the mask. A mask holds for one thread; where another thread receives the signal, Python
+    raises KeyboardInterrupt in the main thread, which may be half way through starting a child.
+    """
+    received = threading.Event()
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    handler = signal.signal(signal.SIGINT, lambda *_: received.set()) if in_main_thread else None
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        if handler is not None:
+            signal.signal(signal.SIGINT, handler)
+    if received.is_set():
+        signal.raise_signal(signal.SIGINT)
 
 
 def _cores() -> int:

@@ -60,6 +60,8 @@ def read_dataset_file(directory: Path) -> DatasetFile:
         raise InputError(f"{path}: cannot be read as JSON: {error}") from None
     if not isinstance(tree, dict):
         raise InputError(f"{path}: is not a JSON object")
+    if tree.get("format") != "vlcrender-dataset":
+        raise InputError(f"{path}: format = {json.dumps(tree.get('format'))}: has to be vlcrender-dataset")
     if tree.get("version") != FORMAT_VERSION:
         found = json.dumps(tree.get("version"))
         raise InputError(
