@@ -9,8 +9,8 @@ from estimator.io.atomic import write_atomically
 
 
 @pytest.fixture
-def calls(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str]:
-    """Names of the system calls that matter, in order; what the disk then holds of the file stands beside fsync."""
+def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Names of the system calls that matter, in order, fsync with the size of the file at that time."""
     made: list[str] = []
     fsync, replace = os.fsync, os.replace
 

@@ -170,7 +170,7 @@ def test_a_covariance_is_symmetric_and_positive_definite(values: list[float], go
 
 
 def test_the_nees_interval_of_two_frames_by_hand() -> None:
-    """Squares 3 and 12, mean 7.5. Tables of chi-square, six degrees of freedom: 0.5 % below 0.6757, 99.5 % below 18.548.
+    """Squares 3 and 12: mean 7.5. Chi-square with six degrees of freedom: 0.6757 at 0.5 %, 18.548 at 99.5 %.
 
     Half of these is the interval of the mean: consistent. With three degrees of freedom it would end at 6.42, and the
     verdict would be overconfident.
