@@ -204,3 +204,12 @@ def test_a_covariance_whose_inverse_has_no_digits_is_refused() -> None:
     """
     for gap, good in ((4e-14, True), (2e-15, False), (0.0, False)):
         assert is_covariance([1, 1 - gap, 0, 1 - gap, 1, 0, 0, 0, 1]) == good
+
+
+@pytest.mark.parametrize("error_m", [0.0, 5e-324, 1e-170, 1e-161, 1e-100])
+def test_an_efficiency_is_finite_or_none_for_errors_of_any_size(error_m: float) -> None:
+    """Squares below 5e-324 are zero, and so are errors below 1e-162; the largest bound of the format is 1.7e50 m."""
+    found = against_bound([error_m], [3e100**0.5])
+    assert found is not None
+    assert (found.efficiency is None) == (error_m < 1e-162)
+    assert found.efficiency is None or found.efficiency == pytest.approx(3e100**0.5 / found.rmse_m)
