@@ -1,5 +1,6 @@
 """Photon transfer held against a camera written here in plain NumPy; then the sensor's own data sheet and its page."""
 
+import dataclasses
 import json
 import sys
 from collections.abc import Callable
@@ -8,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from html_text import texts
 from numpy.typing import NDArray
 
 from vlcrender.cli import main
@@ -288,8 +290,39 @@ def test_the_page_stands_alone_and_shows_every_row(full: Datasheet) -> None:
         assert f">{row.key}<" in text
         assert f">{cells(row)[1]}<" in text
     assert not [word for word in ("http", "url(", "<script", "nan", "inf ") if word in text.split("</style>")[1]]
-    named = Datasheet("<b>", full.conditions, full.sensor, full.efficiency, full.measurement, full.rows)
-    assert "<b>" not in page(named)
+
+
+def test_the_text_of_the_page_is_the_data_sheet(full: Datasheet) -> None:
+    """In order: title, conditions, the rows, and the legends of the two plots; names are text, never markup."""
+    named = dataclasses.replace(full, title="<b>&'x'")
+    found = texts(page(named))
+    rows = []
+    for row in full.rows:
+        set_value, measured, tolerance, verdict = cells(row)
+        rows += [row.key, row.name, set_value, measured, f"± {tolerance}" if tolerance else "", row.unit, verdict]
+        rows.append(row.definition)
+    assert found[:4] == [
+        "Data sheet: <b>&'x'",
+        "Data sheet of the sensor <b>&'x'",
+        " · ".join(full.conditions),
+        "Measured from digital numbers by EMVA Standard 1288, Release 4.0 Linear. A value passes where it lies within "
+        "the tolerance, four standard errors, of the set value.",
+    ]
+    plots = found.index("Photon transfer")
+    assert found[4:plots] == ["Set and measured", "set", "measured", "tolerance", "measured as", *filter(None, rows)]
+    legend = "Temporal variance minus dark variance, against mean minus dark mean."
+    assert found[plots + 1 : plots + 5] == [legend, "measured", "set: K times the signal", "saturation"]
+    curves = found.index("Signal to noise")
+    legend = "Mean minus dark mean, divided by its temporal noise, against photons per pixel."
+    assert found[curves + 1 : curves + 5] == [legend, "measured", "set", "limit of photon noise"]
+    assert {"mean, DN", "variance, DN²"} < set(found[plots:curves])
+    assert {"photons per pixel", "signal to noise"} < set(found[curves:])
+
+
+def test_a_value_that_is_off_stands_out(full: Datasheet) -> None:
+    assert 'class="off"' not in page(full)
+    wrong = tuple(dataclasses.replace(row, passed=False) if row.key == "K" else row for row in full.rows)
+    assert page(dataclasses.replace(full, rows=wrong)).count('<td class="off">OFF</td>') == 1
 
 
 def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:

@@ -412,3 +412,36 @@ def test_a_frame_is_read_with_those_of_the_rig_s_other_cameras(folder: Path) -> 
     assert other.other_cameras == ()
     assert read_frame(dataset, 2).other_cameras == ()
     assert read_frame(dataset, 0, with_other_cameras=False).other_cameras == ()
+
+
+def test_each_frame_of_a_shot_has_all_the_others_and_itself_not(folder: Path) -> None:
+    """Three cameras of a rig, with focal lengths that tell them apart, in the first and only shot."""
+    focal_px = {"main": 1500.0, "left": 1501.0, "right": 1502.0}
+
+    def mounted(content: dict[str, Any]) -> None:
+        main = content["cameras"]["main"]
+        content["cameras"] = {
+            name: {**main, "K": [[f, 0.0, 200.0], [0.0, f, 150.0], [0.0, 0.0, 1.0]]} for name, f in focal_px.items()
+        }
+
+    change_json(folder, mounted)
+    change_rows(folder, lambda rows: [row.update(shot=0, camera=n) for row, n in zip(rows, focal_px, strict=True)])
+    dataset = read_dataset(folder)
+    for number, own in enumerate(focal_px.values()):
+        frame = read_frame(dataset, number)
+        assert frame.camera.K[0][0] == own
+        assert [other.camera.K[0][0] for other in frame.other_cameras] == [f for f in focal_px.values() if f != own]
+
+
+def test_a_digest_in_capital_letters_is_the_same_digest(folder: Path) -> None:
+    before = read_frame(read_dataset(folder), 0).parts[0].image_dn
+    change_rows(folder, lambda rows: [row.update(sha256=row["sha256"].upper()) for row in rows])
+    assert np.array_equal(read_frame(read_dataset(folder), 0).parts[0].image_dn, before)
+
+
+def test_estimates_in_another_order_are_refused(folder: Path) -> None:
+    """As many rows as frames: a row counts for the frame that it names, not for its place."""
+    rows = [ROWS[0].model_copy(update={"frame": frame}) for frame in (0, 2, 1)]
+    path = write_estimates(folder, "shuffled", rows)
+    with pytest.raises(InputError, match=r"shuffled\.parquet: 3 rows, needed one for each of the 3 frames, in order"):
+        read_estimates(path, 3)

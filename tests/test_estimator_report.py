@@ -5,9 +5,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
+from html_text import texts
 from test_estimator_score import LEDS, TRUTH, failed, ok, truths
 
 from estimator.evaluate.score import Scores, VariantScore, score_variant
+from estimator.evaluate.score_table import ERROR_HEADERS, ERROR_NOTE, error_cells, interval_text
 from estimator.report.figures import Decades, distribution_plot, error_plot
 from estimator.report.report import page
 from estimator.report.svg import COLOURS, DASHES, MARKS, mark, style_of_variants
@@ -110,3 +112,69 @@ def test_the_table_of_bounds_is_left_out_if_it_is_empty(tmp_path: Path) -> None:
     title = "Cramér-Rao bound and covariance consistency"
     assert title not in page([(tmp_path, scores_of([scored([0.1, 0.2])]))])
     assert title in page([(tmp_path, scores_of([scored([0.1, 0.2], bound_m2=BOUND)]))])
+
+
+def test_the_text_of_a_page_by_hand(tmp_path: Path) -> None:
+    """One frame 100 mm off and one failed, in order: title, table of scores, failures, the two plots, floor plan."""
+    found = texts(page([(tmp_path, scores_of([scored([0.1, None])]))]))
+    cells = ["1", "1", "50 %", "100 mm", "∞", *["100 mm"] * 6, "0 µm", "–", "100 ms"]
+    row = ["x", *cells]
+    curves = ["x", "0 %", "25 %", "50 %", "75 %", "95 %", "100 %", "100 mm", "1 m", "3D error, share of all frames"]
+    tips = ["frame 0: 100 mm", "frame 1: a: b"]
+    assert found == [
+        "Positioning report: set",
+        "Positioning report",
+        "No frame is dropped: failed frames are counted beside the errors of the others, and count as infinite errors "
+        "in the columns “of all”.",
+        *("set", "2 frames · 1 LEDs · room 4 × 5 × 3.5 m", "Scores", "variant", *ERROR_HEADERS, *row, ERROR_NOTE),
+        *("Failures", "variant", "frames", "reason", "x", "1", "a: b"),
+        *("3D error of each frame", "Crosses: failed frames.", "x", "100 mm", "1 m", "0", "1", "frame", "failed"),
+        *(f"x, {tip}" for tip in tips),
+        *("Distribution of the 3D error", "A curve ends, on the right, at the variant's success rate.", *curves),
+        "Floor plans",
+        "Yellow: LEDs. Rings: true positions. Marks: estimates, joined to the truth. Crosses: failed frames.",
+        *tips,
+        "x",
+    ]
+
+
+def test_names_and_reasons_are_text_and_never_markup(tmp_path: Path) -> None:
+    """Names of datasets, variants and previews, and reasons, come from files: `<`, `&` and quotes are text."""
+    hostile = """<script>"a"&'b'"""
+    variants = [
+        score_variant(name, [failed(0, hostile), ok(1, TRUTH)], truths(2), LEDS) for name in (hostile, f"{hostile}:c,d")
+    ]
+    (tmp_path / "previews").mkdir()
+    (tmp_path / "previews/000'<i>.png").write_bytes(b"PNG")
+    html = page([(tmp_path, scores_of(variants).model_copy(update={"dataset": hostile}))])
+    assert "<script" not in html
+    assert "<i>" not in html
+    assert """alt="000&#39;&lt;i&gt;" src="data:image/png;base64,UE5H">""" in html
+    found = texts(html)
+    assert f"Positioning report: {hostile}" in found
+    # The set's name once; the first variant's in two tables, two legends and a caption; the reason of either.
+    assert found.count(hostile) == 1 + 5 + 2
+    assert f"Frame by frame against {hostile}" in found
+    assert "frame 000'<i>" in found
+    assert ":<wbr>c,<wbr>d</td>" in html  # lines may break before options
+
+
+def test_the_interval_stands_below_its_value(tmp_path: Path) -> None:
+    """Of 20 errors, both median and RMSE have an interval; the cell holds the value and the interval in small type."""
+    variant = scored([0.01 * k for k in range(1, 21)])
+    html = page([(tmp_path, scores_of([variant]))])
+    cells = dict(zip(ERROR_HEADERS, error_cells(variant), strict=True))
+    assert f"<td>{cells['median']}<small>{interval_text(variant.median_interval)}</small></td>" in html
+    assert f"<td>{cells['RMSE']}<small>{interval_text(variant.rmse_interval)}</small></td>" in html
+    assert '<td class="failed">' not in html
+
+
+def test_estimates_outside_are_counted_and_previews_limited(tmp_path: Path) -> None:
+    """13 previews: 12 are shown, from the first on. A caption counts the estimates beyond the walls of 4 m x 5 m."""
+    (tmp_path / "previews").mkdir()
+    for k in range(13):
+        (tmp_path / f"previews/{k:06}.png").write_bytes(b"PNG")
+    found = texts(page([(tmp_path, scores_of([scored([0.1, 3.1, -1.1, None])]))]))
+    assert "x · 2 estimates outside the walls" in found
+    assert "12 of 13" in found
+    assert [text for text in found if text.startswith("frame 0000")] == [f"frame {k:06}" for k in range(12)]

@@ -201,3 +201,42 @@ def test_what_cannot_be_scored_is_named(synthetic_set: Path, tmp_path: Path) -> 
     (folder / "truth.parquet").unlink()
     with pytest.raises(InputError, match=r"truth.parquet: no such file"):
         score(folder)
+
+
+def test_truth_in_another_order_is_refused(tmp_path: Path) -> None:
+    """As many rows as frames, the second and third exchanged: every error of theirs would be wrong."""
+    folder = small_dataset(tmp_path)
+    write_estimates(folder, "one", [ok(frame, TRUTH) for frame in range(3)])
+    table = pq.read_table(folder / "truth.parquet")
+    pq.write_table(table.take([0, 2, 1]), folder / "truth.parquet")
+    with pytest.raises(InputError, match=r"truth\.parquet: 3 rows, needed one for each of the 3 frames, in order"):
+        score(folder)
+
+
+def test_the_efficiency_is_of_the_frames_that_have_a_bound() -> None:
+    """Errors of 1 m without a bound stand before one of 12 mm with a bound of 6 mm: efficiency 1/2."""
+    x, y, z = TRUTH
+    rows = [ok(0, (x + 1, y, z)), failed(1, "a: x"), ok(2, (x, y, z + 0.012))]
+    bound_m2 = (12e-6, 0.0, 0.0, 0.0, 12e-6, 0.0, 0.0, 0.0, 12e-6)
+    truth = [row.model_copy(update={"bound_m2": bound_m2 if row.frame == 2 else None}) for row in truths(3)]
+    found = score_variant("x", rows, truth, LEDS).against_bound
+    assert found is not None
+    assert (found.frames, found.rmse_m, found.efficiency) == (1, pytest.approx(0.012), pytest.approx(0.5))
+
+
+def test_a_variant_that_gives_up_early_does_not_look_fast() -> None:
+    """Times are of the frames that succeeded: 0.1, 0.3 and 0.5 s; failed ones took 0.9 s here and could take none."""
+    rows = [*(ok(k, TRUTH, time_s=t) for k, t in enumerate((0.5, 0.1, 0.3))), *(failed(k, "a: x") for k in (3, 4, 5))]
+    assert score_variant("x", rows, truths(6), LEDS).median_time_s == pytest.approx(0.3)
+
+
+def test_a_range_that_is_too_long_has_a_positive_error() -> None:
+    (row,) = score_variant("x", [ok(0, TRUTH, 3.02, 2.99)], truths(1), LEDS).rows
+    assert [error.error_m for error in row.range_errors] == pytest.approx([0.02, -0.01])
+
+
+def test_the_bound_of_a_frame_is_the_root_of_its_trace() -> None:
+    """Variances of 4, 9 and 36 mm^2: 7 mm; the covariances do not count."""
+    bound_m2 = (4e-6, 1e-6, 2e-6, 1e-6, 9e-6, 3e-6, 2e-6, 3e-6, 36e-6)
+    (row,) = score_variant("x", [ok(0, TRUTH)], truths(1, bound_m2), LEDS).rows
+    assert row.bound_m == pytest.approx(0.007)

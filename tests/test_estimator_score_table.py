@@ -2,14 +2,17 @@
 
 from test_estimator_score import LEDS, TRUTH, failed, ok, truths
 
-from estimator.evaluate.score import score_variant
+from estimator.evaluate.comparison import compare
+from estimator.evaluate.score import VariantScore, score_variant
 from estimator.evaluate.score_table import (
     ERROR_HEADERS,
     LIMIT_HEADERS,
+    PAIR_HEADERS,
     error_cells,
     interval_text,
     length_text,
     limit_cells,
+    pair_cells,
     share_text,
 )
 from estimator.evaluate.statistics import Interval
@@ -67,3 +70,33 @@ def test_a_covariance_that_is_too_small_is_said_to_be() -> None:
     assert [c["NEES"] for c in cells] == ["100 (overconfident)", "0.0001 (conservative)"]
     assert [c["ambiguous"] for c in cells] == ["0", "1 (100 %)"]
     assert cells[0]["efficiency"] == "–"
+
+
+def test_a_pair_is_counted_over_all_frames_and_compared_over_those_of_both() -> None:
+    """A is nearer in two of the three frames of both: 66.6 %, whatever the two frames are where one failed."""
+    x, y, z = TRUTH
+
+    def scored(name: str, *errors_m: float | None) -> VariantScore:
+        rows = [failed(k, "a: b") if e is None else ok(k, (x + e, y, z)) for k, e in enumerate(errors_m)]
+        return score_variant(name, rows, truths(len(rows)), LEDS)
+
+    a, b = scored("a", 0.01, 0.01, 0.04, 0.1, None), scored("b", 0.02, 0.04, 0.01, None, 0.1)
+    cells = dict(zip(PAIR_HEADERS, pair_cells(compare(a, b)), strict=True))
+    assert (cells["both"], cells["only A"], cells["only B"], cells["neither"]) == ("3", "1", "1", "0")
+    assert (cells["A nearer"], cells["median A − B"]) == ("66.6 %", "-10 mm")
+    alone = dict(zip(PAIR_HEADERS, pair_cells(compare(scored("a", None), scored("b", 0.1))), strict=True))
+    assert list(alone.values()) == ["0", "0", "1", "0", "–", "–", "–", "–"]
+
+
+def test_errors_and_bounds_stand_in_the_columns_of_their_names() -> None:
+    """One frame: (3, 4, -12) cm off, 13 cm in all, 2 cm of range; a bound of 6.5 cm, half of the error; 0.1 s."""
+    x, y, z = TRUTH
+    bound_m2 = (0.065**2 / 3, 0.0, 0.0, 0.0, 0.065**2 / 3, 0.0, 0.0, 0.0, 0.065**2 / 3)
+    score = score_variant("x", [ok(0, (x + 0.03, y + 0.04, z - 0.12), 3.02)], truths(1, bound_m2), LEDS)
+    cells = dict(zip(ERROR_HEADERS, error_cells(score), strict=True))
+    expected = dict.fromkeys(("median of all", "p95 of all", "median", "RMSE", "mean", "p95", "max"), "130 mm")
+    expected |= {"horizontal": "50 mm", "vertical": "120 mm", "range": "20 mm", "time": "100 ms", "95 % interval": "–"}
+    assert cells == {"ok": "1", "failed": "0", "success rate": "100 %", **expected}
+    limits = dict(zip(LIMIT_HEADERS, limit_cells(score), strict=True))
+    assert (limits["frames with a bound"], limits["bound"], limits["RMSE there"]) == ("1", "65 mm", "130 mm")
+    assert (limits["efficiency"], limits["NEES"], limits["of"], limits["ambiguous"]) == ("0.5", "–", "0", "0")

@@ -167,3 +167,49 @@ COVARIANCES = [
 @pytest.mark.parametrize(("values", "good"), COVARIANCES)
 def test_a_covariance_is_symmetric_and_positive_definite(values: list[float], good: bool) -> None:
     assert is_covariance(values) == good
+
+
+def test_the_nees_interval_of_two_frames_by_hand() -> None:
+    """Squares 3 and 12: mean 7.5. Chi-square with six degrees of freedom: 0.6757 at 0.5 %, 18.548 at 99.5 %.
+
+    Half of these is the interval of the mean: consistent. With three degrees of freedom it would end at 6.42, and the
+    verdict would be overconfident.
+    """
+    found = nees([3.0, 12.0])
+    assert found is not None
+    assert (found.frames, found.mean, found.within) == (2, 7.5, True)
+    assert found.low == pytest.approx(0.6757 / 2, abs=0.5e-4)
+    assert found.high == pytest.approx(18.548 / 2, abs=0.5e-3)
+    overconfident = nees([3.0, 16.0])
+    assert overconfident is not None
+    assert not overconfident.within
+
+
+def test_a_covariance_of_rounding_is_symmetric_and_of_a_thousandth_is_not() -> None:
+    """Why MAX_ASYMMETRY is 1e-6: covariances may come from single precision, where a term is rounded by 6e-8.
+
+    Sums of 16 such terms agree to 1e-6; entries that differ by more are not of one matrix.
+    """
+    rounded = np.float32(0.3)
+    assert is_covariance([1, float(rounded), 0, 0.3, 1, 0, 0, 0, 1])
+    assert is_covariance([1, 0.3, 0, 0.3 + 0.9e-6, 1, 0, 0, 0, 1])
+    assert not is_covariance([1, 0.3, 0, 0.3 + 1.1e-6, 1, 0, 0, 0, 1])
+
+
+def test_a_covariance_whose_inverse_has_no_digits_is_refused() -> None:
+    """Why MIN_EIGENVALUE is 1e-14: a correlation matrix's inverse is off by eps over its smallest eigenvalue.
+
+    eps is 2.2e-16, so that 1e-14 leaves 2 %, by which the mean NEES of 1700 frames scatters: sqrt(2 / (3 n)). Of
+    [[1, r], [r, 1]] the eigenvalues are 1 - r and 1 + r.
+    """
+    for gap, good in ((4e-14, True), (2e-15, False), (0.0, False)):
+        assert is_covariance([1, 1 - gap, 0, 1 - gap, 1, 0, 0, 0, 1]) == good
+
+
+@pytest.mark.parametrize("error_m", [0.0, 5e-324, 1e-170, 1e-161, 1e-100])
+def test_an_efficiency_is_finite_or_none_for_errors_of_any_size(error_m: float) -> None:
+    """Squares below 5e-324 are zero, and so are errors below 1e-162; the largest bound of the format is 1.7e50 m."""
+    found = against_bound([error_m], [3e100**0.5])
+    assert found is not None
+    assert (found.efficiency is None) == (error_m < 1e-162)
+    assert found.efficiency is None or found.efficiency == pytest.approx(3e100**0.5 / found.rmse_m)

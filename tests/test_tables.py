@@ -8,7 +8,16 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from vlcrender.dataset.schema import FRAMES_SCHEMA, TRUTH_SCHEMA, FrameRecord, FrameRow, LedTruth, SpotRow, TruthRow
+from vlcrender.dataset.schema import (
+    FRAMES_SCHEMA,
+    TRUTH_SCHEMA,
+    FrameRecord,
+    FrameRow,
+    LedTruth,
+    SpotRow,
+    TruthRow,
+    flat9,
+)
 from vlcrender.dataset.tables import read_table, write_table
 from vlcrender.errors import InputError
 
@@ -110,3 +119,40 @@ def test_other_columns_are_named(tmp_path: Path) -> None:
         read_table(tmp_path / "truth.parquet", TruthRow)
     with pytest.raises(InputError, match=r"frames\.parquet: is missing"):
         read_table(tmp_path / "frames.parquet", FrameRow)
+
+
+def test_a_table_of_other_names_or_types_is_refused_though_it_has_as_many_columns(
+    tmp_path: Path, rng: np.random.Generator
+) -> None:
+    """A former version may differ in the type of one column, or in the order of two."""
+    path = tmp_path / "truth.parquet"
+    write_table(path, [record(rng, bound=True).truth], TruthRow)
+    table = pq.read_table(path)
+    yaw = table.schema.get_field_index("yaw_deg")
+    pq.write_table(table.set_column(yaw, "yaw_deg", table["yaw_deg"].cast(pa.float32())), path)
+    with pytest.raises(InputError, match=r"columns differ from FORMAT\.md: yaw_deg: double, yaw_deg: float$"):
+        read_table(path, TruthRow)
+    pq.write_table(table.select(table.column_names[::-1]), path)
+    with pytest.raises(InputError, match=r"columns differ from FORMAT\.md: their order"):
+        read_table(path, TruthRow)
+
+
+def test_a_matrix_is_written_row_by_row() -> None:
+    assert flat9(np.arange(9.0).reshape(3, 3)) == (0, 1, 2, 3, 4, 5, 6, 7, 8)
+
+
+def test_a_table_that_cannot_be_written_leaves_the_old_one(
+    tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "frames.parquet"
+    path.write_bytes(b"old")
+
+    def full(_table: object, partial: Path) -> None:
+        partial.write_bytes(b"half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(pq, "write_table", full)
+    with pytest.raises(InputError, match=r"frames\.parquet: cannot be written: No space left on device"):
+        write_table(path, [record(rng, bound=True).device], FrameRow)
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]

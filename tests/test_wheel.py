@@ -1,4 +1,4 @@
-"""The wheel holds the scenes, the recipes and the types, and works from an empty folder."""
+"""The wheel holds the scenes, the recipes, the templates and the types, and works from an empty folder."""
 
 import os
 import subprocess
@@ -24,7 +24,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return Path(next(WheelBuilder(str(ROOT)).build(directory=str(directory), versions=["standard"])))
 
 
-def test_the_wheel_holds_scenes_recipes_format_and_types(wheel: Path) -> None:
+def test_the_wheel_holds_scenes_recipes_format_templates_and_types(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
         for folder, kinds in {"scenes": (".toml", ".png"), "datasets": (".toml", ".md")}.items():
@@ -32,6 +32,8 @@ def test_the_wheel_holds_scenes_recipes_format_and_types(wheel: Path) -> None:
             assert {path.suffix for path in files} == set(kinds)  # a file of another kind: has it to be in the wheel?
             for path in files:
                 assert archive.read(f"{PACKAGED}/{folder}/{path.name}") == path.read_bytes()
+    templates = ("estimator/report/report", "vlcrender/emva1288/page")
+    assert {f"{name}.{kind}" for name in templates for kind in ("html", "css")} <= names
     assert {"vlcrender/py.typed", "estimator/py.typed", "vlcrender/api.py"} <= names
     assert {name.split("/")[0].split("-")[0] for name in names} == {"vlcrender", "estimator"}
 

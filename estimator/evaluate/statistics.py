@@ -16,8 +16,6 @@ RESAMPLES = 1999
 BOOTSTRAP_KEY = 20161118
 MAX_RESAMPLED_AT_ONCE = 2_000_000
 NEES_CONFIDENCE = 0.99
-MIN_ERROR_M = 1e-100
-"""Smaller errors count as zero; no efficiency is computed from them."""
 
 
 class Summary(Row):
@@ -151,7 +149,7 @@ def against_bound(errors_m: Sequence[float], bounds_m: Sequence[float]) -> Again
         frames=len(errors_m),
         bound_rms_m=bound_rms_m,
         rmse_m=rmse_m,
-        efficiency=bound_rms_m / rmse_m if rmse_m >= MIN_ERROR_M else None,
+        efficiency=bound_rms_m / rmse_m if rmse_m > 0 else None,
     )
 
 

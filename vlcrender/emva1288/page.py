@@ -1,9 +1,11 @@
-"""HTML page of a data sheet with its plots: one file, no network."""
+"""HTML page of a data sheet with its plots: one file, no network. page.html beside this module is its template."""
 
 from collections.abc import Callable, Sequence
 from html import escape
 
 import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
 from numpy.typing import NDArray
 
 from vlcrender.emva1288.datasheet import Datasheet, cells
@@ -12,85 +14,24 @@ Array = NDArray[np.float64]
 WIDTH, HEIGHT = 960.0, 380.0
 LEFT, RIGHT, TOP, BOTTOM = 76.0, 28.0, 12.0, 44.0
 
-STYLE = """
-:root { color-scheme: light dark; --ink: #1c2024; --soft: #667078; --line: #dde2e6; --paper: #fff; --back: #f4f6f8; }
-@media (prefers-color-scheme: dark) {
-  :root { --ink: #e6e9ec; --soft: #9aa4ad; --line: #363d44; --paper: #1d2126; --back: #14171a; }
-}
-* { box-sizing: border-box; }
-body { margin: 0 auto; max-width: 1200px; padding: 32px 20px 64px; background: var(--back); color: var(--ink);
-  font: 15px/1.5 system-ui, sans-serif; }
-h1 { font-size: 26px; margin: 0 0 4px; }
-h2 { font-size: 18px; margin: 32px 0 8px; }
-p { margin: 4px 0; color: var(--soft); }
-.card { background: var(--paper); border: 1px solid var(--line); border-radius: 10px; padding: 14px 18px;
-  overflow-x: auto; }
-table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums; }
-th { color: var(--soft); font-weight: 500; font-size: 13px; }
-th, td { padding: 6px 10px; text-align: right; white-space: nowrap; border-bottom: 1px solid var(--line); }
-tr:last-child td { border-bottom: 0; }
-.text { text-align: left; }
-.soft { color: var(--soft); white-space: normal; min-width: 200px; }
-.off { color: #d03b3b; font-weight: 600; }
-.key { display: inline-block; width: 10px; height: 10px; border-radius: 50%; margin: 0 6px 0 18px; }
-svg { width: 100%; height: auto; display: block; }
-svg text { fill: var(--soft); font: 12px system-ui, sans-serif; }
-svg .rule { stroke: var(--line); }
-svg path { fill: none; stroke-width: 1.6; }
-svg .measured { fill: #0072b2; } .key.measured { background: #0072b2; }
-svg .set { stroke: #d55e00; } .key.set { background: #d55e00; }
-svg .limit { stroke: #009e73; stroke-dasharray: 5 4; } .key.limit { background: #009e73; }
-"""
+TEMPLATES = Environment(
+    loader=PackageLoader("vlcrender.emva1288", "."),
+    autoescape=True,
+    undefined=StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+    keep_trailing_newline=True,
+)
 
 
 def page(sheet: Datasheet) -> str:
     """The HTML text of the page."""
-    conditions = " · ".join(escape(condition) for condition in sheet.conditions)
-    return f"""<!doctype html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>Data sheet: {escape(sheet.title)}</title>
-<style>{STYLE}</style>
-</head>
-<body>
-<h1>Data sheet of the sensor {escape(sheet.title)}</h1>
-<p>{conditions}</p>
-<p>Measured from digital numbers by EMVA Standard 1288, Release 4.0 Linear. A value passes where it lies within the
-tolerance, four standard errors, of the set value.</p>
-<h2>Set and measured</h2>
-<div class="card">{_table(sheet)}</div>
-<h2>Photon transfer</h2>
-<div class="card"><p>Temporal variance minus dark variance, against mean minus dark mean.
-{_legend("measured", "set: K times the signal", "saturation")}</p>{_photon_transfer(sheet)}</div>
-<h2>Signal to noise</h2>
-<div class="card"><p>Mean minus dark mean, divided by its temporal noise, against photons per pixel.
-{_legend("measured", "set", "limit of photon noise")}</p>{_signal_to_noise(sheet)}</div>
-</body>
-</html>
-"""
-
-
-def _table(sheet: Datasheet) -> str:
-    rows = []
-    for row in sheet.rows:
-        set_text, measured, tolerance, verdict = (escape(cell) for cell in cells(row))
-        plus_minus = f"± {tolerance}" if tolerance else ""
-        kind = ' class="off"' if row.passed is False else ""
-        rows.append(
-            f'<tr><td class="text">{escape(row.key)}</td><td class="text">{escape(row.name)}</td><td>{set_text}</td>'
-            f'<td>{measured}</td><td>{plus_minus}</td><td class="text">{escape(row.unit)}</td><td{kind}>{verdict}</td>'
-            f'<td class="text soft">{escape(row.definition)}</td></tr>'
-        )
-    heads = ("text|", "text|", "|set", "|measured", "|tolerance", "text|", "|", "text|measured as")
-    head = "".join(f'<th class="{kind}">{name}</th>' for kind, _, name in (h.partition("|") for h in heads))
-    return f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
-
-
-def _legend(measured: str, set_text: str, limit: str) -> str:
-    names = (("measured", measured), ("set", set_text), ("limit", limit))
-    return "".join(f'<span class="key {kind}"></span>{escape(name)}' for kind, name in names)
+    return TEMPLATES.get_template("page.html").render(
+        sheet=sheet,
+        rows=[(row, *cells(row)) for row in sheet.rows],
+        photon_transfer=Markup(_photon_transfer(sheet)),
+        signal_to_noise=Markup(_signal_to_noise(sheet)),
+    )
 
 
 def _photon_transfer(sheet: Datasheet) -> str:
