@@ -124,6 +124,9 @@ def test_a_perfect_photodiode_counts_every_photon_of_a_narrow_line() -> None:
         ({"pixel_pitch_um": 2.4}, 4),
         ({"transmittance": 0.45}, 1 / 2),
         ({"focal_length_mm": 36.0}, 1),  # at infinity focus only the f-number counts
+        # f_i = f s / (s - f): the working f-number is N / (1 - f / s), of 18 mm
+        ({"focus_distance_m": 2.0}, (1 - 0.009) ** 2),
+        ({"focus_distance_m": 0.5}, (1 - 0.036) ** 2),
     ],
 )
 def test_electrons_scale_with_aperture_area_and_transmittance(change: dict[str, float], factor: float) -> None:
