@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from vlcrender.camera.intrinsics import Camera
+from vlcrender.sensor.quantum_efficiency import QuantumEfficiency
 from vlcrender.sensor.radiometry import (
     WAVELENGTHS_NM,
     Silicon,
+    Tabulated,
     electron_rate_per_cd_m2,
     luminous_efficiency,
     relative_spectrum,
@@ -132,3 +134,9 @@ def test_a_perfect_photodiode_counts_every_photon_of_a_narrow_line() -> None:
 def test_electrons_scale_with_aperture_area_and_transmittance(change: dict[str, float], factor: float) -> None:
     changed = electron_rate_per_cd_m2(Camera(**change), "LED-B3", Silicon())
     assert changed == pytest.approx(factor * electron_rate_per_cd_m2(Camera(), "LED-B3", Silicon()), rel=1e-12)
+
+
+def test_a_measured_table_is_linear_between_its_wavelengths_and_0_outside() -> None:
+    table = QuantumEfficiency(wavelengths_nm=(400.0, 500.0, 700.0), values=(0.2, 0.6, 0.4))
+    found = Tabulated(table).quantum_efficiency(np.array([399.9, 400.0, 425.0, 500.0, 600.0, 700.0, 700.1]))
+    assert found == pytest.approx([0.0, 0.2, 0.3, 0.6, 0.5, 0.4, 0.0])
