@@ -141,6 +141,20 @@ def test_saturation_agrees_with_random_draws(rng: np.random.Generator) -> None:
     assert best < 5500 - 4 * np.sqrt(5500)  # where it would be if they were all alike: the brightest are full by then
 
 
+def test_read_noise_does_not_move_the_saturation_of_a_well() -> None:
+    """The well clips first: noise that is added later raises all temporal variances alike, bit for bit in the maximum.
+
+    Where the ADC limits, it clips read noise as well, and the variance falls at less light.
+    """
+    levels = np.linspace(0.6, 1.0, 41) * 6300
+    well, noisy = (Sensor(**{**FULL, "read_noise_e": sigma, "adc_noise_dn": 0.0}) for sigma in (0.0, 60.0))
+    assert saturation_e(well, 0.0, levels, 800_000)[0] == saturation_e(noisy, 0.0, levels, 800_000)[0]
+    adc, noisy = (
+        Sensor(**{**FULL, "full_well_e": 1e5, "read_noise_e": sigma, "adc_noise_dn": 0.0}) for sigma in (0.0, 60.0)
+    )
+    assert saturation_e(noisy, 0.0, levels, 800_000)[0] < saturation_e(adc, 0.0, levels, 800_000)[0]
+
+
 @pytest.mark.parametrize("z", [-1.0, 0.0, 0.7, 3.0])
 def test_clipped_normal_moments_agree_with_random_draws(z: float, rng: np.random.Generator) -> None:
     """Mean and variance of a million, each to 5 standard errors from the draws' own moments."""

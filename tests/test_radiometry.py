@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from vlcrender.camera.intrinsics import Camera
+from vlcrender.sensor.quantum_efficiency import QuantumEfficiency
 from vlcrender.sensor.radiometry import (
     WAVELENGTHS_NM,
     Silicon,
+    Tabulated,
     electron_rate_per_cd_m2,
     luminous_efficiency,
     relative_spectrum,
@@ -124,8 +126,17 @@ def test_a_perfect_photodiode_counts_every_photon_of_a_narrow_line() -> None:
         ({"pixel_pitch_um": 2.4}, 4),
         ({"transmittance": 0.45}, 1 / 2),
         ({"focal_length_mm": 36.0}, 1),  # at infinity focus only the f-number counts
+        # f_i = f s / (s - f): the working f-number is N / (1 - f / s), of 18 mm
+        ({"focus_distance_m": 2.0}, (1 - 0.009) ** 2),
+        ({"focus_distance_m": 0.5}, (1 - 0.036) ** 2),
     ],
 )
 def test_electrons_scale_with_aperture_area_and_transmittance(change: dict[str, float], factor: float) -> None:
     changed = electron_rate_per_cd_m2(Camera(**change), "LED-B3", Silicon())
     assert changed == pytest.approx(factor * electron_rate_per_cd_m2(Camera(), "LED-B3", Silicon()), rel=1e-12)
+
+
+def test_a_measured_table_is_linear_between_its_wavelengths_and_0_outside() -> None:
+    table = QuantumEfficiency(wavelengths_nm=(400.0, 500.0, 700.0), values=(0.2, 0.6, 0.4))
+    found = Tabulated(table).quantum_efficiency(np.array([399.9, 400.0, 425.0, 500.0, 600.0, 700.0, 700.1]))
+    assert found == pytest.approx([0.0, 0.2, 0.3, 0.6, 0.5, 0.4, 0.0])

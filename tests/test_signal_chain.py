@@ -284,3 +284,92 @@ def test_threads_make_no_difference(tmp_path: Path) -> None:
 def test_impossible_means_are_refused(mean: float) -> None:
     with pytest.raises(ValueError, match="are allowed"):
         expose(EVERYTHING, np.array([[1.0, mean]], dtype=np.float32), "bad", exposure_s=0.0)
+
+
+def test_a_full_pixel_shows_no_dsnu() -> None:
+    """DSNU is part of the collected charge, which the well clips: 40 e of it leave a pixel 100 sigma above the well."""
+    sensor = Sensor(**{**FINE, "full_well_e": 500.0}, dsnu_e=5.0)
+    image = exposed(sensor, 3000.0)
+    assert (image == 500).all()
+
+
+def test_dark_current_does_not_follow_the_pixels_response() -> None:
+    """PRNU is a spread of quantum efficiency: electrons of the dark current need no photon."""
+    plain, uneven = Sensor(**FINE, dark_current_e_s=1000.0), Sensor(**FINE, dark_current_e_s=1000.0, prnu=0.3)
+    assert np.array_equal(exposed(plain, 0.0, exposure_s=0.5), exposed(uneven, 0.0, exposure_s=0.5))
+
+
+def test_read_noise_is_independent_of_the_shot_noise_of_its_pixel() -> None:
+    """The same exposure with and without read noise: the difference is the read noise itself, to a quarter electron.
+
+    Correlations of n independent pairs have the standard error 1 / sqrt(n), also of the squares.
+    """
+    for mean in (2.0, 60.0):
+        quiet, noisy = (
+            exposed(Sensor(**FINE, black_level_dn=BLACK, read_noise_e=sigma), mean).ravel() for sigma in (0.0, 20.0)
+        )
+        shot, read = quiet - mean, noisy - quiet
+        for a, b in ((shot, read), (shot, read**2), (shot**2, read), (shot**2, read**2)):
+            assert abs(np.corrcoef(a, b)[0, 1]) < 5 / np.sqrt(N)
+
+
+def test_the_offsets_of_rows_and_columns_are_drawn_apart() -> None:
+    """The corner pixel belongs to row 0 and column 0: over sensors, its two offsets are uncorrelated.
+
+    A correlation of n independent pairs has the standard error 1 / sqrt(n).
+    """
+    corners = [
+        [
+            float(
+                expose(
+                    Sensor(**FINE, **{key: 50.0}, black_level_dn=BLACK, serial=serial),
+                    np.zeros((1, 1), dtype=np.float32),
+                    "corner",
+                    exposure_s=0.0,
+                )[0, 0]
+            )
+            for serial in range(100)
+        ]
+        for key in ("row_offset_e", "column_offset_e")
+    ]
+    assert np.std(corners, axis=1).min() > 50  # a row's and a column's offsets do differ between sensors, 200 DN
+    assert abs(np.corrcoef(corners)[0, 1]) < 5 / np.sqrt(100)
+
+
+@pytest.mark.parametrize(("well_e", "limit_e"), [(3000.0, 3000.0), (1e5, 2 * (4095 - 1000))])
+def test_a_pixel_saturates_at_the_well_or_at_the_adc_above_the_black_level(well_e: float, limit_e: float) -> None:
+    """At `saturation_e` the number is at its limit, at 4 e (2 DN) less it is below."""
+    sensor = Sensor(noise="none", gain_e_per_dn=2.0, full_well_e=well_e, black_level_dn=1000)
+    assert sensor.saturation_e == limit_e
+    below, at, above = expose(
+        sensor, np.array([[limit_e - 4, limit_e, limit_e + 500]], dtype=np.float32), "x", exposure_s=0.0
+    )[0]
+    assert below + 2 == at == above == sensor.white_dn
+    variance = variance_e2(sensor, np.array([[limit_e - 1, limit_e]], dtype=np.float32), 0.0)
+    assert np.isfinite(variance).tolist() == [[True, False]]
+
+
+@pytest.mark.parametrize(
+    ("term", "added_e2"),
+    [
+        ({}, 0.0),
+        ({"prnu": 0.1}, 10.0**2),
+        ({"dark_current_e_s": 30.0}, 60.0),
+        ({"dsnu_e": 3.0}, 9.0),
+        ({"read_noise_e": 4.0}, 16.0),
+        ({"adc_noise_dn": 2.0}, 1.0),
+        ({"row_offset_e": 5.0}, 25.0),
+        ({"column_offset_e": 6.0}, 36.0),
+    ],
+    ids=lambda value: next(iter(value), "none") if isinstance(value, dict) else "",
+)
+def test_each_term_adds_its_variance(term: dict[str, float], added_e2: float) -> None:
+    """A mean of 100 e for 2 s at half an electron a digital number: 100 + (1/2)^2 / 12 by photons and rounding.
+
+    Exact in float64, to rounding.
+    """
+    sensor = Sensor(noise="full", gain_e_per_dn=0.5, **term)
+    variance = variance_e2(sensor, np.full((1, 1), 100.0, dtype=np.float32), 2.0)
+    assert variance[0, 0] == pytest.approx(100 + 0.25 / 12 + added_e2, rel=1e-12)
+    counts = sensor.model_copy(update={"noise": "shot", "gain_e_per_dn": 1.0})
+    assert variance_e2(counts, np.full((1, 1), 100.0, dtype=np.float32), 2.0)[0, 0] == 100

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from vlcrender.camera.intrinsics import Camera
 from vlcrender.camera.roi import RegionImage, Roi
-from vlcrender.dataset.files import sha256_of
+from vlcrender.dataset.files import replace_durably, sha256_of
 from vlcrender.errors import InputError
 
 
@@ -38,7 +38,7 @@ def write_exr(path: Path, images: Sequence[RegionImage], sensor: Roi, attributes
         partial.unlink(missing_ok=True)
         raise InputError(f"{path}: cannot be written: {' '.join(str(error).split())}") from None
     digest = sha256_of(partial)
-    partial.replace(path)
+    replace_durably(partial, path)
     return digest
 
 

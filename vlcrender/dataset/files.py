@@ -28,10 +28,17 @@ def whole_file(path: Path) -> Iterator[Path]:
     partial = path.with_suffix(".partial")
     try:
         yield partial
-        os.replace(partial, path)
+        replace_durably(partial, path)
     except OSError as error:
         partial.unlink(missing_ok=True)
         raise InputError(f"{path}: cannot be written: {error.strerror or first_line(str(error))}") from None
+
+
+def replace_durably(partial: Path, path: Path) -> None:
+    """Rename a finished file once its content is on the disk: after a power cut, `path` is the old file or the new."""
+    with partial.open("r+b") as file:
+        os.fsync(file.fileno())
+    os.replace(partial, path)
 
 
 def first_line(text: str) -> str:

@@ -1,0 +1,105 @@
+"""Frames of a dataset: what is new in each frame and what is shared, and the bound of a frame against a direct call."""
+
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+from conftest import ROOT, SMALL
+
+from vlcrender.camera.intrinsics import Pose
+from vlcrender.camera.roi import RegionImage, Roi
+from vlcrender.dataset.generate import generate
+from vlcrender.dataset.recipe import Plan, load_plan
+from vlcrender.dataset.schema import FrameRow, TruthRow
+from vlcrender.dataset.tables import read_table
+from vlcrender.rendering.crlb import position_bound_m2
+from vlcrender.rendering.renderer import Renderer
+
+TABLE1 = ("scene=../scenes/table1.toml", "poses.min_leds=2", "expected=true")
+
+
+def plan_of(*assignments: str) -> Plan:
+    return load_plan(ROOT / "datasets/quickstart.toml", [*SMALL, *TABLE1, *assignments])
+
+
+def pixels(path: Path) -> np.ndarray:
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        image: np.ndarray = file.channels()["Y"].pixels.astype(float)
+    return image
+
+
+SHOTS = 4
+
+
+@pytest.fixture(scope="module")
+def twins(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Shots of one pose by two cameras with the same axes in the same place."""
+    directory = tmp_path_factory.mktemp("twins") / "set"
+    rig = "rig=[{ name = 'twin', offset_m = [0.0, 0.0, 0.0] }]"
+    tilts = ("poses.tilt_x_deg=[0, 5]", "poses.tilt_y_deg=[0, 5]")
+    generate(plan_of("poses.count=1", f"repeats={SHOTS}", rig, *tilts), directory)
+    return directory
+
+
+def test_cameras_of_a_rig_have_photon_noise_of_their_own(twins: Path) -> None:
+    """Standardised noise of two frames with the same means: correlation 0 within 5 / sqrt(pixels)."""
+    first, twin = (pixels(twins / f"expected/{frame:06d}.exr") for frame in (0, 1))
+    assert np.array_equal(first, twin)
+    noise = [(pixels(twins / f"frames/{n:06d}.exr") - first).ravel() / np.sqrt(first.ravel()) for n in range(2 * SHOTS)]
+    correlations = np.corrcoef(noise)[np.triu_indices(2 * SHOTS, 1)]
+    assert np.abs(correlations).max() < 5 / np.sqrt(first.size)
+
+
+def test_rough_pixels_have_a_new_error_in_each_frame(twins: Path) -> None:
+    """Errors on the same LEDs in the same place, frame by frame: no two are equal."""
+    errors = []
+    for row, truth in zip(
+        read_table(twins / "frames.parquet", FrameRow), read_table(twins / "truth.parquet", TruthRow), strict=True
+    ):
+        true = {led.led: (led.u_px, led.v_px) for led in truth.leds}
+        errors.append([np.subtract((spot.u_px, spot.v_px), true[spot.led]) for spot in row.spots])
+    found = np.array(errors)
+    assert found.shape[0] == 2 * SHOTS
+    assert found.shape[1] >= 2
+    assert len(np.unique(found[..., 0])) == found[..., 0].size
+    assert len(np.unique(found[..., 1])) == found[..., 1].size
+
+
+def test_a_shot_has_one_reading_and_the_next_another(twins: Path) -> None:
+    readings = [row.accelerometer_m_s2 for row in read_table(twins / "frames.parquet", FrameRow)]
+    assert readings[::2] == readings[1::2]
+    assert len(set(readings)) == SHOTS
+
+
+def test_the_bound_of_a_frame_is_that_of_its_noise_and_its_accelerometer(tmp_path: Path) -> None:
+    """A direct call with variance and tilt errors by hand: strong dark current, and tilts whose errors differ.
+
+    At tilt_y = 60 deg an IMU's error on tilt_x is twice its error across gravity (1 / cos 60 deg). The variance is
+    light + dark current + read noise^2 + rounding^2 / 12. Expected images are stored in float32, 6e-8, and the direct
+    call has the same steps: 1e-5 leaves room for both.
+    """
+    plan = plan_of(
+        *("poses.count=1", "poses.tilt_x_deg=[5, 5]", "poses.tilt_y_deg=[60, 60]", "bound=true"),
+        *('sensor={ noise = "full", dark_current_e_s = 1e9, read_noise_e = 3.0, gain_e_per_dn = 2.0 }',),
+        'accelerometer={ kind = "imu", misalignment_deg = 0.4, bits = 24 }',
+    )
+    generate(plan, tmp_path / "set")
+    (truth,) = read_table(tmp_path / "set/truth.parquet", TruthRow)
+    assert truth.bound_m2 is not None
+    expected = pixels(tmp_path / "set/expected/000000.exr")
+    pose = Pose(truth.position_m, truth.tilt_x_deg, truth.tilt_y_deg, truth.yaw_deg)
+    (mounted,) = plan.recipe.cameras
+    variance = RegionImage(Roi.of_sensor(mounted.camera), expected + 1e9 * 1.6e-6 + 3.0**2 + 2.0**2 / 12)
+    renderer = Renderer(plan.scene)
+    bound = position_bound_m2(
+        mounted,
+        pose,
+        renderer.led_patches,
+        1.6e-6,
+        [variance],
+        float(np.median(np.linalg.norm(plan.scene.leds.centers_m - truth.position_m, axis=1))),
+        (0.8, 0.4),
+    )
+    assert bound is not None
+    assert np.array(truth.bound_m2).reshape(3, 3) == pytest.approx(bound, rel=1e-5, abs=1e-5 * np.trace(bound))
