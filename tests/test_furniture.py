@@ -12,6 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from test_path_traced import BOX, scene_of
 
+from vlcrender.core.backend import mi
 from vlcrender.core.warn_once import warn_once
 from vlcrender.errors import InputError
 from vlcrender.scene.furniture import MAX_TRIANGLES, furniture_meshes
@@ -249,3 +250,14 @@ def test_subdivision_makes_about_as_many_triangles_as_expected(tmp_path: Path) -
     """The estimate is exact where all edges are halved as often."""
     mesh = mesh_of(tmp_path, "one.obj", "v 0 0 0\nv 0.8 0 0\nv 0.4 0.69 0\nf 1 2 3\n", 0.101)
     assert len(mesh.faces) == 64
+
+
+def test_meshes_of_a_mitsuba_file_are_looked_up_in_its_folder_and_only_during_its_load(tmp_path: Path) -> None:
+    """Other scenes of a program have their own folders: the paths that Mitsuba searches are afterwards as before."""
+    (tmp_path / "box.ply").write_text(PLY_BOX)
+    before = str(mi.file_resolver())
+    assert volume_m3(mesh_of(tmp_path, "box.xml", mesh_xml("ply", "box.ply"))) == pytest.approx(0.02, rel=1e-6)
+    assert str(mi.file_resolver()) == before
+    with pytest.raises(InputError, match="Mitsuba cannot load it"):
+        mesh_of(tmp_path, "text.xml", REFUSED["broken.xml"][0])
+    assert str(mi.file_resolver()) == before

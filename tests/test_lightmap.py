@@ -4,7 +4,9 @@ import dataclasses
 import errno
 import pwd
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import IO, Any
 
 import numpy as np
 import pytest
@@ -13,7 +15,8 @@ from platformdirs import user_cache_dir
 
 from vlcrender.config.toml_model import check, read_toml
 from vlcrender.core.warn_once import warn_once
-from vlcrender.light import bake_cache
+from vlcrender.light import bake_cache, lightmap
+from vlcrender.light.bake_cache import BakedIlluminance
 from vlcrender.light.lightmap import bake, led_illuminance_lux, path_traced_lux, room_mesh
 from vlcrender.light.mitsuba_room import mitsuba_scene
 from vlcrender.scene.fresnel import glazing_reflectance
@@ -320,3 +323,153 @@ def test_joined_meshes_keep_their_faces() -> None:
     one = mesh_of_surfaces(scene.surfaces[:1], 1.0)
     two = join([one, one])
     assert np.array_equal(two.faces[len(one.faces) :], one.faces + len(one.vertices_m))
+
+
+@pytest.mark.usefixtures("no_bakes_in_memory")
+def test_a_bake_with_any_wrong_byte_is_no_bake(tmp_path: Path) -> None:
+    """A disk or a power cut may leave anything: with a byte inverted, the file is the bake, to the bit, or none."""
+    baked = BakedIlluminance(*np.linspace(0.1, 1e4, 30).reshape(3, 10) ** 2)
+    bake_cache.store("key", baked, tmp_path)
+    file = tmp_path / "key.npz"
+    content = file.read_bytes()
+    refused = 0
+    for place in range(0, len(content), 3):
+        file.write_bytes(content[:place] + bytes([content[place] ^ 0xFF]) + content[place + 1 :])
+        loaded = bake_cache.load("key", 10, tmp_path)
+        refused += loaded is None
+        assert loaded is None or all(
+            np.array_equal(getattr(loaded, field.name), getattr(baked, field.name))
+            for field in dataclasses.fields(BakedIlluminance)
+        )
+    # at least the numbers, of 8 bytes each, which hardly compress
+    assert refused > 0.5 * 3 * 10 * 8 / 3
+
+
+@pytest.mark.usefixtures("no_bakes_in_memory")
+def test_an_interrupted_write_leaves_the_earlier_bake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A bake is written beside its place and renamed: a reader in another process finds a whole bake at any time."""
+    earlier, later = (BakedIlluminance(*np.full((3, 5), lux)) for lux in (1.0, 2.0))
+    bake_cache.store("key", earlier, tmp_path)
+
+    def killed(out: IO[bytes], **arrays: np.ndarray) -> None:
+        out.write(b"PK")
+        out.flush()
+        found = bake_cache.load("key", 5, tmp_path)
+        assert found is not None
+        assert found.led_lux.tolist() == [1.0] * 5
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(np, "savez_compressed", killed)
+        with pytest.raises(KeyboardInterrupt):
+            bake_cache.store("key", later, tmp_path)
+    for expected in (earlier, later):
+        found = bake_cache.load("key", 5, tmp_path)
+        assert found is not None
+        assert found.led_lux.tolist() == expected.led_lux.tolist()
+        bake_cache.store("key", later, tmp_path)
+
+
+@pytest.fixture
+def key_of(monkeypatch: pytest.MonkeyPatch) -> Callable[[Scene], str]:
+    """The name of a scene's bake in the cache, without baking."""
+    keys: list[str] = []
+
+    def load(key: str, count: int, folder: Path | None) -> BakedIlluminance:
+        keys.append(key)
+        return BakedIlluminance(*np.zeros((3, count)))
+
+    monkeypatch.setattr(lightmap, "load", load)
+
+    def key(scene: Scene) -> str:
+        bake(scene)
+        return keys[-1]
+
+    return key
+
+
+DIFFUSE_PANEL = {
+    "columns": 1,
+    "rows": 1,
+    "first_center_m": [3.0, 3.0, 3.3],
+    "pitch_m": [1.0, 1.0],
+    "size_m": [0.6, 0.6, 0.1],
+    "reflectance": 0.7,
+    "diffuser": {"distance_m": 0.05, "transmittance": 0.5},
+    "leds": {
+        **{"columns": 2, "rows": 2, "pitch_m": [0.2, 0.2], "radius_m": 0.01, "first_id": 10},
+        **{"luminance_cd_m2": [5000.0, 6000.0], "luminance_seed": 0, "half_power_deg": 60.0},
+    },
+}
+LIT_ROOM: dict[str, Any] = {
+    "led": [lamp()],
+    "panels": [DIFFUSE_PANEL],
+    "glazing": [{**MIRROR, "refractive_index": 1.52}],
+    "furniture": [{"file": "board.obj", "position_m": [1.0, 1.0, 1.0], "yaw_deg": 0.0, "reflectance": 0.3}],
+    "room": {"size_m": [7.0, 7.0, 3.5], "reflectance": {"floor": 0.2, "ceiling": 0.8, "walls": 0.5}},
+    "ambient": {"illuminance_lux": 400.0, "spectrum": "LED-B3"},
+    "bake": {"texel_m": 1.0, "paths": 64},
+}
+
+
+def changed(tree: Any, path: str, value: object) -> Any:
+    """A copy of a tree with the value at a dotted path replaced."""
+    first, _, rest = path.partition(".")
+    key: Any = int(first) if first.isdecimal() else first
+    new = changed(tree[key], rest, value) if rest else value
+    return [new if i == key else item for i, item in enumerate(tree)] if isinstance(tree, list) else {**tree, key: new}
+
+
+def lit_room(folder: Path, path: str = "led.0.id", value: object = 1) -> Scene:
+    (folder / "board.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    return scene_of(folder, **changed(LIT_ROOM, path, value))
+
+
+CHANGES: dict[str, object] = {
+    "led.0.position_m": [3.5, 3.4, 3.5],
+    "led.0.radius_m": 0.011,
+    "led.0.luminance_cd_m2": 9999.0,
+    "led.0.half_power_deg": 59.0,
+    "panels.0.leds.half_power_deg": 59.0,
+    "panels.0.leds.luminance_seed": 1,
+    "panels.0.diffuser.distance_m": 0.06,
+    "panels.0.diffuser.transmittance": 0.6,
+    "panels.0.reflectance": 0.6,
+    "panels.0.first_center_m": [3.0, 3.1, 3.3],
+    "glazing.0.wall": "x=max",
+    "glazing.0.corner_m": [3.1, 0.5],
+    "glazing.0.size_m": [1.1, 2.5],
+    "glazing.0.luminance_cd_m2": 1.0,
+    "glazing.0.refractive_index": 1.53,
+    "furniture.0.position_m": [1.0, 1.0, 1.1],
+    "furniture.0.yaw_deg": 1.0,
+    "furniture.0.reflectance": 0.4,
+    "room.size_m": [7.0, 7.0, 3.6],
+    "room.reflectance.floor": 0.3,
+    "room.reflectance.ceiling": 0.7,
+    "room.reflectance.walls": 0.4,
+    "bake.texel_m": 0.9,
+    "bake.paths": 72,
+}
+"""Settings that change the light of LIT_ROOM that is baked."""
+
+
+def test_a_bake_is_another_one_with_every_setting_that_changes_its_light(
+    tmp_path: Path, key_of: Callable[[Scene], str]
+) -> None:
+    key = key_of(lit_room(tmp_path))
+    assert [path for path, value in CHANGES.items() if key_of(lit_room(tmp_path, path, value)) == key] == []
+    others = {"led.0.id": 2, "ambient.illuminance_lux": 300.0, "ambient.spectrum": "LED-B1"}
+    assert [path for path, value in others.items() if key_of(lit_room(tmp_path, path, value)) != key] == []
+
+
+def test_a_bake_is_another_one_with_another_mitsuba_or_cache_version(
+    tmp_path: Path, key_of: Callable[[Scene], str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = lit_room(tmp_path)
+    keys = {key_of(scene)}
+    monkeypatch.setattr(lightmap, "CACHE_VERSION", lightmap.CACHE_VERSION + 1)
+    keys.add(key_of(scene))
+    monkeypatch.setattr(lightmap.mi, "__version__", "0.0")
+    keys.add(key_of(scene))
+    assert len(keys) == 3

@@ -245,3 +245,30 @@ def models_in(annotation: object) -> set[type[BaseModel]]:
 @pytest.mark.parametrize("model", sorted(models_in(SceneSettings), key=lambda model: model.__name__))
 def test_every_key_of_a_scene_is_described(model: type[BaseModel]) -> None:
     assert {name for name, field in model.model_fields.items() if not field.description} == set()
+
+
+def test_leds_in_descending_order_of_id_keep_their_own_values() -> None:
+    """[[led]] and panels in any order: each LED is as its entry says."""
+    tree = tomllib.loads(TABLE1)
+    led = {"radius_m": 0.01, "luminance_cd_m2": 5000.0}
+    square = {"shape": "square", "side_m": 0.05, "luminance_cd_m2": 7000.0, "half_power_deg": 30.0}
+    panel = {**{"columns": 1, "rows": 1, "first_center_m": [3.0, 3.0, 3.4], "pitch_m": [1.0, 1.0]}, "reflectance": 0.7}
+    array = {"columns": 1, "rows": 1, "pitch_m": [0.1, 0.1], "radius_m": 0.02, "first_id": 4, "half_power_deg": 45.0}
+    diffuse = {**panel, "size_m": [0.6, 0.6, 0.1], "diffuser": {"distance_m": 0.07, "transmittance": 0.5}}
+    diffuse["leds"] = {**array, "luminance_cd_m2": [6000.0, 6000.0]}
+    entries = [{"id": 9, "position_m": [1.0, 1.0, 3.5], **led}, {"id": 2, "position_m": [2.0, 1.0, 3.5], **square}]
+    scene = build_scene(check({**tree, "led": entries, "panels": [diffuse]}, SceneSettings, "test"), "test")
+    leds = scene.leds
+    assert leds.ids.tolist() == [2, 4, 9]
+    assert leds.centers_m[:, 0].tolist() == [2.0, 3.0, 1.0]
+    assert leds.half_widths_m.tolist() == [0.025, 0.02, 0.01]
+    assert leds.luminances_cd_m2.tolist() == [7000.0, 6000.0, 5000.0]
+    assert leds.squares.tolist() == [True, False, False]
+    # I = I_0 cos^m is I_0 / 2 at the half-power angle
+    assert np.cos(np.radians([30.0, 45.0, 60.0])) ** leds.orders == pytest.approx([0.5] * 3)
+    (first, behind, last) = leds.diffusers
+    assert (first, last) == (None, None)
+    assert behind is not None
+    assert behind.foot_m == (3.0, 3.0)
+    assert (behind.distance_m, behind.order) == (0.07, leds.orders[1])
+    assert behind.area_m2 == pytest.approx(np.pi * 0.02**2)

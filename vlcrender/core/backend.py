@@ -214,16 +214,16 @@ class _Mitsuba:
         return self._instantiated(config, self._parser.parse_dict(config, dict(tree)))
 
     def load_file(self, path: str, parallel: bool = True, optimize: bool = True) -> Any:
-        """`mitsuba.load_file` in this variant: files that the file names are looked up beside it first."""
+        """`mitsuba.load_file` in this variant. Files that the scene names are looked up in its folder first."""
         config = self._configuration(parallel, optimize)
-        before = self.file_resolver()
-        beside = self.FileResolver(before)
-        beside.prepend(str(Path(path).resolve().parent))
-        self.set_file_resolver(beside)  # of this thread
+        outside = self.file_resolver()
+        resolver = self.FileResolver(outside)
+        resolver.prepend(str(Path(path).parent))
+        self.set_file_resolver(resolver)
         try:
             return self._instantiated(config, self._parser.parse_file(config, path))
         finally:
-            self.set_file_resolver(before)
+            self.set_file_resolver(outside)
 
     def _configuration(self, parallel: bool, optimize: bool) -> Any:
         config = self._parser.ParserConfig(self._variant)

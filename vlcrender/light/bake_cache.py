@@ -5,6 +5,7 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 from zipfile import BadZipFile
+from zlib import error as ZlibError
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,9 @@ from vlcrender.core.warn_once import warn_once
 
 Array = NDArray[np.float64]
 logger = logging.getLogger(__name__)
+
+DAMAGES = (OSError, ValueError, KeyError, EOFError, BadZipFile, ZlibError, NotImplementedError, RuntimeError)
+"""What NumPy, zipfile and zlib raise for files that are cut short or have wrong bytes."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +56,8 @@ def load(key: str, count: int, folder: Path | None) -> BakedIlluminance | None:
     try:
         with np.load(_file(folder, key)) as stored:
             baked = BakedIlluminance(stored["led_lux"], stored["daylight_lux"], stored["sigma_lux"])
-    except (OSError, ValueError, KeyError, EOFError, BadZipFile):
-        return None  # missing, or cut short by a crash
+    except DAMAGES:
+        return None  # missing, or damaged by a crash or a disk
     return baked if baked.led_lux.shape == (count,) else None
 
 
