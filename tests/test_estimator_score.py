@@ -203,9 +203,9 @@ def test_what_cannot_be_scored_is_named(synthetic_set: Path, tmp_path: Path) -> 
         score(folder)
 
 
-def test_truth_in_another_order_is_refused(tmp_path: Path) -> None:
+def test_truth_in_another_order_is_refused(synthetic_set: Path, tmp_path: Path) -> None:
     """As many rows as frames, the second and third exchanged: every error of theirs would be wrong."""
-    folder = small_dataset(tmp_path)
+    folder = copy_of(synthetic_set, tmp_path)
     write_estimates(folder, "one", [ok(frame, TRUTH) for frame in range(3)])
     table = pq.read_table(folder / "truth.parquet")
     pq.write_table(table.take([0, 2, 1]), folder / "truth.parquet")

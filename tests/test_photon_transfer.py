@@ -1,7 +1,7 @@
 """Stated standard errors of photon transfer against the scatter of repeated measurements, one quantity at a time.
 
-A score is the deviation from the truth over the stated error. Over n repeats its mean has the standard error 1 / sqrt(n)
-and its spread 1 / sqrt(2 n), where the error is right; five of each are allowed.
+A score is the deviation from the truth over the stated error. Over n repeats its mean has the standard error
+1 / sqrt(n) and its spread 1 / sqrt(2 n), where the error is right; five of each are allowed.
 """
 
 from collections.abc import Iterable
