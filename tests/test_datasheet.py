@@ -194,6 +194,7 @@ def test_an_efficiency_off_by_one_percent_is_rejected(full: Datasheet) -> None:
     assert row_of(compare(full.sensor, full.efficiency * 1.01, full.measurement), "QE").passed is False
 
 
+@pytest.mark.slow
 def test_missing_read_noise_is_rejected(full: Datasheet) -> None:
     silent = make_datasheet("silent", Sensor(**{**FULL, "read_noise_e": 0.0, "adc_noise_dn": 0.0}), side_px=64)
     assert row_of(compare(full.sensor, full.efficiency, silent.measurement), "sigma_d").passed is False
@@ -211,6 +212,7 @@ def test_shot_noise_alone_has_nothing_else_set() -> None:
     assert row_of(sheet.rows, "full well").set_value == 4095  # limit of the ADC, below the well's 6000 e
 
 
+@pytest.mark.slow
 def test_noise_hidden_by_rounding_has_an_upper_bound() -> None:
     sheet = make_datasheet(
         "coarse",
@@ -225,6 +227,7 @@ def test_noise_hidden_by_rounding_has_an_upper_bound() -> None:
     assert row_of(sheet.rows, "DR").measured is None
 
 
+@pytest.mark.slow
 def test_noise_clipped_in_the_dark_is_reported_as_off() -> None:
     """Black level 0 clips half of the read noise; a data sheet must show it."""
     sheet = make_datasheet("clipped", Sensor(**{**FULL, "black_level_dn": 0}), side_px=64)
@@ -249,6 +252,7 @@ def test_an_unmeasurable_camera_is_refused(rng: np.random.Generator) -> None:
         measure(endless)
 
 
+@pytest.mark.slow
 def test_a_mosaic_is_measured_by_its_green_pixels() -> None:
     curves = {"red": [0.1, 0.6], "green": [0.4, 0.5], "blue": [0.6, 0.0]}
     coloured = {"mosaic": "rggb", "quantum_efficiency": {"wavelengths_nm": [500, 600], **curves}}

@@ -192,6 +192,7 @@ def test_gravity_and_two_leds_fix_a_position_and_one_does_not() -> None:
         ml(one)
 
 
+@pytest.mark.slow
 def test_exact_gravity_is_exact() -> None:
     """Said to be without error, a reading that is off by 0.1 deg moves the answer by 3 m times that, 5 mm."""
     view = view_of(TARGET, 3.0, 10.0, 5.0, 30.0)

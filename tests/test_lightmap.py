@@ -166,6 +166,7 @@ def test_furniture_casts_a_shadow_and_reflects(tmp_path: Path) -> None:
     assert set(mesh.albedo[mesh.faces[top]].ravel().round(6)) == {0.3}
 
 
+@pytest.mark.slow
 def test_daylight_through_glazing_agrees_with_form_factors(tmp_path: Path) -> None:
     """E at a point opposite the middle of a rectangle, 4 corner form factors; the room is black."""
     black = {"floor": 0.0, "ceiling": 0.0, "walls": 0.0}
