@@ -110,6 +110,7 @@ def test_regions_are_read_at_their_place_and_give_the_same_positions(tmp_path: P
             assert np.linalg.norm(ours - full) < 5e-5
 
 
+@pytest.mark.slow
 def test_regions_beyond_the_sensor_give_the_position(tmp_path: Path) -> None:
     """Table 1's four LEDs, up to 6 m beside the axis; noise-free, level, exact gravity: discs have no ellipses' offset.
 

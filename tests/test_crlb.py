@@ -118,6 +118,7 @@ def test_bound_agrees_with_the_information_of_moving_edges(renderer: Renderer, s
     assert np.abs(correlation - expected_correlation).max() < 0.02
 
 
+@pytest.mark.slow
 def test_four_times_the_light_quarters_the_bound(renderer: Renderer, small_camera: Camera) -> None:
     """Shot noise: information is proportional to the light; an accelerometer of 45 deg adds almost none."""
     once, more = (bound_m2(renderer, small_camera, range(4), 45.0, t * EXPOSURE_S) for t in (0.25, 1))
@@ -127,6 +128,7 @@ def test_four_times_the_light_quarters_the_bound(renderer: Renderer, small_camer
     assert more * 4 == pytest.approx(once, rel=1e-4, abs=1e-4 * float(np.diag(once).max()))
 
 
+@pytest.mark.slow
 def test_gravity_and_more_leds_lower_the_bound(renderer: Renderer, small_camera: Camera) -> None:
     sizes = []
     for ids, sigma in ((range(4), 0.0), (range(4), 0.05), (range(4), 45.0), (range(3), 45.0)):
@@ -138,6 +140,7 @@ def test_gravity_and_more_leds_lower_the_bound(renderer: Renderer, small_camera:
     assert sizes[0] < 0.5 * sizes[2] < 0.9 * sizes[3]
 
 
+@pytest.mark.slow
 def test_each_tilt_has_its_own_error(renderer: Renderer, small_camera: Camera) -> None:
     """A large error on one tilt raises the bound, and by less than a large error on both."""
     expected = renderer.expected_image(PosedCamera(small_camera, POSE)).expected_electrons(EXPOSURE_S)
@@ -152,6 +155,7 @@ def test_each_tilt_has_its_own_error(renderer: Renderer, small_camera: Camera) -
     assert x != pytest.approx(y, rel=0.01)
 
 
+@pytest.mark.slow
 def test_bound_on_a_rig_is_of_the_cameras_own_position(renderer: Renderer, small_camera: Camera) -> None:
     """A camera mounted 0.3 m beside another, with its axes: the bound of a lone camera at that position.
 
@@ -168,6 +172,7 @@ def test_bound_on_a_rig_is_of_the_cameras_own_position(renderer: Renderer, small
     assert bound == pytest.approx(bound_m2(renderer, small_camera, [0, 1], 0.5), rel=1e-4, abs=1e-12)
 
 
+@pytest.mark.slow
 def test_a_frame_that_determines_no_position_has_no_bound(renderer: Renderer, small_camera: Camera) -> None:
     """One disc has the same image for any yaw, and a frame without LEDs has no information."""
     assert bound_m2(renderer, small_camera, [0], 0.5) is None

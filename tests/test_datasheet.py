@@ -157,6 +157,7 @@ def row_of(rows: tuple[Row, ...], key: str) -> Row:
     return next(row for row in rows if row.key == key)
 
 
+@pytest.mark.slow
 def test_the_data_sheet_of_the_chain_finds_the_set_values(full: Datasheet) -> None:
     for row in full.rows:
         assert row.passed, row
@@ -183,6 +184,7 @@ WRONG: dict[str, dict[str, float]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("key", WRONG)
 def test_a_wrong_set_value_is_rejected(full: Datasheet, key: str) -> None:
     """The measurement of one sensor against the settings of another: a hundredth in gain is off, and so on."""
@@ -190,6 +192,7 @@ def test_a_wrong_set_value_is_rejected(full: Datasheet, key: str) -> None:
     assert row_of(compare(other, full.efficiency, full.measurement), key).passed is False
 
 
+@pytest.mark.slow
 def test_an_efficiency_off_by_one_percent_is_rejected(full: Datasheet) -> None:
     assert row_of(compare(full.sensor, full.efficiency * 1.01, full.measurement), "QE").passed is False
 
@@ -284,6 +287,7 @@ def test_sensors_are_presets_or_files(tmp_path: Path) -> None:
             assert mention in str(refusal.value)
 
 
+@pytest.mark.slow
 def test_the_page_stands_alone_and_shows_every_row(full: Datasheet) -> None:
     text = page(full)
     assert text.count("<svg") == 2

@@ -55,6 +55,7 @@ def exact(view: View, leds_m: Floats) -> DeviceFrame:
 SIX = grid(3, 2, 0.14, TARGET)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tilt_deg", [(0.0, 0.0, 10.0), (30.0, -20.0, 40.0), (60.0, 0.0, 100.0)])
 def test_without_noise_the_error_is_rounding(tilt_deg: tuple[float, float, float]) -> None:
     """The reference's edges err by 0.3 / 150^1.5 of 4000 e, and numbers round by 0.3 e: 0.7 e, where the dimmest edges

@@ -286,6 +286,7 @@ def changed(made: Path, directory: Path, **entry: object) -> Path:
     return directory
 
 
+@pytest.mark.slow
 def test_verify_projects_through_the_lens(seen_by_a_lens: Path, tmp_path: Path) -> None:
     assert verify(seen_by_a_lens) == []
     another = changed(seen_by_a_lens, tmp_path / "pinhole", projection="perspective", distortion=None)

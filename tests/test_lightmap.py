@@ -258,6 +258,7 @@ def without_home(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pwd, "getpwuid", no_entry)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_bakes_in_memory")
 @pytest.mark.parametrize("case", ["a file in the folder's place", "no home"])
 def test_a_bake_that_cannot_be_written_is_kept_in_memory_with_one_warning(
