@@ -146,6 +146,7 @@ def test_readings_are_whole_steps_and_saturate() -> None:
     assert readings.min() == pytest.approx(-G, abs=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["bmi270", "lsm6dso", "icm42688p"])
 def test_the_stated_error_is_the_scatter_of_tilts_over_devices(name: str) -> None:
     """Presets of real parts, each shot another device: both tilts spread by error_deg.

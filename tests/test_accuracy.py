@@ -100,6 +100,7 @@ def test_without_noise_huynh2016_errs_only_by_what_a_pixel_can_explain(ideal: Pa
         assert abs(error - predicted) < left
 
 
+@pytest.mark.slow
 def test_the_printed_equation_3_does_not_find_the_camera(ideal: Path) -> None:
     dataset = read_dataset(ideal)
     frame = read_frame(dataset, dataset.frames[0])

@@ -91,6 +91,7 @@ def test_electrons_follow_the_exposure_time(mean: vr.ExpectedFrame) -> None:
     np.testing.assert_allclose(mean.expected_electrons(2e-6), 2 * mean.expected_electrons(1e-6), rtol=3e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("regions", [False, True])
 @pytest.mark.parametrize("preset", [None, "phone-1.2um"])
 def test_a_frame_has_the_bits_of_a_data_set(preset: str | None, regions: bool, tmp_path: Path) -> None:

@@ -163,10 +163,8 @@ def own_llvm() -> int:
     return int(run.stdout)
 
 
-@pytest.mark.parametrize(
-    ("variant", "workers"),
-    [("scalar_rgb", 1), pytest.param("scalar_rgb", 2, marks=pytest.mark.slow), ("llvm_ad_rgb", 1)],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("variant", "workers"), [("scalar_rgb", 1), ("scalar_rgb", 2), ("llvm_ad_rgb", 1)])
 def test_a_variant_that_the_user_has_set_stays_and_changes_no_bit(
     variant: str, workers: int, tmp_path: Path, alone: dict[str, object]
 ) -> None:

@@ -88,6 +88,7 @@ def test_a_hand_computed_point() -> None:
     assert pixels == pytest.approx([3500.0, 500.0])
 
 
+@pytest.mark.slow
 def test_regions_are_read_at_their_place_and_give_the_same_positions(tmp_path: Path) -> None:
     # Moderate tilts, at which LED images do not merge: which merged images are separated depends on single electrons.
     tilts = ["poses.tilt_x_deg=[0, 25]", "poses.tilt_y_deg=[0, 25]", "poses.height_m=[0.9, 1.8]"]
@@ -109,6 +110,7 @@ def test_regions_are_read_at_their_place_and_give_the_same_positions(tmp_path: P
             assert np.linalg.norm(ours - full) < 5e-5
 
 
+@pytest.mark.slow
 def test_regions_beyond_the_sensor_give_the_position(tmp_path: Path) -> None:
     """Table 1's four LEDs, up to 6 m beside the axis; noise-free, level, exact gravity: discs have no ellipses' offset.
 
@@ -204,6 +206,7 @@ def test_a_distorted_set_is_estimated_as_well_as_a_straight_one(tmp_path: Path) 
         assert wrong[1][name] > wrong[0][name] > 10 * found[name]
 
 
+@pytest.mark.slow
 def test_a_fish_eye_set_is_estimated(tmp_path: Path) -> None:
     """500 px a radian, dozens of LEDs: 0.02 px over a pattern some 300 px wide, on 3 m, are well below 2 mm."""
     fish_eye = ["camera.projection=equidistant", "camera.pixel_pitch_um=36.0", "exposure_s=1.8e-7"]

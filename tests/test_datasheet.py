@@ -173,6 +173,7 @@ def row_of(rows: tuple[Row, ...], key: str) -> Row:
     return next(row for row in rows if row.key == key)
 
 
+@pytest.mark.slow
 def test_the_data_sheet_of_the_chain_finds_the_set_values(full: Datasheet) -> None:
     for row in full.rows:
         assert row.passed, row
@@ -199,6 +200,7 @@ WRONG: dict[str, dict[str, float]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("key", WRONG)
 def test_a_wrong_set_value_is_rejected(full: Datasheet, key: str) -> None:
     """The measurement of one sensor against the settings of another: a hundredth in gain is off, and so on."""
@@ -206,10 +208,12 @@ def test_a_wrong_set_value_is_rejected(full: Datasheet, key: str) -> None:
     assert row_of(compare(other, full.efficiency, full.measurement), key).passed is False
 
 
+@pytest.mark.slow
 def test_an_efficiency_off_by_one_percent_is_rejected(full: Datasheet) -> None:
     assert row_of(compare(full.sensor, full.efficiency * 1.01, full.measurement), "QE").passed is False
 
 
+@pytest.mark.slow
 def test_missing_read_noise_is_rejected(full: Datasheet) -> None:
     silent = make_datasheet("silent", Sensor(**{**FULL, "read_noise_e": 0.0, "adc_noise_dn": 0.0}), side_px=64)
     assert row_of(compare(full.sensor, full.efficiency, silent.measurement), "sigma_d").passed is False
@@ -227,6 +231,7 @@ def test_shot_noise_alone_has_nothing_else_set() -> None:
     assert row_of(sheet.rows, "full well").set_value == 4095  # limit of the ADC, below the well's 6000 e
 
 
+@pytest.mark.slow
 def test_noise_hidden_by_rounding_has_an_upper_bound() -> None:
     sheet = make_datasheet(
         "coarse",
@@ -241,6 +246,7 @@ def test_noise_hidden_by_rounding_has_an_upper_bound() -> None:
     assert row_of(sheet.rows, "DR").measured is None
 
 
+@pytest.mark.slow
 def test_noise_clipped_in_the_dark_is_reported_as_off() -> None:
     """Black level 0 clips half of the read noise; a data sheet must show it."""
     sheet = make_datasheet("clipped", Sensor(**{**FULL, "black_level_dn": 0}), side_px=64)
@@ -265,6 +271,7 @@ def test_an_unmeasurable_camera_is_refused(rng: np.random.Generator) -> None:
         measure(endless)
 
 
+@pytest.mark.slow
 def test_a_mosaic_is_measured_by_its_green_pixels() -> None:
     curves = {"red": [0.1, 0.6], "green": [0.4, 0.5], "blue": [0.6, 0.0]}
     coloured = {"mosaic": "rggb", "quantum_efficiency": {"wavelengths_nm": [500, 600], **curves}}
@@ -296,6 +303,7 @@ def test_sensors_are_presets_or_files(tmp_path: Path) -> None:
             assert mention in str(refusal.value)
 
 
+@pytest.mark.slow
 def test_the_page_stands_alone_and_shows_every_row(full: Datasheet) -> None:
     text = page(full)
     assert text.count("<svg") == 2

@@ -82,6 +82,7 @@ def test_slopes_are_those_of_differences(projection: Projection) -> None:
         np.testing.assert_allclose(slopes[:, :, axis], (ahead - behind) / 2e-5, atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("projection", "project", "view", "leds", "noise"),
     [

@@ -73,6 +73,7 @@ def test_gravity_decides_between_the_two_poses_of_a_plane() -> None:
     assert worst_pnp > 1.0
 
 
+@pytest.mark.slow
 def test_two_equal_poses_are_ambiguous_and_gravity_resolves_them() -> None:
     """Four LEDs in 6 cm, 3 m away, 0.1 px: perspective over the pattern is 0.06 / 3 sin(15 deg) of its 60 px, 0.3 px,
     so that both of the plane's poses fit. They are 30 deg apart: an accelerometer good to 20 deg cannot tell, one to

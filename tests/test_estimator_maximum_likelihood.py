@@ -57,6 +57,7 @@ def exact(view: View, leds_m: Floats) -> DeviceFrame:
 SIX = grid(3, 2, 0.14, TARGET)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tilt_deg", [(0.0, 0.0, 10.0), (30.0, -20.0, 40.0), (60.0, 0.0, 100.0)])
 def test_without_noise_the_error_is_rounding(tilt_deg: tuple[float, float, float]) -> None:
     """The reference's edges err by 0.3 / 150^1.5 of 4000 e, and numbers round by 0.3 e: 0.7 e, where the dimmest edges
@@ -194,6 +195,7 @@ def test_gravity_and_two_leds_fix_a_position_and_one_does_not() -> None:
         ml(one)
 
 
+@pytest.mark.slow
 def test_exact_gravity_is_exact() -> None:
     """Said to be without error, a reading that is off by 0.1 deg moves the answer by 3 m times that, 5 mm."""
     view = view_of(TARGET, 3.0, 10.0, 5.0, 30.0)

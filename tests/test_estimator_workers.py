@@ -30,7 +30,7 @@ def without_times(rows: dict[str, tuple[EstimateRow, ...]]) -> dict[str, list[st
     return {name: [row.model_dump_json(exclude={"time_s"}) for row in of_variant] for name, of_variant in rows.items()}
 
 
-@pytest.mark.parametrize("workers", [1, 2, pytest.param(7, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("workers", [1, *(pytest.param(several, marks=pytest.mark.slow) for several in (2, 7))])
 def test_any_number_of_workers_gives_the_same_answers_in_order(folder: Path, workers: int) -> None:
     dataset = read_dataset(folder)
     alone = estimate_dataset(dataset, list(VARIANTS.values()), on_frame=lambda: None)

@@ -69,6 +69,7 @@ def test_one_thread_gives_the_same_bytes_as_all(made: Path, tmp_path: Path) -> N
     assert digests(tmp_path / "one") == digests(made)
 
 
+@pytest.mark.slow
 def test_a_longer_set_with_other_noise_shares_no_frame(made: Path, tmp_path: Path) -> None:
     generate(small_plan("seed=2017"), tmp_path / "other")
     assert not set(digests(tmp_path / "other").values()) & set(digests(made).values())
@@ -285,6 +286,7 @@ def changed(made: Path, directory: Path, **entry: object) -> Path:
     return directory
 
 
+@pytest.mark.slow
 def test_verify_projects_through_the_lens(seen_by_a_lens: Path, tmp_path: Path) -> None:
     assert verify(seen_by_a_lens) == []
     another = changed(seen_by_a_lens, tmp_path / "pinhole", projection="perspective", distortion=None)
@@ -375,6 +377,7 @@ def test_a_lost_preview_or_expected_image_is_found(made: Path, tmp_path: Path) -
     assert sorted(verify(tmp_path / "set")) == [f"{tmp_path}/set/{name}: is missing" for name in names]
 
 
+@pytest.mark.slow
 def test_a_frame_whose_preview_was_lost_is_made_again(made: Path, tmp_path: Path) -> None:
     """An unfinished run goes on: a journal of all three frames, and one preview gone."""
     generate(small_plan("expected=true"), tmp_path / "set")

@@ -169,6 +169,7 @@ def test_furniture_casts_a_shadow_and_reflects(tmp_path: Path) -> None:
     assert set(mesh.albedo[mesh.faces[top]].ravel().round(6)) == {0.3}
 
 
+@pytest.mark.slow
 def test_daylight_through_glazing_agrees_with_form_factors(tmp_path: Path) -> None:
     """E at a point opposite the middle of a rectangle, 4 corner form factors; the room is black."""
     black = {"floor": 0.0, "ceiling": 0.0, "walls": 0.0}
@@ -260,6 +261,7 @@ def without_home(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pwd, "getpwuid", no_entry)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_bakes_in_memory")
 @pytest.mark.parametrize("case", ["a file in the folder's place", "no home"])
 def test_a_bake_that_cannot_be_written_is_kept_in_memory_with_one_warning(

@@ -45,6 +45,7 @@ STREAKS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", STREAKS)
 def test_a_streak_is_as_long_as_the_displacement(table1: Scene, small_camera: Camera, name: str) -> None:
     motion, displacement_px = STREAKS[name]

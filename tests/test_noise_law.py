@@ -68,6 +68,7 @@ BROKEN: dict[str, Callable[[Sample, float], Sample]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mean", MEANS)
 @pytest.mark.parametrize("broken", BROKEN)
 def test_missing_or_wrong_noise_does_not_pass(broken: str, mean: float) -> None:

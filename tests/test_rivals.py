@@ -66,6 +66,7 @@ def test_a_fish_eye_is_located(fish_eye: Path) -> None:
     assert max(errors_m(fish_eye, "nakazawa2013")) < 3e-3
 
 
+@pytest.mark.slow
 def test_two_level_cameras_are_located(stereo: Path) -> None:
     """0.02 px of some 60 px of disparity: 1 mm of range; across, times distance over pattern, 2.6 m / 0.25 m, over
     the root of a dozen LEDs: 3 mm, of which the worst of four frames may be thrice.
@@ -75,6 +76,7 @@ def test_two_level_cameras_are_located(stereo: Path) -> None:
     assert max(errors_m(stereo, "kim")) < 3e-3
 
 
+@pytest.mark.slow
 def test_ranges_by_disparity_do_not_depend_on_tilt_and_vectors_are_refused(tilted: Path) -> None:
     assert max(errors_m(tilted, "rahman2011")) < 15e-3
     tilts = pq.read_table(tilted / "truth.parquet", columns=["tilt_y_deg"])["tilt_y_deg"].to_pylist()
@@ -86,6 +88,7 @@ def test_ranges_by_disparity_do_not_depend_on_tilt_and_vectors_are_refused(tilte
     assert any(refused)
 
 
+@pytest.mark.slow
 def test_each_refuses_the_other_s_camera(stereo: Path, fish_eye: Path) -> None:
     assert {row.reason for row in rows(fish_eye, "yoshino2008")} == {"camera: has a fish-eye lens, needed a normal one"}
     assert {row.reason for row in rows(stereo, "nakazawa2013")} == {"camera: has a normal lens, needed a fish-eye"}

@@ -228,6 +228,7 @@ def test_the_tables_name_what_exists() -> None:
     assert VARIANTS.keys() >= ROBUST | WRONG_ALWAYS.keys()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("name", CASES)
 def test_an_answer_is_right_or_a_failure_has_a_name(name: str, variant: str) -> None:

@@ -48,6 +48,7 @@ def test_keys_in_pixels_are_scaled_and_the_light_follows_the_mode() -> None:
     assert same.sensor == full.sensor
 
 
+@pytest.mark.slow
 def test_a_metered_exposure_equals_that_of_the_full_camera(office: Scene) -> None:
     """Binned pixels gather a hundred times the light in one time, by either metering; else a frame is too dark.
 

@@ -75,6 +75,7 @@ def brute_force(texture: Texture, camera: Camera, pose: Pose, grid: int) -> np.n
     return total / grid**2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "pose", [Pose((1.4, 1.5, 0.3)), Pose((1.4, 1.6, 0.3), yaw_deg=45.0), Pose((1.2, 1.3, 1.6), 40.0, 0.0, 70.0)]
 )
