@@ -444,3 +444,9 @@ def test_estimates_in_another_order_are_refused(folder: Path) -> None:
     path = write_estimates(folder, "shuffled", rows)
     with pytest.raises(InputError, match=r"shuffled\.parquet: 3 rows, needed one for each of the 3 frames, in order"):
         read_estimates(path, 3)
+
+
+def test_a_dataset_may_be_empty(folder: Path) -> None:
+    change_json(folder, lambda c: c.update(frame_count=0))
+    change_rows(folder, lambda rows: rows.clear())
+    assert read_dataset(folder).frames == ()
