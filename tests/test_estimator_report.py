@@ -178,3 +178,9 @@ def test_estimates_outside_are_counted_and_previews_limited(tmp_path: Path) -> N
     assert "x · 2 estimates outside the walls" in found
     assert "12 of 25" in found
     assert [text for text in found if text.startswith("frame 0000")] == [f"frame {k:06}" for k in range(0, 24, 2)]
+
+
+def test_failures_stand_out_and_zero_failures_do_not(tmp_path: Path) -> None:
+    """One mark: the cell of the variant that failed once, and neither the header nor the other's 0."""
+    html = page([(tmp_path, scores_of([scored([0.1, None]), scored([0.1, 0.1], "y")]))])
+    assert re.findall(r'<t[dh] class="failed">([^<]*)</t[dh]>', html) == ["1"]

@@ -1,11 +1,14 @@
 """Worker processes give the same rows as one process."""
 
+import threading
 from pathlib import Path
 
+import cv2
 import pytest
 from estimator_synthetic import small_dataset
 
 from estimator.errors import InputError
+from estimator.evaluate import workers
 from estimator.evaluate.batch import estimate_dataset
 from estimator.evaluate.workers import estimate_with_workers
 from estimator.io.dataset import read_dataset
@@ -39,3 +42,30 @@ def test_any_number_of_workers_gives_the_same_answers_in_order(folder: Path, wor
 def test_an_unknown_name_is_refused_before_a_process_starts(folder: Path) -> None:
     with pytest.raises(InputError, match="variant best: unknown"):
         estimate_with_workers(read_dataset(folder), ["best"], 2, on_frame=lambda: None)
+
+
+def test_a_worker_exits_when_its_parent_dies(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Started in this process with a parent of our own: the worker goes on while it lives, and exits with 1 after it."""
+    dies, exited, codes = threading.Event(), threading.Event(), []
+
+    class Parent:
+        def join(self) -> None:
+            dies.wait(30)
+
+    def leave(code: int) -> None:
+        codes.append((code, dies.is_set()))
+        exited.set()
+
+    monkeypatch.setattr(workers.multiprocessing, "parent_process", Parent)
+    monkeypatch.setattr(workers.os, "_exit", leave)
+    monkeypatch.setattr(workers, "_worker_state", None, raising=False)
+    threads = cv2.getNumThreads()
+    try:
+        workers._start(read_dataset(folder), ["pnp"], 1)
+        assert cv2.getNumThreads() == 1
+    finally:
+        cv2.setNumThreads(threads)
+    assert not exited.wait(0.05)
+    dies.set()
+    assert exited.wait(30)
+    assert codes == [(1, True)]
