@@ -71,6 +71,7 @@ WRONG: dict[str, tuple[Estimate, str]] = {
         "covariance: not a symmetric, positive definite matrix",
     ),
     "an unknown LED": (Estimate(HERE, {9: 3.0}), "ranges: to an LED that is not on the map"),
+    "a known and an unknown LED": (Estimate(HERE, {10: 3.0, 9: 3.0}), "ranges: to an LED that is not on the map"),
     "an endless range": (Estimate(HERE, {10: np.inf}), "ranges: the result is not a finite number"),
 }
 

@@ -445,3 +445,27 @@ def test_estimates_in_another_order_are_refused(folder: Path) -> None:
     path = write_estimates(folder, "shuffled", rows)
     with pytest.raises(InputError, match=r"shuffled\.parquet: 3 rows, needed one for each of the 3 frames, in order"):
         read_estimates(path, 3)
+
+
+def test_a_dataset_may_be_empty(folder: Path) -> None:
+    change_json(folder, lambda c: c.update(frame_count=0))
+    change_rows(folder, lambda rows: rows.clear())
+    assert read_dataset(folder).frames == ()
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_leds_lie_within_1000_km_of_the_origin(folder: Path, axis: int) -> None:
+    """So that the range from any position of an estimate to any LED can be written: both are far below 1e100 m."""
+    for metres, good in ((1e6, True), (-1e6, True), (1.01e6, False), (-1.01e6, False)):
+        change_json(folder, lambda c, metres=metres: c["led_map"][0]["position_m"].__setitem__(axis, metres))
+        if good:
+            assert read_dataset(folder).leds[10].position_m[axis] == metres
+        else:
+            assert f"led_map.0.position_m.{axis}: Input should be" in refused(folder)
+
+
+@pytest.mark.parametrize(("length", "shown"), [(58, "x" * 58 + "'"), (59, "x" * 56 + "...")])
+def test_a_message_quotes_at_most_60_characters_of_a_value(folder: Path, length: int, shown: str) -> None:
+    """58 characters and two quotation marks are 60: shown whole. Of longer ones, 57 characters and three dots."""
+    change_json(folder, lambda c: c.update(frame_count="x" * length))
+    assert refused(folder).endswith(f"(got '{shown})")

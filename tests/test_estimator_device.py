@@ -25,9 +25,9 @@ SENSOR = Sensor(
     noise="full",
     prnu=0.01,
     dark_current_e_s=8.0,
-    dsnu_e=2.0,
+    dsnu_e=1.5,
     read_noise_e=3.0,
-    adc_noise_dn=0.8,
+    adc_noise_dn=1.2,
     row_offset_e=4.0,
     column_offset_e=0.0,
     mosaic="none",
@@ -53,8 +53,8 @@ ACCELEROMETER = Accelerometer(kind="tilt-error", error_deg=0.0)
 
 
 def test_the_floor_of_a_pixel_at_a_gain_of_2_5_by_hand() -> None:
-    """DSNU 2 e, read noise 3 e, ADC noise 0.8 DN = 2 e, a step of 2.5 e that is uniform: 4 + 9 + 4 + 2.5^2 / 12."""
-    assert SENSOR.floor_e2() == pytest.approx(17 + 6.25 / 12, rel=1e-12)
+    """DSNU 1.5 e, read noise 3 e, ADC noise 1.2 DN = 3 e, and a uniform step of 2.5 e: 2.25 + 9 + 9 + 2.5^2 / 12."""
+    assert SENSOR.floor_e2() == pytest.approx(20.25 + 6.25 / 12, rel=1e-12)
 
 
 @pytest.mark.parametrize(

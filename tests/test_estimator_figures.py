@@ -89,3 +89,22 @@ def test_the_line_of_the_bound_is_the_root_mean_square_of_the_frames_that_have_o
     ((x, top, foot),) = re.findall(r'<line class="bound" x1="([\d.]+)" y1="([\d.]+)" x2="[\d.]+" y2="([\d.]+)"', svg)
     assert float(x) == pytest.approx(LEFT + INNER * math.log10((50.21 / 2) ** 0.5), abs=0.05)
     assert (float(top), float(foot)) == (TOP, TOP + HEIGHT)
+
+
+def test_rules_are_level_or_upright_and_stand_at_their_labels() -> None:
+    """Of the distribution: shares from left to right, decades from foot to top. Of the errors: decades and lanes."""
+    tree = Tree.fromstring(distribution_plot([scored([0.002, 0.2])]))
+    rules = [[float(e.get(key, "")) for key in ("x1", "y1", "x2", "y2")] for e in tree.iter("line")]
+    shares = [[LEFT, TOP + HEIGHT * (1 - share), WIDTH - RIGHT] for share in (0, 0.25, 0.5, 0.75, 0.95, 1)]
+    decades = [[LEFT + INNER * k / 3, TOP, TOP + HEIGHT] for k in range(4)]
+    expected = [[x1, y, x2, y] for x1, y, x2 in shares] + [[x, y1, x, y2] for x, y1, y2 in decades]
+    assert rules == [pytest.approx(rule, abs=0.05) for rule in expected]
+    places = labels(tree)
+    for percent, (_, y, _) in zip((0, 25, 50, 75, 95, 100), shares, strict=True):
+        assert places[f"{percent} %"] == (pytest.approx(LEFT - 8), pytest.approx(y + 4, abs=0.05))
+    for name, (x, *_) in zip(("1 mm", "10 mm", "100 mm", "1 m"), decades, strict=True):
+        assert places[name] == (pytest.approx(x, abs=0.05), TOP + HEIGHT + 16)
+    tree = Tree.fromstring(error_plot([scored([0.002, 0.2])]))
+    rules = [[float(e.get(key, "")) for key in ("x1", "y1", "x2", "y2")] for e in tree.iter("line")]
+    heights = [*(TOP + HEIGHT * (1 - k / 3) for k in range(4)), TOP + HEIGHT + 14 + LANE / 2]
+    assert rules == [pytest.approx([LEFT, y, WIDTH - RIGHT, y], abs=0.05) for y in heights]

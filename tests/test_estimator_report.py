@@ -170,11 +170,17 @@ def test_the_interval_stands_below_its_value(tmp_path: Path) -> None:
 
 
 def test_estimates_outside_are_counted_and_previews_limited(tmp_path: Path) -> None:
-    """13 previews: 12 are shown, from the first on. A caption counts the estimates beyond the walls of 4 m x 5 m."""
+    """Of 25 previews 12 are shown, every second. A caption counts the estimates beyond the walls of 4 m x 5 m."""
     (tmp_path / "previews").mkdir()
-    for k in range(13):
+    for k in range(25):
         (tmp_path / f"previews/{k:06}.png").write_bytes(b"PNG")
     found = texts(page([(tmp_path, scores_of([scored([0.1, 3.1, -1.1, None])]))]))
     assert "x · 2 estimates outside the walls" in found
-    assert "12 of 13" in found
-    assert [text for text in found if text.startswith("frame 0000")] == [f"frame {k:06}" for k in range(12)]
+    assert "12 of 25" in found
+    assert [text for text in found if text.startswith("frame 0000")] == [f"frame {k:06}" for k in range(0, 24, 2)]
+
+
+def test_failures_stand_out_and_zero_failures_do_not(tmp_path: Path) -> None:
+    """One mark: the cell of the variant that failed once, and neither the header nor the other's 0."""
+    html = page([(tmp_path, scores_of([scored([0.1, None]), scored([0.1, 0.1], "y")]))])
+    assert re.findall(r'<t[dh] class="failed">([^<]*)</t[dh]>', html) == ["1"]

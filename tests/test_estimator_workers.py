@@ -6,10 +6,12 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
 
+import cv2
 import pytest
 from conftest import copy_of
 
 from estimator.errors import InputError
+from estimator.evaluate import workers
 from estimator.evaluate.batch import estimate_dataset
 from estimator.evaluate.workers import _interrupts_deferred, estimate_with_workers
 from estimator.io.dataset import read_dataset
@@ -71,3 +73,30 @@ def test_an_interrupt_that_another_thread_receives_is_raised_after_the_block(
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def test_a_worker_exits_when_its_parent_dies(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Started in this process with a parent of our own: the worker goes on while it lives, and then exits with 1."""
+    dies, exited, codes = threading.Event(), threading.Event(), []
+
+    class Parent:
+        def join(self) -> None:
+            dies.wait()
+
+    def leave(code: int) -> None:
+        codes.append((code, dies.is_set()))
+        exited.set()
+
+    monkeypatch.setattr(workers.multiprocessing, "parent_process", Parent)
+    monkeypatch.setattr(workers.os, "_exit", leave)
+    monkeypatch.setattr(workers, "_worker_state", None, raising=False)
+    threads = cv2.getNumThreads()
+    try:
+        workers._start(read_dataset(folder), ["pnp"], 1)
+        assert cv2.getNumThreads() == 1
+        assert not exited.wait(0.05)
+    finally:
+        cv2.setNumThreads(threads)
+        dies.set()
+        exited.wait(10)  # before the real _exit is back
+    assert codes == [(1, True)]

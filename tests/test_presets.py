@@ -166,3 +166,21 @@ def test_a_bad_value_is_refused_in_one_line(case: str) -> None:
     assert "quickstart.toml" in line
     for mention in mentions:
         assert mention in line, line
+
+
+def test_tables_that_a_preset_does_not_have_stay_as_they_are() -> None:
+    """A table of the recipe alone, one of the preset alone, and a value where the preset has a table."""
+    tree = {"sensor": {"preset": "phone-1.2um"}, "poses": {"count": 3}, "name": "x"}
+    made = with_presets(tree, [], "here")
+    assert (made["poses"], made["name"], made["camera"]) == ({"count": 3}, "x", {"pixel_pitch_um": 1.2})
+    assert with_presets({**tree, "camera": 3}, [], "here")["camera"] == 3  # the check of the recipe names it
+    assert with_presets({"sensor": 3}, ["sensor.preset=phone-1.2um"], "here")["sensor"]["full_well_e"] == 4900.0
+
+
+def test_an_accelerometer_and_a_sensor_have_presets_of_their_own() -> None:
+    made = with_presets({}, ["accelerometer.preset=bmi270", "sensor.preset=industrial"], "here")
+    assert set(made) == {"accelerometer", "sensor", "camera"}
+    assert made["accelerometer"] == preset("accelerometers", "bmi270")["accelerometer"]
+    assert made["sensor"] == preset("sensors", "industrial")["sensor"]
+    with pytest.raises(InputError, match=r'^here: accelerometer\.preset = "industrial": unknown; presets of accelero'):
+        with_presets({"accelerometer": {"preset": "industrial"}}, [], "here")

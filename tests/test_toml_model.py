@@ -100,6 +100,10 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
         {"name": "x", "lens": {"f_number": "a", "on": "b"}},
         'lens.f_number = "a": input should be a valid number (and 1 more)',
     ),
+    "the longest value shown whole": (
+        {"name": "x", "lens": {"count": "y" * 58}},
+        f'lens.count = "{"y" * 58}": input should be a valid integer',
+    ),
     "a long value": (
         {"name": "x", "lens": {"count": "y" * 100}},
         f'lens.count = "{"y" * 56}...: input should be a valid integer',
