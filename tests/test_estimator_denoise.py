@@ -1,11 +1,19 @@
 """Denoisers: Algorithm 1 corrected is a mean of neighbours, as printed it is not; and the others."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from estimator_synthetic import view_of
 from scipy import stats
+from test_estimator_maximum_likelihood import frame_of
 
+from estimator.errors import EstimationFailure
+from estimator.methods.huynh2016 import huynh2016_with
 from estimator.spots.denoise import (
     DENOISERS,
+    Denoiser,
+    Image,
     algorithm_1,
     box_mean,
     neighbourhood_mean,
@@ -146,3 +154,22 @@ def test_no_denoiser_exceeds_its_radius(name: str) -> None:
     other[20, 20] += 500
     changed = np.argwhere(denoiser.apply(image, 0.0) != denoiser.apply(other, 0.0)) - 20
     assert np.abs(changed).max() == denoiser.radius_px
+
+
+def test_the_denoiser_is_told_the_noise_beside_shot_noise(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At 3 e/DN: dark signal nonuniformity 4 e, read noise 12 e, the ADC's 2 DN are 6 e, rounding 3 / sqrt(12) e."""
+    told: list[float] = []
+
+    def listen(image: Image, noise_e: float) -> Image:
+        told.append(noise_e)
+        raise EstimationFailure("denoise", "enough was heard")
+
+    monkeypatch.setitem(DENOISERS, "anscombe", Denoiser(listen, 0))
+    view = view_of((3.5, 3.6, 3.5), 3.0, size=(40, 30, 1500.0))
+    frame = frame_of(view, np.array([[3.5, 3.6, 3.5]]), np.zeros((30, 40), dtype=np.uint32))
+    values = {"noise": "full", "gain_e_per_dn": 3.0, "dsnu_e": 4.0, "read_noise_e": 12.0, "adc_noise_dn": 2.0}
+    with pytest.raises(EstimationFailure, match="enough was heard"):
+        huynh2016_with("huynh2016:denoise=anscombe").estimate(
+            replace(frame, sensor=frame.sensor.model_copy(update=values))
+        )
+    assert told == pytest.approx([np.sqrt(16 + 144 + 36 + 0.75)])

@@ -60,3 +60,16 @@ def test_no_match_is_a_named_failure() -> None:
         matches([spot(100, 50)], [claim(1, 200, 50)])
     with pytest.raises(EstimationFailure, match="identify: no identity was decoded"):
         matches([spot(100, 50)], [])
+
+
+@pytest.mark.parametrize(("distance_px", "is_matched"), [(39.9, True), (40.1, False)])
+def test_the_gate_is_four_standard_deviations_of_a_decoded_pixel(distance_px: float, is_matched: bool) -> None:
+    """10 px along each axis: the distance is beyond r with exp(-r^2 / 200), one identity of 3000 beyond 40 px."""
+    found = matches([spot(100, 50), spot(300, 50)], [claim(1, 100, 50 + distance_px), claim(3, 300, 50)])
+    assert (1 in found) == is_matched
+
+
+@pytest.mark.parametrize(("second_px", "is_matched"), [(19.8, False), (20.2, True)])
+def test_another_spot_has_to_be_twice_as_far(second_px: float, is_matched: bool) -> None:
+    found = matches([spot(100, 50), spot(110 + second_px, 50), spot(300, 50)], [claim(1, 110, 50), claim(3, 300, 50)])
+    assert found == ({1: 100, 3: 300} if is_matched else {3: 300})

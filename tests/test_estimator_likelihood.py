@@ -195,3 +195,17 @@ def test_a_bright_led_may_be_displaced_by_a_twentieth_of_a_pixel(shift_px: float
     pixels = gather_led_pixels(frame, pose, SURE)
     photometry = fit_photometry(pixels, pixels.rendered, np.ones(6, dtype=bool), Noise.of(frame))
     assert ((excess_chi2(pixels, pixels.rendered, photometry) < 0) == is_explained).all()
+
+
+@pytest.mark.parametrize("bright", [2, 6])
+def test_saturated_leds_are_left_out_beside_others(bright: int) -> None:
+    """Faces of three times the full well say where their edge is only if the amplitude is known: they are used where
+    all LEDs are so.
+    """
+    full_well_e = 3000.0
+    led_e = np.where(np.arange(6) < bright, 3 * full_well_e, 0.5 * full_well_e)
+    image = np.minimum(np.rint(render(VIEW, SIX, 0.01, led_e.tolist())), full_well_e).astype(np.uint32)
+    frame = frame_of(VIEW, SIX, image)
+    frame = replace(frame, sensor=frame.sensor.model_copy(update={"full_well_e": full_well_e}))
+    pixels = gather_led_pixels(frame, true_pose(frame), SURE)
+    assert [pixels.leds[k].id for k in pixels.led] == ([12, 13, 14, 15] if bright == 2 else [10, 11, 12, 13, 14, 15])

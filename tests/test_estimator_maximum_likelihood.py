@@ -276,18 +276,24 @@ def test_the_covariance_is_that_of_small_changes_of_the_answer(monkeypatch: pyte
     assert ratios.real == pytest.approx(np.ones(3), abs=0.01)
 
 
-@pytest.mark.parametrize("turned_deg", [(0.0, 0.0, 90.0), (20.0, -10.0, 90.0)])
-def test_gravity_is_read_in_the_axes_of_the_rig(turned_deg: tuple[float, float, float]) -> None:
+def nearly_exact(view: View, leds_m: Floats) -> DeviceFrame:
+    """As `exact`, in a tenth of the time: edges err by 4 e, where noise is 6 e in the dimmest and 60 e in the brightest
+    pixels, so that a position errs by less than its standard deviation.
+    """
+    return frame_of(view, leds_m, np.rint(render(view, leds_m, 0.01, samples=SAMPLES)).astype(np.uint32))
+
+
+def test_gravity_is_read_in_the_axes_of_the_rig() -> None:
     """A camera turned on its rig, and two LEDs, which need gravity: its tilts are the rig's, not the camera's."""
     view = view_of(TARGET, 3.0, 25.0, -15.0, 30.0)
-    frame = exact(view, SIX[[0, 4]])
-    rows = tuple(map(tuple, rotation(*np.radians(turned_deg)).tolist()))
-    frame = replace(frame, camera=frame.camera.model_copy(update={"R_cam_rig": rows}))
-    estimate = ml(frame)
-    assert estimate.covariance_m2 is not None
-    error = estimate.position_m - view.position_m
-    # As without noise: a third of a standard deviation.
-    assert error @ np.linalg.solve(estimate.covariance_m2, error) < 0.3**2
+    upright = nearly_exact(view, SIX[[0, 4]])
+    for turned_deg in ((0.0, 0.0, 90.0), (20.0, -10.0, 90.0)):
+        rows = tuple(map(tuple, rotation(*np.radians(turned_deg)).tolist()))
+        estimate = ml(replace(upright, camera=upright.camera.model_copy(update={"R_cam_rig": rows})))
+        assert estimate.covariance_m2 is not None
+        error = estimate.position_m - view.position_m
+        # See `nearly_exact`.
+        assert error @ np.linalg.solve(estimate.covariance_m2, error) < 1.0
 
 
 def test_an_led_is_used_from_a_signal_of_five_sigma_on() -> None:
@@ -339,3 +345,16 @@ def test_the_search_does_not_go_back_and_forth_over_a_kink() -> None:
     )
     error = found.pose.position_m - DIM_VIEW.position_m
     assert error @ np.linalg.solve(found.covariance[:3, :3], error) < chi2.ppf(0.9999, 3)
+
+
+def test_a_reading_of_gravity_that_the_spots_contradict_is_not_used() -> None:
+    """Off by 3 deg, said to be good to 0.1 deg; six LEDs give the tilt to some hundredths of a degree."""
+    view = view_of(TARGET, 3.0, 25.0, -15.0, 30.0)
+    frame = nearly_exact(view, SIX)
+    off = rotation(*np.radians([28.0, -15.0])) @ [0.0, 0.0, 9.80665]
+    accelerometer = Accelerometer(kind="tilt-error", error_deg=0.1)
+    estimate = ml(replace(frame, accelerometer_m_s2=tuple(off.tolist()), accelerometer=accelerometer))
+    assert estimate.covariance_m2 is not None
+    error = estimate.position_m - view.position_m
+    # See `nearly_exact`.
+    assert error @ np.linalg.solve(estimate.covariance_m2, error) < 1.0

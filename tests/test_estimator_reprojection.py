@@ -165,3 +165,31 @@ def test_eccentricity_by_a_lens_is_corrected(lens: Callable[[Array], Array], cha
     assert np.linalg.norm(bent.position_m - view.position_m) > 1e-5
     straight = fit(corrected_for_eccentricity(observed, bent), start).pose
     assert np.linalg.norm(straight.position_m - view.position_m) < 2e-6
+
+
+def test_the_cost_is_chi_square() -> None:
+    """By hand: a spot 3 sigma to the right of its fit has a chi-square of 9, a tilt 2 sigma off one of 4. The
+    other spots are a thousand times more exact, so that the pose does not give way.
+    """
+    leds = grid(5, 4, 0.14, (3, 2, 2.7))
+    view = view_of((3, 2, 2.7), 2.6, 30, -20, 140)
+    spots = simulated(view, leds, 1e-3)
+    spots[7] = replace(spots[7], spot=replace(spots[7].spot, u_px=spots[7].spot.u_px + 3, covariance_px2=np.eye(2)))
+    observed = observe(device(view, 1.0), spots)
+    observed = replace(observed, tilt_rad=observed.tilt_rad + [2 * np.radians(1.0), 0.0])
+    found = fit(observed, Pose(np.array(view.position_m), view.R_cam_world))
+    # It gives way by this spot's share of the information, 1e-6.
+    assert found.spots_chi2[7] == pytest.approx(9.0, rel=1e-3)
+    assert found.tilt_chi2 == pytest.approx(4.0, rel=1e-3)
+    assert found.cost == pytest.approx(found.chi2, rel=1e-9)
+    assert found.chi2 == pytest.approx(13.0, rel=1e-3)
+
+
+def test_tilts_to_both_sides_of_180_deg_are_near() -> None:
+    """A camera upside down: held at 179 deg, read as -179 deg, which is 2 deg off and not 358."""
+    leds = grid(5, 4, 0.14, (3, 2, 0.0))
+    view = View(400, 300, 1500.0, (3.0, 2.0, 2.6), 179.0, 0.0, 0.0)
+    observed = observe(device(view, 1.0), simulated(view, leds, 1e-3))
+    observed = replace(observed, tilt_rad=np.array([np.radians(-179.0), 0.0]))
+    found = fit(observed, Pose(np.array(view.position_m), view.R_cam_world))
+    assert found.tilt_chi2 == pytest.approx(4.0, rel=1e-3)

@@ -171,3 +171,11 @@ def test_a_minimum_of_a_hundredth_of_the_likelihood_is_ambiguous(share: float, e
     """The likelihood goes with exp(-cost / 2): a hundredth at a cost higher by 2 ln 100."""
     other = fitted(3.0 + share * 2 * np.log(100), np.ones(4))
     assert ambiguous(Consensus(fitted(3.0, np.ones(4)), (other,), np.ones(4, dtype=bool), True)) is expected
+
+
+@pytest.mark.parametrize("depth_m", [0.3, 2.8])
+def test_leds_at_any_depth_in_front_of_the_camera_have_a_pose(depth_m: float) -> None:
+    view = view_of((3, 2, 3.0), depth_m, 10, -5, 40, (4000, 3000, 3000.0))
+    seen = observe(device(view, 0.1), simulated(view, grid(3, 3, 0.1 * depth_m, (3, 2, 3.0)), 0.02))
+    pose = Pose(np.array(view.position_m), view.R_cam_world)
+    assert len(minima(seen, [pose])) == len(minima(seen, [pose], robust=True)) == 1
