@@ -64,7 +64,7 @@ def test_tilted_visibility_is_the_share_of_random_poses(rng: np.random.Generator
     grid = [(0.5 + 0.5 * i, 5.0 + 0.5 * j, 3.5) for i in range(6) for j in range(6)]
     scene = leds_at(*grid, room=size)
     camera = Camera(width_px=400, height_px=300, pixel_pitch_um=40.0)
-    count, seen = 4000, 0
+    count, seen = 2000, 0
     for x, y, *angles in rng.uniform([0, 0, 0, 0, -180], [4, 8, 60, 60, 180], (count, 5)):
         p = (np.array(grid) - [x, y, 1.0]) @ rotation_cam_world(*angles).T
         u, v = p[:, :2].T / np.maximum(p[:, 2], 1e-9) * 450
