@@ -24,18 +24,18 @@ def leds_at(*positions: tuple[float, float, float], radius_m: float = 0.02, **ch
 @pytest.mark.parametrize("yaw_deg", [0.0, 5.0, 7.5, 90.0])
 @pytest.mark.parametrize("margin_px", [0.0, 8.0])
 def test_an_led_is_in_view_with_its_whole_rim_inside_the_margin(yaw_deg: float, margin_px: float) -> None:
-    """A disc of 12 px of radius moves to the sensor's right border; its circle is taken as a polygon 0.9 % larger."""
+    """A disc of 12 px of radius moves to each border; its circle is taken as a polygon 0.9 % larger."""
     scene = leds_at((3.0, 3.5, 3.5))
+    right, down, _ = rotation_cam_world(0.0, 0.0, yaw_deg)
 
-    def seen(distance_px: float) -> bool:
-        """Whether the LED is in view with its centre this far inside the right border."""
-        right = rotation_cam_world(0.0, 0.0, yaw_deg)[0]
-        position = np.array([3.0, 3.5, 1.0]) - right * (200 - distance_px) / 600
-        pose = Pose((float(position[0]), float(position[1]), 1.0), yaw_deg=yaw_deg)
-        return leds_in_view(PosedCamera(CAMERA, pose), scene, margin_px).tolist() == [0]
+    def seen(towards: np.ndarray, half_px: float, inside_px: float) -> bool:
+        """Whether the LED is in view with its centre this far inside the border `half_px` from the middle."""
+        x, y, z = np.array([3.0, 3.5, 1.0]) - towards * (half_px - inside_px) / 600
+        return leds_in_view(PosedCamera(CAMERA, Pose((x, y, z), yaw_deg=yaw_deg)), scene, margin_px).tolist() == [0]
 
-    assert not seen(margin_px + 12 * 0.999)
-    assert seen(margin_px + 12 * 1.009)
+    for towards, half_px in ((right, 200.0), (-right, 200.0), (down, 150.0), (-down, 150.0)):
+        assert not seen(towards, half_px, margin_px + 12 * 0.999)
+        assert seen(towards, half_px, margin_px + 12 * 1.009)
 
 
 def test_an_led_below_the_camera_is_not_in_view() -> None:
@@ -58,19 +58,23 @@ def test_level_visibility_counts_leds_above_the_camera_only() -> None:
     assert result.share == result.seen / 350**2
 
 
-def test_tilted_visibility_is_the_share_of_random_poses(rng: np.random.Generator) -> None:
-    """Against other random poses, in a room whose LEDs are all in one part: 5 sigma of both samples."""
+@pytest.mark.parametrize("height_m", [1.0, 3.2])
+def test_tilted_visibility_is_the_share_of_random_poses(rng: np.random.Generator, height_m: float) -> None:
+    """Against other random poses, in a room whose LEDs are all in one part: 5 sigma of both samples.
+
+    Far below the LEDs the share depends on where tilted cameras look, close to them on how far they are tilted.
+    """
     size = {"size_m": [4.0, 8.0, 3.5], "reflectance": {"floor": 0.2, "ceiling": 0.8, "walls": 0.5}}
-    grid = [(0.5 + 0.5 * i, 5.0 + 0.5 * j, 3.5) for i in range(6) for j in range(6)]
+    grid = [(0.5 + 0.5 * i, 5.0 + 0.5 * j, 3.5) for i in range(7) for j in range(6)]
     scene = leds_at(*grid, room=size)
-    camera = Camera(width_px=400, height_px=300, pixel_pitch_um=40.0)
+    camera = Camera(width_px=400, height_px=300, pixel_pitch_um=60.0)
     count, seen = 2000, 0
     for x, y, *angles in rng.uniform([0, 0, 0, 0, -180], [4, 8, 60, 60, 180], (count, 5)):
-        p = (np.array(grid) - [x, y, 1.0]) @ rotation_cam_world(*angles).T
-        u, v = p[:, :2].T / np.maximum(p[:, 2], 1e-9) * 450
+        p = (np.array(grid) - [x, y, height_m]) @ rotation_cam_world(*angles).T
+        u, v = p[:, :2].T / np.maximum(p[:, 2], 1e-9) * 300
         seen += ((p[:, 2] > 0) & (np.abs(u) <= 200) & (np.abs(v) <= 150)).sum() >= 4
     share = seen / count
-    result = tilted_visibility(camera, scene, 1.0)
+    result = tilted_visibility(camera, scene, height_m)
     assert result.poses == TILTED_POSES
     assert 0.1 < share < 0.9
     assert abs(result.share - share) < 5 * np.sqrt(share * (1 - share) * (1 / count + 1 / TILTED_POSES))
