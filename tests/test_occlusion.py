@@ -69,6 +69,21 @@ def test_a_board_above_the_led_or_beside_it_hides_nothing(tmp_path: Path) -> Non
         assert occlusion_of(scene).clear_shares(POSED, [LitRegion(3.4, image.roi, image.coverage > 0)]) == [1.0]
 
 
+def test_each_led_is_occluded_at_its_own_height(tmp_path: Path) -> None:
+    """Two LEDs beside each other, one above a board that covers both and one below it."""
+    leds = [{**LAMP, "position_m": [2.9, 3.5, 3.5]}, {**LAMP, "id": 2, "position_m": [3.1, 3.5, 3.0]}]
+    scene = room(tmp_path, led=leds, furniture=[board(tmp_path, 2.5, 3.2)])
+    images = [coverage_of_led(POSED, face_of_led(scene.leds, i)) for i in range(2)]
+    lit = [
+        LitRegion(float(height_m), image.roi, image.coverage > 0)
+        for height_m, image in zip(scene.leds.centers_m[:, 2], images, strict=True)
+        if image is not None
+    ]
+    hidden, clear = occlusion_of(scene).clear_shares(POSED, lit)
+    assert not np.any(hidden)
+    assert clear == 1.0
+
+
 @pytest.mark.parametrize("tilt_deg", [0.0, 40.0, 80.0])
 def test_a_ceiling_does_not_hide_the_leds_on_it(tmp_path: Path, tilt_deg: float) -> None:
     """Rays meet the ceiling in the LED's own plane, at any slope."""
