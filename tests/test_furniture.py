@@ -261,3 +261,39 @@ def test_meshes_of_a_mitsuba_file_are_looked_up_in_its_folder_and_only_during_it
     with pytest.raises(InputError, match="Mitsuba cannot load it"):
         mesh_of(tmp_path, "text.xml", REFUSED["broken.xml"][0])
     assert str(mi.file_resolver()) == before
+
+
+def test_a_piece_is_scaled_then_turned_counter_clockwise_then_moved(tmp_path: Path) -> None:
+    """Seen from above a yaw of 90 deg takes x to y, and y to -x."""
+    mesh = mesh_of(tmp_path, "corner.obj", "v 0 0 0\nv 200 0 0\nv 0 100 50\nf 1 2 3\n", yaw_deg=90.0, scale=0.001)
+    expected = [[1.5, 1.5, 1.0], [1.5, 1.7, 1.0], [1.4, 1.5, 1.05]]
+    assert sorted(mesh.vertices_m.round(9).tolist()) == sorted(expected)
+
+
+@pytest.mark.parametrize(("axis", "at_m"), [(0, -0.01), (1, -0.01), (2, -0.01), (0, 2.01), (1, 2.01), (2, 2.51)])
+def test_a_piece_has_to_be_inside_the_room_on_every_side(tmp_path: Path, axis: int, at_m: float) -> None:
+    """A triangle of 1 m in the room of 3 x 3 x 2.5 m, and 1 cm beyond its floor, ceiling or walls."""
+    position = np.array([1.0, 1.0, 1.0])
+    position[axis] = at_m
+    with pytest.raises(InputError, match=r"outside the room of \[3\.0, 3\.0, 2\.5\] m"):
+        mesh_of(tmp_path, "board.obj", OBJ + "f 1 2 3\n", position_m=position.tolist())
+
+
+def test_triangles_keep_their_reflectances_where_others_are_left_out(tmp_path: Path) -> None:
+    """The first triangle is collapsed, the second flat; the textures of the others tell left from right."""
+    (tmp_path / "two.obj").write_text(
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0.5 0 0\nvt 0.25 0.25\nvt 0.75 0.25\n"
+        "f 1/1 1/1 2/1\nf 1/1 4/1 2/1\nf 1/1 2/1 3/1\nv 0 0 1\nf 1/2 3/2 5/2\n"
+    )
+    board = (
+        "<shape type='obj'><string name='filename' value='two.obj'/><bsdf type='diffuse'>"
+        "<texture type='checkerboard' name='reflectance'><rgb name='color0' value='0.4'/>"
+        "<rgb name='color1' value='0.2'/><transform name='to_uv'><scale x='1' y='0.5'/></transform>"
+        "</texture></bsdf></shape>"
+    )
+    mesh = mesh_of(tmp_path, "two.xml", xml(board))
+    of_triangle = {
+        tuple(np.abs(normal).round(6).tolist()): float(albedo)
+        for normal, albedo in zip(mesh.normals[mesh.faces[:, 0]], mesh.albedo[mesh.faces[:, 0]].round(6), strict=True)
+    }
+    assert of_triangle == {(0.0, 0.0, 1.0): 0.4, (1.0, 0.0, 0.0): 0.2}

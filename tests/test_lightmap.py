@@ -113,6 +113,9 @@ def test_white_furnace(albedo: float) -> None:
     # The standard errors come from 8 batches: z follows Student's t with 7 degrees of freedom, variance 7/5.
     z = (lux - expected) / np.maximum(sigma, 1e-5 * expected)
     assert abs(z.mean()) < 5 * np.sqrt(7 / 5 / n)
+    # The standard errors are neither too small nor too large. Fourth moment of t: 3 * 7^2 / ((7 - 2) (7 - 4)) = 9.8.
+    # Without reflections every path has the same luminance, and no error.
+    assert albedo == 0 or abs((z**2).mean() - 7 / 5) < 5 * np.sqrt((9.8 - (7 / 5) ** 2) / n)
     assert lux.mean() == pytest.approx(expected, rel=5e-3)
 
 

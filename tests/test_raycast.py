@@ -1,15 +1,21 @@
 """Occlusion and specular reflection of LEDs: geometry and Fresnel's equations against hand calculations."""
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from conftest import ROOT
+from PIL import Image
 
 from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.vignetting import relative_illumination
 from vlcrender.config.toml_model import check, read_toml
+from vlcrender.core.backend import mi
+from vlcrender.light.lightmap import Lightmap, room_mesh
+from vlcrender.light.raycast import Room
 from vlcrender.rendering.expected_image import LedPatch
 from vlcrender.rendering.renderer import Renderer
 from vlcrender.scene.fresnel import glazing_reflectance
@@ -155,3 +161,77 @@ def test_a_panel_hung_low_hides_an_led_above_it() -> None:
     lamps = [LAMP, {**LAMP, "id": 2, "position_m": [3.6, 3.5, 3.5]}]
     view = Renderer(room(led=lamps, panels=[panel])).expected_image(PosedCamera(WIDE, Pose((3.0, 3.5, 0.5))))
     assert sorted(patch.led_id for patch in view.patches) == [2, 10]
+
+
+def cast(
+    scene: Scene, light: Lightmap, origin: Sequence[float], towards: Sequence[float], **spread: Any
+) -> list[float]:
+    """Value at rates of 2 for LEDs and 3 for other light, surface, distance and length of the path of one ray."""
+    rays = Room(light.mesh, scene.glazings, scene.surfaces)
+    direction = mi.Vector3f(*(np.array(towards) / np.linalg.norm(towards)).tolist())
+    hit = rays.trace(mi.Point3f(*map(float, origin)), direction, rays.values(light, 2.0, 3.0), **spread)
+    return [float(x.numpy()[0]) for x in (hit.value, hit.surface, hit.distance_m, hit.path_m)]
+
+
+def lit_evenly(scene: Scene, led_lux: float, ambient_lux: float) -> Lightmap:
+    """Every surface with the same illuminance, without a bake."""
+    mesh = room_mesh(scene)
+    albedo = np.append(mesh.albedo, [0.5] * len(scene.leds))
+    led, ambient = (np.full(len(albedo), lux) for lux in (led_lux, ambient_lux))
+    return Lightmap(mesh, albedo, led, ambient, np.zeros(len(albedo)))
+
+
+def test_each_glazing_mixes_the_scene_outside_with_its_own_reflection_of_the_room() -> None:
+    """Straight onto glazing of index 3 at 60 cd/m2, second to one of index 1.52; the walls reflect half of their light.
+
+    F = ((3 - 1) / (3 + 1))^2 = 1/4 at each face, 2 F / (1 + F) = 0.4. Light from outside is not the LEDs'.
+    """
+    second = {**GLAZING, "wall": "x=max", "luminance_cd_m2": 60.0, "refractive_index": 3.0}
+    scene = room(glazing=[GLAZING, second])
+    light = lit_evenly(scene, 20 * np.pi, 4 * np.pi)
+    wall = 0.5 * (2 * 20 + 3 * 4)
+    number = len(scene.surfaces)
+    value, surface, distance, path = cast(scene, light, (3.0, 3.5, 1.0), (1.0, 0.0, 0.0))
+    # the ray reflected goes on to the first glazing, which is dark at night: reflections of reflections are left out
+    assert (surface, distance, path) == pytest.approx((number + 1, 4.0, 11.0), rel=1e-5)
+    assert value == pytest.approx(0.6 * 3 * 60.0, rel=1e-5)
+    # aslant: onto the wall y = 0 after the glazing, 3-4-5
+    value, surface, distance, path = cast(scene, light, (4.75, 4.5, 2.9), (3.0, -4.0, 0.0))
+    assert (surface, distance, path) == pytest.approx((number + 1, 3.75, 5.625), rel=1e-5)
+    share = glazing_reflectance(0.6, 3.0, np.sqrt)
+    assert value == pytest.approx((1 - share) * 3 * 60.0 + share * wall, rel=1e-5)
+    # a wall without glazing
+    value, surface, distance, path = cast(scene, light, (3.0, 3.5, 1.0), (0.0, 1.0, 0.0))
+    assert scene.surfaces[int(surface)].name == "wall y=max"
+    assert (value, distance, path) == pytest.approx((wall, 3.5, 3.5), rel=1e-5)
+
+
+def test_a_texture_by_way_of_glazing_is_averaged_over_the_whole_paths_footprint(
+    tmp_path: Path, rng: np.random.Generator
+) -> None:
+    """A ray that comes from the mirror image of the camera would see the same: a ray straight to the same point, with
+    its spread turned by the mirror and wider by as much as its way is shorter.
+    """
+    Image.fromarray(rng.integers(0, 256, (16, 16), dtype=np.uint8)).save(tmp_path / "noise.png")
+    rooms = {"size_m": [7.0, 7.0, 3.5], "reflectance": {"floor": 0.2, "ceiling": 0.8}}
+    walls = {"texture": {"walls": {"file": "noise.png", "tile_m": [1.6, 1.6]}}}
+    scene = room(tmp_path, glazing=[GLAZING], room={**rooms, **walls})
+    light = lit_evenly(scene, 20 * np.pi, 4 * np.pi)
+    # by the wall x = 0, 2 m away, to the wall x = 7 m: 9 m along x; back 3 m from there straight to the same point
+    slope = np.array([1.0, 0.35, 0.1])
+    slope /= np.linalg.norm(slope)
+    start = np.array([2.0, 2.0, 0.8])
+    mirror = np.array([-1.0, 1.0, 1.0])
+    end = start * mirror + slope * 9.0 / slope[0]
+    near = end - slope * 3.0 / slope[0]
+    along_u, along_v = np.array([0.004, 0.03, 0.001]), np.array([0.01, -0.004, 0.025])
+    by_glazing, straight = (
+        cast(scene, light, at, towards, spread=tuple(mi.Vector3f(*side.tolist()) for side in spread))[0]
+        for at, towards, spread in (
+            (start, slope * mirror, (along_u * mirror, along_v * mirror)),
+            (near, slope, (3 * along_u, 3 * along_v)),
+        )
+    )
+    share = glazing_reflectance(slope[0], 1.52, np.sqrt)
+    # float32: 1e-7 of 9 m, over 0.1 m a pixel of the image whose values differ by 1
+    assert by_glazing == pytest.approx(share * straight, rel=1e-4)
