@@ -31,7 +31,8 @@ def test_regions_are_parts_in_their_places(tmp_path: Path) -> None:
     """The pixels of each part, its region, beyond the sensor too, and the sensor."""
     regions = [Roi(-3, -2, 4, 5), Roi(10, 20, 2, 3), Roi(58, 70, 6, 20)]
     images = [
-        RegionImage(roi, np.full((roi.rows, roi.columns), number, dtype=np.uint32)) for number, roi in enumerate(regions)
+        RegionImage(roi, np.full((roi.rows, roi.columns), number, dtype=np.uint32))
+        for number, roi in enumerate(regions)
     ]
     write_exr(tmp_path / "a.exr", images, SENSOR, {"expTime": 0.5})
     assert read_exr_parts(tmp_path / "a.exr") == [ExrPart(roi, SENSOR, np.dtype(np.uint32)) for roi in regions]

@@ -1,4 +1,4 @@
-"""Files of a dataset appear whole or not at all, also after a power cut; a journal holds every frame reported as done."""
+"""Files of a dataset appear whole or not at all, also after a power cut; the journal holds every reported frame."""
 
 import json
 import os
@@ -55,9 +55,14 @@ def test_a_file_is_on_the_disk_before_it_gets_its_name(
 def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
     path = tmp_path / "dataset.json"
     write_json(path, {"name": "old"})
-    with pytest.raises(InputError, match=r"dataset\.json: cannot be written: disk full"), whole_file(path) as partial:
-        partial.write_text("half")
-        raise OSError(28, "disk full")
+
+    def write_half() -> None:
+        with whole_file(path) as partial:
+            partial.write_text("half")
+            raise OSError(28, "disk full")
+
+    with pytest.raises(InputError, match=r"dataset\.json: cannot be written: disk full"):
+        write_half()
     assert json.loads(path.read_text()) == {"name": "old"}
     assert list(tmp_path.iterdir()) == [path]
 

@@ -1,7 +1,7 @@
 """Stated standard errors of photon transfer against the scatter of repeated measurements, one quantity at a time.
 
-A score is the deviation from the truth over the stated error. Over n repeats its mean has the standard error 1 / sqrt(n)
-and its spread 1 / sqrt(2 n), where the error is right; five of each are allowed.
+A score is the deviation from the truth over the stated error. Over n repeats its mean has the standard error
+1 / sqrt(n) and its spread 1 / sqrt(2 n), where the error is right; five of each are allowed.
 """
 
 from collections.abc import Iterable
@@ -83,9 +83,7 @@ def test_the_responsivity_errs_as_stated(rng: np.random.Generator, prnu: float, 
         dark = pair(rng, 0.5, 0.0, dark_e)
         points = [pair(rng, 0.5, electrons * response, dark_e) for electrons in (100.0, 200.0, 300.0)]
         points = [Point(200.0 * n, p.exposure_s, p.mean_dn, p.variance_dn2, p.pixels) for n, p in enumerate(points, 1)]
-        bright = patterns(
-            np.rint(1000 + 0.5 * rng.poisson(300 * response)).astype(np.uint32) for _ in range(4)
-        )
+        bright = patterns(np.rint(1000 + 0.5 * rng.poisson(300 * response)).astype(np.uint32) for _ in range(4))
         found.append(fit_responsivity(dark, points, bright))
     assert_errors_are_stated(found, 0.25)
 
@@ -136,9 +134,7 @@ def test_the_response_variance_errs_as_stated(
     for _ in range(REPEATS):
         fixed = 1000 + offset * rng.standard_normal((40, 40))
         light = 1000 + response * rng.standard_normal((40, 40))
-        found.append(
-            response_variance(stack(rng, fixed, noise_dark), stack(rng, fixed + light, noise_bright))
-        )
+        found.append(response_variance(stack(rng, fixed, noise_dark), stack(rng, fixed + light, noise_bright)))
     assert_errors_are_stated(found, (response / 1000) ** 2)
 
 

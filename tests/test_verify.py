@@ -44,9 +44,7 @@ def change_frame(directory: Path, **entries: object) -> None:
 
 def change_truth(directory: Path, change: Callable[[TruthRow], dict[str, object]]) -> None:
     (row,) = read_table(directory / "truth.parquet", TruthRow)
-    write_table(
-        directory / "truth.parquet", [TruthRow.model_validate({**row.model_dump(), **change(row)})], TruthRow
-    )
+    write_table(directory / "truth.parquet", [TruthRow.model_validate({**row.model_dump(), **change(row)})], TruthRow)
 
 
 def write_regions(directory: Path, *rois: Roi, kind: type = np.uint32, sensor: Roi = SENSOR) -> None:
