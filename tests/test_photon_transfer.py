@@ -156,3 +156,18 @@ def test_the_linearity_error_of_a_linear_camera_errs_as_stated(rng: np.random.Ge
         found.append((deviation.value - noise) / deviation.error)
     assert abs(np.mean(found) + 0.2) < 5 / np.sqrt(REPEATS)
     assert abs(np.std(found, ddof=1) - 1) < FIVE_OF_SPREAD
+
+
+def test_light_levels_are_50_even_steps_to_where_the_noise_collapses() -> None:
+    """EMVA 1288: 50 levels or more. The last has half of the largest variance, as nine halvings of the light find it.
+
+    Within 5 % of the light the variance falls from nearly its maximum to half, so by 4 % of it in the last step, 0.3 %
+    of the light. Variances of 1024 pairs are known to sqrt(2 / 1024), 4.4 %: five of both errors.
+    """
+    found = measure(numpy_camera(3, side=32))
+    photons = np.array([point.photons for point in found.points])
+    assert photons == pytest.approx(np.arange(1, 51) / 50 * photons[-1], rel=1e-12)
+    assert [point.photons for point in found.faint] == [2.0**n for n in range(len(found.faint))]
+    assert found.faint[-1].photons < photons[-1]
+    largest = found.points[found.saturation_index].variance_dn2
+    assert found.points[-1].variance_dn2 / largest == pytest.approx(0.5, abs=0.04 + 5 * 0.044 * np.hypot(1, 0.5))
