@@ -94,3 +94,17 @@ def test_a_file_without_the_channel_is_refused_in_one_line(tmp_path: Path) -> No
         path.write_bytes(damage)
         with pytest.raises(InputError, match=r"0\.exr: cannot be read as an EXR with a channel Y"):
             read_exr_parts(path)
+
+
+def test_expected_images_and_frames_keep_every_bit(tmp_path: Path, rng: np.random.Generator) -> None:
+    """float32 of all 24 bits over many magnitudes, and uint32 up to the largest."""
+    sensor = Roi(0, 0, 60, 80)
+    floats = (rng.standard_normal((60, 80)) * 10.0 ** rng.integers(-20, 20, (60, 80))).astype(np.float32)
+    numbers = rng.integers(0, 2**32, (60, 80), dtype=np.uint32)
+    for name, image in (("expected", floats), ("frame", numbers)):
+        path = tmp_path / f"{name}.exr"
+        assert write_exr(path, [(sensor, image)], sensor, {}) == hashlib.sha256(path.read_bytes()).hexdigest()
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            read = file.channels()["Y"].pixels
+        assert read.dtype == image.dtype
+        assert read.tobytes() == image.tobytes()

@@ -1,4 +1,4 @@
-"""Files of a dataset appear whole or not at all, also after a power cut; a journal holds every reported frame."""
+"""Files of a dataset appear whole or not at all, also after a power cut; the journal holds every reported frame."""
 
 import json
 import os
@@ -56,13 +56,13 @@ def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path: Path)
     path = tmp_path / "dataset.json"
     write_json(path, {"name": "old"})
 
-    def fail() -> None:
+    def write_half() -> None:
         with whole_file(path) as partial:
             partial.write_text("half")
             raise OSError(28, "disk full")
 
     with pytest.raises(InputError, match=r"dataset\.json: cannot be written: disk full"):
-        fail()
+        write_half()
     assert json.loads(path.read_text()) == {"name": "old"}
     assert list(tmp_path.iterdir()) == [path]
 

@@ -5,6 +5,7 @@ import math
 import colour
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from vlcrender.camera.intrinsics import Camera
 from vlcrender.sensor.quantum_efficiency import QuantumEfficiency
@@ -140,3 +141,10 @@ def test_a_measured_table_is_linear_between_its_wavelengths_and_0_outside() -> N
     table = QuantumEfficiency(wavelengths_nm=(400.0, 500.0, 700.0), values=(0.2, 0.6, 0.4))
     found = Tabulated(table).quantum_efficiency(np.array([399.9, 400.0, 425.0, 500.0, 600.0, 700.0, 700.1]))
     assert found == pytest.approx([0.0, 0.2, 0.3, 0.6, 0.5, 0.4, 0.0])
+
+
+@pytest.mark.parametrize("share", [-0.001, 1.001])
+def test_an_efficiency_below_0_or_above_1_is_refused(share: float) -> None:
+    with pytest.raises(ValidationError, match=r"values\.1"):
+        QuantumEfficiency(wavelengths_nm=(400.0, 500.0), values=(0.0, share))
+    assert QuantumEfficiency(wavelengths_nm=(400.0, 500.0), values=(0.0, 1.0)).values == (0.0, 1.0)
