@@ -140,7 +140,6 @@ def test_gravity_and_more_leds_lower_the_bound(renderer: Renderer, small_camera:
     assert sizes[0] < 0.5 * sizes[2] < 0.9 * sizes[3]
 
 
-@pytest.mark.slow
 def test_each_tilt_has_its_own_error(renderer: Renderer, small_camera: Camera) -> None:
     """A large error on one tilt raises the bound, and by less than a large error on both."""
     expected = renderer.expected_image(PosedCamera(small_camera, POSE)).expected_electrons(EXPOSURE_S)
