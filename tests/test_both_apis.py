@@ -30,6 +30,7 @@ def test_ten_lines_make_a_frame_a_position_a_data_set_and_scores(tmp_path: Path)
     assert (row["variant"], row["frames"], row["success_rate"]) == ("ml", 2, 1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("regions", [None, vr.LedRegions(kind="leds", margin_px=10)])
 def test_a_record_is_what_the_reader_of_data_sets_gives(regions: vr.LedRegions | None, tmp_path: Path) -> None:
     """All fields of the frame that `estimator.read_frame` reads from a dataset of the same seed and pose."""

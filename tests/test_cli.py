@@ -137,7 +137,6 @@ def test_show_refuses(tmp_path: Path) -> None:
     assert_refused(run("vlcrender", "show", TABLE1, "--out", "no/such/x.png", cwd=tmp_path), "no/such")
 
 
-@pytest.mark.slow
 def test_show_draws_and_counts(tmp_path: Path) -> None:
     result = run("vlcrender", "show", TABLE1, "--out", str(tmp_path / "table1.png"))
     assert result.returncode == 0, result.stderr

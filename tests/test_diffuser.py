@@ -138,8 +138,10 @@ def test_a_rim_hides_leds_from_the_side(slope: float, share: float) -> None:
     assert sum(patch.visible_fraction for patch in seen) == pytest.approx(share, abs=0.02)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("frame", [False, True], ids=["diffuser", "frame and diffuser"])
+@pytest.mark.parametrize(
+    "frame",
+    [pytest.param(False, id="diffuser"), pytest.param(True, id="frame and diffuser", marks=pytest.mark.slow)],
+)
 def test_diffusers_and_frames_agree_with_the_reference(frame: bool) -> None:
     scene = panelled(diffuser=True, frame=frame)
     camera = Camera(**{**SMALL_VIEW, "pixel_pitch_um": 160.0})

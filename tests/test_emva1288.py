@@ -80,6 +80,7 @@ def numpy_one(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(np, "asfarray", lambda values: np.asarray(values, dtype=float), raising=False)
 
 
+@pytest.mark.slow
 def test_emva1288_finds_our_gain_and_dark_noise(tmp_path: Path) -> None:
     found = results(SENSOR, tmp_path)
     gain = 1 / SENSOR.gain_at_iso_e_per_dn

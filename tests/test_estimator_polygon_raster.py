@@ -42,6 +42,7 @@ def circle_in_pixels(u: float, v: float, radius: float, size: int) -> Floats:
     return chords.reshape(size, lines, size).mean(axis=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("radius", [3.0, 12.5, 30.0])
 def test_a_circle_covers_what_its_chords_say(radius: float) -> None:
     """A chord of length L leaves the circle by L^2 / 8r at the most, L^2 / 12r on average, which the polygon's greater

@@ -217,6 +217,7 @@ def test_two_renderers_agree_to_the_bit(office_renderer: Renderer, office: Scene
     assert first.tobytes() == second.tobytes()
 
 
+@pytest.mark.slow
 def test_another_thread_renders_the_same_bits(office_renderer: Renderer) -> None:
     """Dr.Jit's flags apply to one thread, and workers of a cluster render in other threads."""
     posed = PosedCamera(Camera(), Pose((1.5, 2.0, 1.2), 40.0, 35.0, 110.0))

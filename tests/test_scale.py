@@ -71,6 +71,7 @@ def test_a_metered_exposure_equals_that_of_the_full_camera(office: Scene) -> Non
         assert same.time_s(views[1]) == pytest.approx(times[0] / 100, rel=4e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("skewed", [(), SKEWED], ids=["plain", "skewed"])
 @pytest.mark.parametrize("pose", [Pose((3.15, 3.1, 0.6), 6, -8, 20), Pose((3.5, 3.2, 0.8), 40, 10, 30)])
 def test_a_binned_pixel_holds_the_sum_of_its_pixels(office: Scene, pose: Pose, skewed: tuple[str, ...]) -> None:

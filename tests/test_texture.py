@@ -214,6 +214,7 @@ def test_grey_values_are_read_linearly(tmp_path: Path) -> None:
         assert read_reflectances(tmp_path / name, "test").tolist() == [[0.0, 0.2, 1.0]]
 
 
+@pytest.mark.slow
 def test_another_texture_gives_another_bake(tmp_path: Path) -> None:
     """Two images whose means over texels are the same are still two."""
     image = np.kron([[0.2, 0.8], [0.8, 0.2]], np.ones((4, 4)))
