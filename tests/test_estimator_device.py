@@ -14,6 +14,7 @@ from estimator.io.device import (
     Sensor,
     SquareLed,
     depth_problem,
+    region_of,
     regions_problem,
 )
 
@@ -145,3 +146,8 @@ def test_the_last_code_of_the_adc_is_a_digital_number() -> None:
     beyond = Part(0, 2, np.array([[0, 4096]], dtype=np.uint32))
     assert depth_problem([last], SENSOR) is None
     assert depth_problem([last, beyond], SENSOR) == "digital number 4096, but 12 bits end at 4095"
+
+
+def test_the_region_of_a_part_is_its_first_and_last_pixel() -> None:
+    """3 rows of 5 columns from row 10 and column -2 on: columns -2 to 2, rows 10 to 12."""
+    assert region_of(Part(10, -2, np.zeros((3, 5), dtype=np.uint32))).tolist() == [[-2, 10], [2, 12]]

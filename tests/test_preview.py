@@ -67,3 +67,11 @@ def test_a_region_that_starts_inside_a_block_counts_in_it(tmp_path: Path, row: i
     linear = np.zeros((2, 800))
     linear[:, 1] = (3 - row) / 9, row / 9
     np.testing.assert_allclose(grey, linear ** (1 / 2.2), atol=HALF_STEP)
+
+
+@pytest.mark.parametrize(("rows", "shown_rows"), [(2, 1), (3, 1), (5, 1), (6, 2)])
+def test_blocks_that_the_frame_does_not_fill_are_left_out_but_one(tmp_path: Path, rows: int, shown_rows: int) -> None:
+    """Blocks of 3: a rest of one or two rows would be darker than it is, and a picture has at least one row."""
+    sensor = Roi(0, 0, rows, 2400)
+    grey = shown(tmp_path, (sensor, np.full((rows, 2400), 9, dtype=np.uint32)), sensor=sensor, white_dn=9)
+    assert grey.shape == (shown_rows, 800)
