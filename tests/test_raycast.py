@@ -166,7 +166,7 @@ def test_a_panel_hung_low_hides_an_led_above_it() -> None:
 def cast(
     scene: Scene, light: Lightmap, origin: Sequence[float], towards: Sequence[float], **spread: Any
 ) -> list[float]:
-    """Value at rates of 2 for LEDs and 3 for other light, surface, distance and length of the path of one ray."""
+    """Value at rates of 2 for LEDs and 3 for ambient light, surface, distance and length of the path of one ray."""
     rays = Room(light.mesh, scene.glazings, scene.surfaces)
     direction = mi.Vector3f(*(np.array(towards) / np.linalg.norm(towards)).tolist())
     hit = rays.trace(mi.Point3f(*map(float, origin)), direction, rays.values(light, 2.0, 3.0), **spread)
