@@ -155,6 +155,16 @@ def test_read_noise_does_not_move_the_saturation_of_a_well() -> None:
     assert saturation_e(noisy, 0.0, levels, 800_000)[0] < saturation_e(adc, 0.0, levels, 800_000)[0]
 
 
+def test_the_saturation_of_an_adc_agrees_with_random_draws(rng: np.random.Generator) -> None:
+    """Shot noise and 60 e of read noise, clipped together by the ADC; variances of 100 000 draws at each level."""
+    sensor = Sensor(**{**FULL, "full_well_e": 1e5, "prnu": 0.0, "dsnu_e": 0.0, "read_noise_e": 60.0})
+    levels = np.linspace(0.6, 1.0, 41) * 6300
+    noise = np.sqrt(levels + 60.0**2 + 0.8**2)
+    draws = np.minimum(levels + noise * rng.standard_normal((100_000, 41)), (4095 - 100) * 1.6)
+    best, error = saturation_e(sensor, 0.0, levels, 100_000)
+    assert abs(levels[int(np.argmax(draws.var(axis=0)))] - best) <= 4 * error < 500
+
+
 @pytest.mark.parametrize("z", [-1.0, 0.0, 0.7, 3.0])
 def test_clipped_normal_moments_agree_with_random_draws(z: float, rng: np.random.Generator) -> None:
     """Mean and variance of a million, each to 5 standard errors from the draws' own moments."""

@@ -7,14 +7,18 @@ import OpenEXR
 import pytest
 from conftest import ROOT, SMALL
 
-from vlcrender.camera.intrinsics import Pose
+from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.roi import RegionImage, Roi
+from vlcrender.dataset.frame_job import _white_balance
 from vlcrender.dataset.generate import generate
 from vlcrender.dataset.recipe import Plan, load_plan
 from vlcrender.dataset.schema import FrameRow, TruthRow
 from vlcrender.dataset.tables import read_table
 from vlcrender.rendering.crlb import position_bound_m2
 from vlcrender.rendering.renderer import Renderer
+from vlcrender.scene.loader import load_scene
+from vlcrender.sensor.quantum_efficiency import QuantumEfficiency
+from vlcrender.sensor.sensor import Sensor
 
 TABLE1 = ("scene=../scenes/table1.toml", "poses.min_leds=2", "expected=true")
 
@@ -103,3 +107,12 @@ def test_the_bound_of_a_frame_is_that_of_its_noise_and_its_accelerometer(tmp_pat
     )
     assert bound is not None
     assert np.array(truth.bound_m2).reshape(3, 3) == pytest.approx(bound, rel=1e-5, abs=1e-5 * np.trace(bound))
+
+
+def test_white_balance_multiplies_the_weaker_colours_and_leaves_a_blind_one() -> None:
+    """Green strongest, red half of it at each wavelength, blue blind: factors 2, 1 and 1."""
+    curves = {"red": (0.3, 0.3), "green": (0.6, 0.6), "blue": (0.0, 0.0)}
+    sensor = Sensor(mosaic="rggb", quantum_efficiency=QuantumEfficiency(wavelengths_nm=(380.0, 780.0), **curves))
+    scene = load_scene(ROOT / "scenes/table1.toml")
+    assert _white_balance(Camera(), sensor, scene) == pytest.approx((2.0, 1.0, 1.0))
+    assert _white_balance(Camera(), Sensor(), scene) == (1.0, 1.0, 1.0)

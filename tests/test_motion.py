@@ -102,3 +102,10 @@ def test_too_long_a_motion_is_refused(table1: Scene) -> None:
     (mounted,) = mounted_cameras(Camera(), ())
     with pytest.raises(InputError, match=r"motion: moves the image by .* px .* at most 1000 px"):
         poses_during(Motion(linear_velocity_m_s=(50.0, 0.0, 0.0)), mounted, POSE, EXPOSURE_S, table1)
+
+
+def test_a_turn_that_leaves_nothing_in_view_is_refused(table1: Scene, small_camera: Camera) -> None:
+    """60 deg during the exposure: no point within 25 deg of the axis before it is there after it."""
+    (mounted,) = mounted_cameras(small_camera, ())
+    with pytest.raises(InputError, match=r"motion: moves the image by .* at most 1000 px"):
+        poses_during(Motion(angular_velocity_deg_s=(0.0, 60 / EXPOSURE_S, 0.0)), mounted, POSE, EXPOSURE_S, table1)

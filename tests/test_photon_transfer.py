@@ -197,3 +197,19 @@ def test_rounding_hides_noise_of_less_than_half_a_number() -> None:
     point = Point(0.0, 0.01, 0.0, 0.2, 10**15)
     assert np.sqrt(3) * point.mean.error == pytest.approx(0.5)
     assert np.sqrt(3) * point.variance().error == pytest.approx(0.25)
+
+
+@pytest.mark.parametrize("sigma", [0.15, 0.2, 0.25])
+def test_a_pattern_under_noise_that_does_not_dither_errs_within_its_stated_error(
+    sigma: float, rng: np.random.Generator
+) -> None:
+    """Offsets of 0.5 DN under noise of a fifth of a digital number.
+
+    The mean of rounded numbers is off by up to exp(-2 pi^2 s^2) / pi, with the place of the pixel between two numbers:
+    a pattern of variance exp(-4 pi^2 s^2) / (2 pi^2), 0.010 DN^2 at 0.2 DN, where sampling errs by 0.002 DN^2. It adds
+    to the pattern itself as a bias, so that two stated errors cover it; the error stays below a quarter of the pattern.
+    """
+    offsets = 500 + 0.5 * rng.standard_normal((200, 200))
+    found = stack(rng, offsets, sigma, frames=64).pixel
+    assert abs(found.value - 0.25) < 2 * found.error
+    assert found.error < 0.25 / 4

@@ -63,8 +63,10 @@ def patterns(frames: Iterable[NDArray[np.uint32]]) -> Patterns:
     by_row, by_column = mean.mean(axis=1, keepdims=True), mean.mean(axis=0, keepdims=True)
     of_rows, of_columns = _variance(by_row - everything, rows - 1), _variance(by_column - everything, columns - 1)
     pixels = _variance(mean - by_row - by_column + everything, (rows - 1) * (columns - 1))
-    # Bound of the rounding error in the variance of the pixels' means, where noise does not dither the numbers.
-    undithered = float(np.exp(-4 * np.pi**2 * noise * count)) / (2 * np.pi**2) if pixels.value else UNSEEN_DN2
+    # Bound of the rounding error in the variance of the pixels' means, where noise does not dither the numbers. The
+    # temporal variance of the numbers includes 1/12 of rounding.
+    before_rounding = max(noise * count - 1 / 12, 0.0)
+    undithered = float(np.exp(-4 * np.pi**2 * before_rounding)) / (2 * np.pi**2) if pixels.value else UNSEEN_DN2
     unseen = Quantity(0.0, 0.0 if pixels.value else UNSEEN_DN2)
     return Patterns(
         mean_dn=float(everything),
