@@ -166,3 +166,10 @@ def test_a_bad_value_is_refused_in_one_line(case: str) -> None:
     assert "quickstart.toml" in line
     for mention in mentions:
         assert mention in line, line
+
+
+def test_an_assigned_preset_leaves_no_key_of_the_recipes_preset() -> None:
+    """A phone's preset has a black level and noise that "ideal" has not, and the recipe has a PRNU of its own."""
+    tree = {"sensor": {"preset": "phone-1.2um", "prnu": 0.01}}
+    made = with_presets(tree, ["sensor.preset=ideal", "sensor.bits=14"], "here")
+    assert made["sensor"] == {**preset("sensors", "ideal")["sensor"], "bits": 14}
