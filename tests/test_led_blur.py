@@ -184,11 +184,12 @@ def test_the_kernel_of_an_led_is_within_a_step_of_depth_of_its_own(table1: Scene
 
     The middle pixel of a wide disc is covered whole: its share of the light is 1 / area.
     """
-    camera = Camera(focus_distance_m="infinity", width_px=400, height_px=300, pixel_pitch_um=12.0)
+    camera = Camera(focus_distance_m="infinity", width_px=400, height_px=300, pixel_pitch_um=3.0)
     x, y, z = table1.leds.centers_m[1].tolist()
-    for depth_m in np.linspace(0.15, 0.35, 12):
+    for depth_m in np.linspace(0.16, 0.3, 8):
         kernel = led_blur(table1.leds, PosedCamera(camera, Pose((x, y, z - float(depth_m))))).kernels[1].whole
         assert kernel is not None
+        assert split_for(camera, float(depth_m)) == 1  # LEDs under a narrower blur have kernels of their own
         area = np.pi / 4 * float(defocus_diameter_px(camera, depth_m)) ** 2
         middle = kernel[kernel.shape[0] // 2, kernel.shape[0] // 2]
         assert middle * area == pytest.approx(1.0, abs=0.005 * 1.01)
