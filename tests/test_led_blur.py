@@ -1,10 +1,12 @@
 """LEDs after a narrow blur: against closed forms; sum and centroid of the light; slopes for the bound."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.special import j1
+from test_raycast import room
 
 from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.posed_camera import PosedCamera
@@ -176,3 +178,45 @@ def test_slopes_of_blurred_edges_are_independent_of_the_step(table1: Scene, lens
     # Slopes jump where the edge enters a part: in a share of up to 2e-4 * 16 of the parts, by up to their own size.
     assert np.linalg.norm(small - large) < 2e-4 * 16 * 4 * np.linalg.norm(small)
     assert np.linalg.norm(small) > 0
+
+
+def test_the_kernel_of_an_led_is_within_a_step_of_depth_of_its_own(table1: Scene) -> None:
+    """Focused at infinity the disc's diameter goes with 1 / depth: half of DEPTH_STEP off, its area by twice that.
+
+    The middle pixel of a wide disc is covered whole: its share of the light is 1 / area.
+    """
+    camera = Camera(focus_distance_m="infinity", width_px=400, height_px=300, pixel_pitch_um=3.0)
+    x, y, z = table1.leds.centers_m[1].tolist()
+    for depth_m in np.linspace(0.16, 0.3, 8):
+        kernel = led_blur(table1.leds, PosedCamera(camera, Pose((x, y, z - float(depth_m))))).kernels[1].whole
+        assert kernel is not None
+        assert split_for(camera, float(depth_m)) == 1  # LEDs under a narrower blur have kernels of their own
+        area = np.pi / 4 * float(defocus_diameter_px(camera, depth_m)) ** 2
+        middle = kernel[kernel.shape[0] // 2, kernel.shape[0] // 2]
+        assert middle * area == pytest.approx(1.0, abs=0.005 * 1.01)
+
+
+def test_a_narrow_blur_makes_no_pixel_brighter_than_a_sharp_lens_and_lights_no_hidden_one(tmp_path: Path) -> None:
+    """An LED 40 deg off the axis, where relative illumination is 0.34, half of it behind a board.
+
+    The blur is a mean over places of the LED's sharp image: at most its brightest, and nothing beyond the kernel.
+    """
+    vertices = [(3.0, 3.0), (4.0, 3.0), (4.0, 4.0), (3.0, 4.0)]
+    (tmp_path / "board.obj").write_text("".join(f"v {x} {y} 0\n" for x, y in vertices) + "f 1 3 2\nf 1 4 3\n")
+    scene = room(tmp_path, furniture=[{"file": "board.obj", "position_m": [0.0, 0.0, 3.499]}])
+    renderer = Renderer(scene)
+    pose = Pose((3.0, 3.5 - 2.5 * np.tan(np.radians(40.0)), 1.0))
+    lens = {"width_px": 400, "height_px": 400, "pixel_pitch_um": 80.0}
+    sharp_camera = Camera(**lens)
+    wide_open = Camera(**lens, focus_distance_m="infinity", f_number=1.0)
+    f_number = float(defocus_diameter_px(wide_open, 2.5)) / 0.7
+    camera = Camera(**lens, focus_distance_m="infinity", f_number=f_number)
+    (patch,) = renderer.led_patches(PosedCamera(camera, pose))
+    (sharp,) = renderer.led_patches(PosedCamera(sharp_camera, pose))
+    light = patch.electrons_per_s * (f_number / sharp_camera.f_number) ** 2  # of the same pupil
+    assert light.sum() == pytest.approx(sharp.electrons_per_s.sum(), rel=1e-9)
+    assert light.max() <= sharp.electrons_per_s.max() * (1 + 1e-9)
+    lit = np.nonzero(sharp.electrons_per_s.any(axis=0))[0] + sharp.column
+    blurred = np.nonzero((light > 1e-9 * light.max()).any(axis=0))[0] + patch.column
+    # a disc of 0.7 px reaches one pixel farther
+    assert blurred.max() <= lit.max() + 1

@@ -184,3 +184,10 @@ def test_an_accelerometer_and_a_sensor_have_presets_of_their_own() -> None:
     assert made["sensor"] == preset("sensors", "industrial")["sensor"]
     with pytest.raises(InputError, match=r'^here: accelerometer\.preset = "industrial": unknown; presets of accelero'):
         with_presets({"accelerometer": {"preset": "industrial"}}, [], "here")
+
+
+def test_an_assigned_preset_leaves_no_key_of_the_recipes_preset() -> None:
+    """A phone's preset has a black level and noise that "ideal" has not, and the recipe has a PRNU of its own."""
+    tree = {"sensor": {"preset": "phone-1.2um", "prnu": 0.01}}
+    made = with_presets(tree, ["sensor.preset=ideal", "sensor.bits=14"], "here")
+    assert made["sensor"] == {**preset("sensors", "ideal")["sensor"], "bits": 14}

@@ -99,3 +99,13 @@ def test_each_frame_is_estimated_by_itself(made: Path) -> None:
     found = [(row.position_m, true["position_m"]) for row, true in zip(rows, truth, strict=True) if row.position_m]
     assert len(found) >= 4
     assert max(np.linalg.norm(np.subtract(a, b)) for a, b in found) < 0.02
+
+
+@pytest.mark.parametrize("tilt_y", [90.0, -90.0])
+def test_pose_of_a_camera_in_gimbal_lock_has_its_rotation(tilt_y: float, rng: np.random.Generator) -> None:
+    """Turned back and forth, so that the numbers that are 0 in gimbal lock hold the rounding of products, 1e-16."""
+    for tilt_x, yaw, *turn in rng.uniform(-170, 170, (20, 5)):
+        mount = Pose((0, 0, 0), *turn).rotation
+        rotation = mount @ (mount.T @ Pose((0, 0, 0), tilt_x, tilt_y, yaw).rotation)
+        # as above: angles near gimbal lock lose 1e-16 / GIMBAL_LOCK at most
+        assert np.abs(pose_of(np.zeros(3), rotation).rotation - rotation).max() < 1e-7
