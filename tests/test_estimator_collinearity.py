@@ -7,7 +7,7 @@ from estimator_synthetic import Array, View, grid, view_of
 from estimator.camera.pose import Pose
 from estimator.camera.projection import Equidistant, Perspective, Projection
 from estimator.errors import EstimationFailure
-from estimator.solvers.collinearity import fit_pose, position_by_collinearity
+from estimator.solvers.collinearity import fit_pose, position_by_collinearity, starts
 
 CEILING_M = 2.7
 PANEL = grid(5, 4, 0.14, (3, 2, CEILING_M))
@@ -148,3 +148,20 @@ def test_too_few_and_lines_are_refused() -> None:
     line = PANEL[:5]
     with pytest.raises(EstimationFailure, match="position: the LEDs are on one line"):
         position_by_collinearity(line, perspective(view, line), Perspective())
+
+
+@pytest.mark.parametrize("tilts_deg", [(30.0, -22.5), (-30.0, 45.0)])
+def test_the_starts_are_minima_of_the_grid_best_first(tilts_deg: tuple[float, float]) -> None:
+    """The tilt is a point of the grid of 7.5 deg, where leveled spots are similar to the LEDs: the first start is
+    exact. No other minimum is a neighbour of one.
+    """
+    view = view_of((3, 2, CEILING_M), 2.6, *tilts_deg, 40)
+    rays = np.column_stack([perspective(view, PANEL), np.ones(len(PANEL))])
+    found = starts(PANEL, rays / np.linalg.norm(rays, axis=1, keepdims=True))
+    np.testing.assert_allclose(found[0].position_m, view.position_m, atol=1e-9)
+    np.testing.assert_allclose(found[0].R_cam_world, view.R_cam_world, atol=1e-9)
+    up = np.array([pose.R_cam_world[:, 2] for pose in found])
+    grid_points = np.degrees(np.column_stack([np.arctan2(up[:, 1], up[:, 2]), -np.arcsin(up[:, 0])])) / 7.5
+    apart = np.abs(grid_points[:, None] - grid_points).max(axis=2) + 10 * np.eye(len(found))
+    assert len(found) > 1
+    assert (apart > 1.5).all()

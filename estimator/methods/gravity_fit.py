@@ -99,8 +99,10 @@ def _from_triples(observations: Observations) -> list[Pose]:
             R_cam_world = np.asarray(Rotation.from_rotvec(vector.ravel()).as_matrix())
             pose = Pose(-R_cam_world.T @ shift.ravel(), R_cam_world)
             offset = centroid_images(pose, observations.leds_m, observations.lift_m2)[0] - observations.image
-            error = np.minimum((offset**2).sum(axis=1), gate2).sum()
-            ranked.append((float(error), len(ranked), pose))
+            error = float(np.minimum((offset**2).sum(axis=1), gate2).sum())
+            # Of three LEDs on one line the solver may return NaN, which has no place in an order.
+            if np.isfinite(error):
+                ranked.append((error, len(ranked), pose))
     return [pose for *_, pose in islice(sorted(ranked, key=lambda one: one[:2]), MAX_TRIPLE_STARTS)]
 
 
