@@ -151,3 +151,11 @@ def test_the_last_code_of_the_adc_is_a_digital_number() -> None:
 def test_the_region_of_a_part_is_its_first_and_last_pixel() -> None:
     """3 rows of 5 columns from row 10 and column -2 on: columns -2 to 2, rows 10 to 12."""
     assert region_of(Part(10, -2, np.zeros((3, 5), dtype=np.uint32))).tolist() == [[-2, 10], [2, 12]]
+
+
+def test_ids_of_leds_have_63_bits() -> None:
+    """As int64 columns hold them."""
+    assert DiscLed(id=2**63 - 1, position_m=(0.0, 0.0, 3.0), radius_m=0.05).id == 2**63 - 1
+    for beyond in (2**63, -1):
+        with pytest.raises(ValueError, match="Input should be"):
+            DiscLed(id=beyond, position_m=(0.0, 0.0, 3.0), radius_m=0.05)

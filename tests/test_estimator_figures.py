@@ -53,6 +53,7 @@ def test_failed_frames_are_crosses_in_a_lane_of_their_variant_below_the_axis() -
         (pytest.approx(frame_x[0], abs=0.05), pytest.approx(lanes[1], abs=0.05), "second, frame 0: a: b")
     ]
     assert tree.get("viewBox") == f"0 0 {WIDTH} {TOP + HEIGHT + 14 + 2 * LANE + BOTTOM}"
+    assert labels(tree)["frame"] == (LEFT + INNER / 2, TOP + HEIGHT + 14 + 2 * LANE + 34)  # in the middle, below all
 
 
 def test_the_bound_of_a_frame_is_a_line_at_its_height() -> None:

@@ -75,3 +75,6 @@ def test_blocks_that_the_frame_does_not_fill_are_left_out_but_one(tmp_path: Path
     sensor = Roi(0, 0, rows, 2400)
     grey = shown(tmp_path, (sensor, np.full((rows, 2400), 9, dtype=np.uint32)), sensor=sensor, white_dn=9)
     assert grey.shape == (shown_rows, 800)
+    sensor = Roi(0, 0, 2400, rows)
+    grey = shown(tmp_path, (sensor, np.full((2400, rows), 9, dtype=np.uint32)), sensor=sensor, white_dn=9)
+    assert grey.shape == (800, shown_rows)
