@@ -62,19 +62,21 @@ def chosen(names: Iterable[str]) -> list[Mutant]:
     """The kept lists; SystemExit where an entry no longer fits its file."""
     wanted = set(names)
     mutants = []
-    for entry in tomllib.loads((HERE / "chosen.toml").read_text())["mutant"]:
-        if wanted and entry["name"] not in wanted:
-            continue
-        source = (ROOT / entry["file"]).read_text()
-        if source.count(entry["old"]) != 1:
-            sys.exit(
-                f"chosen.toml: {entry['name']}: {source.count(entry['old'])} places in {entry['file']}, needed one"
-            )
-        start = source.index(entry["old"])
-        line = source.count("\n", 0, start) + 1 + _first_difference(entry["old"], entry["new"])
-        mutated = source.replace(entry["old"], entry["new"])
-        mutants.append(Mutant(entry["name"], entry["file"], line, mutated, f"{entry['old']} -> {entry['new']}"))
+    for path in sorted(HERE.glob("chosen*.toml")):
+        for entry in tomllib.loads(path.read_text())["mutant"]:
+            if not wanted or entry["name"] in wanted:
+                mutants.append(_of_entry(entry, path.name))
     return mutants
+
+
+def _of_entry(entry: dict[str, str], where: str) -> Mutant:
+    source = (ROOT / entry["file"]).read_text()
+    count = source.count(entry["old"])
+    if count != 1:
+        sys.exit(f"{where}: {entry['name']}: `old` occurs {count} times in {entry['file']}, needed once")
+    line = source.count("\n", 0, source.index(entry["old"])) + 1 + _first_difference(entry["old"], entry["new"])
+    mutated = source.replace(entry["old"], entry["new"])
+    return Mutant(entry["name"], entry["file"], line, mutated, f"{entry['old']} -> {entry['new']}")
 
 
 def _first_difference(old: str, new: str) -> int:
