@@ -6,7 +6,7 @@
 
 Each mutant is one change to one file of a copy of the checkout. The tests that execute the changed line run against it,
 quickest first, up to the first failure: killed. A mutant whose tests all pass survived: a test is missing, or the
-change is equivalent (equivalent.toml says why). Runs go on where they stopped: results are kept in
+change is equivalent (equivalent_*.toml says why). Runs go on where they stopped: results are kept in
 out/mutants/results.jsonl under a hash of the mutated source and of the tests.
 """
 
@@ -234,9 +234,9 @@ def run(mutants: list[Mutant], workers: int) -> int:
             if row["outcome"] == "killed" or row["state"] == state:
                 known[row["digest"]] = row
     explained = {}
-    if (HERE / "equivalent.toml").exists():
-        entries = tomllib.loads((HERE / "equivalent.toml").read_text()).get("mutant", [])
-        explained = {(entry["file"], entry["change"]): entry["why"] for entry in entries}
+    for path in HERE.glob("equivalent*.toml"):
+        entries = tomllib.loads(path.read_text()).get("mutant", [])
+        explained |= {(entry["file"], entry["change"]): entry["why"] for entry in entries}
     lock, outcomes, survivors = threading.Lock(), Counter[str](), []
     try:
         with concurrent.futures.ThreadPoolExecutor(workers) as pool:
