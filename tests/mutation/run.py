@@ -5,7 +5,7 @@
     python tests/mutation/run.py sample --count 150 --seed 7
 
 Each mutant is one change to one file of a copy of the checkout. The tests that execute the changed line run against it,
-quickest first, up to the first failure: killed. A mutant whose tests all pass survived: a test is missing, or the
+those of its module first, then the quickest, up to the first failure: killed. A mutant whose tests all pass survived: a test is missing, or the
 change is equivalent (equivalent_*.toml says why). Runs go on where they stopped: results are kept in
 out/mutants/results.jsonl under a hash of the mutated source and of the tests.
 """
@@ -120,10 +120,14 @@ class Map:
                 lines.setdefault(line, set()).add(test)
 
     def tests(self, file: str, line: int) -> tuple[list[str], float]:
-        """Tests that execute a line, quickest first, and their time; of a line run at import, the whole file's."""
+        """Tests that execute a line, those of its module first, then the quickest, and their time.
+
+        For a line that runs at import, the tests of the whole file.
+        """
         lines = self._rows.get(file, {})
         near = lines.get(line) or set().union(*lines.values()) if lines else set()
-        ordered = sorted(near, key=lambda test: (self._times.get(test, 1.0), test))
+        module = Path(file).stem
+        ordered = sorted(near, key=lambda test: (module not in test.split("::")[0], self._times.get(test, 1.0), test))
         total, taken = 0.0, []
         for test in ordered:
             total += self._times.get(test, 1.0)
