@@ -5,9 +5,9 @@
     python tests/mutation/run.py sample --count 150 --seed 7
 
 Each mutant is one change to one file of a copy of the checkout. The tests that execute the changed line run against it,
-those of its module first, then the quickest, up to the first failure: killed. A mutant whose tests all pass survived: a test is missing, or the
-change is equivalent (equivalent_*.toml says why). Runs go on where they stopped: results are kept in
-out/mutants/results.jsonl under a hash of the mutated source and of the tests.
+those of its module first, then the quickest, up to the first failure: killed. A mutant whose tests all pass survived:
+a test is missing, or the change is equivalent (equivalent_*.toml says why). Runs go on where they stopped: results are
+kept in out/mutants/results.jsonl under a hash of the mutated source and of the tests.
 """
 
 import argparse
@@ -108,16 +108,21 @@ class Map:
             sys.exit("no map of tests yet: run `python tests/mutation/run.py map` first")
         self._times = json.loads((OUT / "times.json").read_text())
         self._rows: dict[str, dict[int, set[str]]] = {}
+        of_file: dict[str, set[str]] = {}
+        for test in self._times:
+            of_file.setdefault(test.split("::")[0], set()).add(test)
         connection = sqlite3.connect(OUT / "coverage.sqlite")
         contexts = dict(connection.execute("select id, context from context"))
         query = "select path, context_id, numbits from line_bits join file on file.id = line_bits.file_id"
         for path, context, bits in connection.execute(query):
-            test = contexts[context].split("|")[0]
+            test, _, phase = contexts[context].partition("|")
             if not test:
                 continue
+            # What a fixture of a module or a session executes stands under the first test that needs it alone.
+            tests = of_file[test.split("::")[0]] if phase == "setup" else {test}
             lines = self._rows.setdefault(str(Path(path).resolve().relative_to(ROOT)), {})
             for line in (8 * i + bit for i, byte in enumerate(bits) for bit in range(8) if byte >> bit & 1):
-                lines.setdefault(line, set()).add(test)
+                lines.setdefault(line, set()).update(tests)
 
     def tests(self, file: str, line: int) -> tuple[list[str], float]:
         """Tests that execute a line, those of its module first, then the quickest, and their time.
