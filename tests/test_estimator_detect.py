@@ -246,3 +246,70 @@ def test_the_support_contains_all_light_of_a_blurred_led(blur_px: int) -> None:
     (spot,) = spots_of(image)
     off = np.array([spot.u_px, spot.v_px]) - [(light * u).sum() / light.sum(), (light * v).sum() / light.sum()]
     assert (np.abs(off) < 0.2 * np.sqrt(np.diag(spot.covariance_px2))).all()
+
+
+def test_scatter_includes_the_photo_response_nonuniformity() -> None:
+    """20 000 e and 5 %: a pixel's variance is 20 000 of shot noise and 1 000 000 of its own response. The sum over n
+    centroids is 2 n +- sqrt(4 n), as above.
+    """
+    view = view_of((3, 3, 3), 3.0, 20, 10, size=(70, 60, 1500.0))
+    expected = render(view, np.array([[3.001, 3.0, 3.0]]), led_e=20000.0)
+    (clean,) = spots_of(expected)
+    rng = np.random.default_rng(4)
+    n, total = 200, 0.0
+    for _ in range(n):
+        response = 1 + 0.05 * rng.standard_normal(expected.shape)
+        image = rng.poisson(expected * response).astype(np.float32)
+        (spot,) = detect([Readout(0, 0, image, image, np.zeros(image.shape, bool), prnu=0.05)], image.size, 0)
+        error = np.array([spot.u_px - clean.u_px, spot.v_px - clean.v_px])
+        total += error @ np.linalg.inv(spot.covariance_px2) @ error
+    assert abs(total / (2 * n) - 1) < 5 * np.sqrt(4 * n) / (2 * n)
+
+
+def test_a_floor_counts_as_much_as_background() -> None:
+    """700 e of light have a variance of 700 e^2, and so has a floor of that: the centroid's covariance is the same."""
+    image = np.full((60, 60), 100.0, dtype=np.float32)
+    image[25:34, 20:29] = 1100.0
+    none = np.zeros(image.shape, bool)
+    (quiet,) = detect([Readout(0, 0, image, image, none)], image.size, 0)
+    (floor,) = detect([Readout(0, 0, image, image, none, floor_e2=700.0)], image.size, 0)
+    (light,) = detect([Readout(0, 0, image + 700, image + 700, none)], image.size, 0)
+    np.testing.assert_allclose(floor.covariance_px2, light.covariance_px2, rtol=1e-6, atol=1e-12)
+    # The square's own: the sum of (u - u0)^2 is 9 x 60, times 1100 e, over the flux squared; the margin adds to it.
+    assert (np.diag(quiet.covariance_px2) > 540 * 1100.0 / (81 * 1000.0) ** 2).all()
+
+
+@pytest.mark.parametrize(("led_e", "found"), [(36.0, 0), (46.0, 1)])
+def test_a_spot_has_a_signal_of_five_sigma(led_e: float, found: int) -> None:
+    """A square of 7 x 7 pixels before 1000 e: its flux is 49 led_e. Half of the upper quartile of its 5 x 5 mean is a
+    level of 0.3, which 69 pixels reach; the support is about the disc of that area and 0.5 + 2 px around it, 162 pixels
+    of 1000 e. 36 e are 4.4 sigma and 46 e are 5.5 sigma: below five, the noise moves a centroid by the support's radius
+    over that ratio, more than a pixel.
+    """
+    image = np.full((60, 60), 1000.0)
+    image[25:32, 20:27] += led_e
+    support_px = np.pi * (np.sqrt(69 / np.pi) + 2.5) ** 2
+    ratio = 49 * led_e / np.sqrt(support_px * 1000 + 49 * led_e)
+    assert (ratio > 5) == bool(found)
+    if found:
+        (spot,) = spots_of(image)
+        assert spot.area_px == 69
+    else:
+        with pytest.raises(EstimationFailure, match="detect: no spot"):
+            spots_of(image)
+
+
+def test_the_margin_holds_the_blur_that_the_smoothing_hides() -> None:
+    """A blur of up to half of the 5 x 5 mean widens a blob by nothing that is told from the mean's own fringe, and only
+    the margin holds its light. The support then has all light: what is left is the rounding of float32 electrons.
+    """
+    view = view_of((3, 3, 3), 3.0, 60.0, 0.0, 30.0, size=(200, 150, 9000.0))
+    sharp = render(view, np.array([[3.0001, 3.0002, 3.0]]), radius_m=0.012)
+    y, x = np.mgrid[-2:3, -2:3]
+    kernel = (x**2 + y**2 <= 4).astype(float)
+    image = cv2.filter2D(sharp, -1, kernel / kernel.sum())
+    light = image - 40
+    v, u = np.mgrid[: view.height_px, : view.width_px] + 0.5
+    (spot,) = spots_of(image)
+    assert spot.u_px == pytest.approx((light * u).sum() / light.sum(), abs=1e-5)
+    assert spot.v_px == pytest.approx((light * v).sum() / light.sum(), abs=1e-5)

@@ -1,9 +1,12 @@
 """Likelihood: information and gradient by the full information matrix, and amplitudes of simulated frames."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from estimator_synthetic import grid, poisson, render, view_of
 from numpy.typing import NDArray
+from scipy.stats import chi2
 from test_estimator_maximum_likelihood import frame_of
 
 from estimator.camera.pose import Pose
@@ -101,3 +104,94 @@ def test_leds_whose_image_is_uncertain_are_left_out() -> None:
     pixels = gather_led_pixels(frame, true_pose(frame), spread)
     assert len(pixels.leds) == 3
     assert pixels.more
+
+
+def test_the_noise_of_a_dark_pixel_by_hand() -> None:
+    """3 e/DN: dark signal nonuniformity 4 e, read noise 12 e, the ADC's 2 DN are 6 e, rounding is 3 / sqrt(12) e, rows
+    differ by 5 e and columns by 7 e. The full well of 6000 e is 2000 DN above the black level of 64.
+    """
+    frame = frame_of(VIEW, SIX, np.zeros((300, 400), dtype=np.uint32))
+    values = {
+        **{"noise": "full", "gain_e_per_dn": 3.0, "dsnu_e": 4.0, "read_noise_e": 12.0, "adc_noise_dn": 2.0},
+        **{"row_offset_e": 5.0, "column_offset_e": 7.0, "prnu": 0.05, "black_level_dn": 64.0, "full_well_e": 6000.0},
+    }
+    noise = Noise.of(replace(frame, sensor=frame.sensor.model_copy(update=values)))
+    assert noise.dark_e2 == pytest.approx(16 + 144 + 36 + 9 / 12 + 25 + 49)
+    assert noise.prnu2 == pytest.approx(0.0025)
+    # Four standard deviations of the noise that is added after clipping: read noise, offsets and the ADC's.
+    assert noise.saturation_e == pytest.approx(6000 - 4 * np.sqrt(144 + 25 + 49 + 36))
+
+
+def test_halos_that_touch_do_not_add_up() -> None:
+    """Two faces of 5 px radius, 6 px apart, the second ten times brighter: the ring about the first holds half of the
+    second, whose pixels are left out. Without noise the amplitudes are the ones rendered, to four times the mean over
+    a hundred edge pixels of 0.3 / 100^1.5 of 40 000 e, 1.2 e.
+    """
+    view = view_of(TARGET, 3.0, 0.0, 0.0, 0.0)
+    leds = np.array(TARGET) + [[-0.016, 0.0, 0.0], [0.016, 0.0, 0.0]]
+    image = np.rint(render(view, leds, 0.01, [4040.0, 40040.0], samples=100)).astype(np.uint32)
+    frame = frame_of(view, leds, image)
+    pixels = gather_led_pixels(frame, Pose(np.array(view.position_m), view.R_cam_world), SURE)
+    photometry = fit_photometry(pixels, pixels.rendered, np.ones(2, dtype=bool), Noise.of(frame))
+    for _ in range(3):
+        photometry = fit_photometry(pixels, pixels.rendered, np.ones(2, dtype=bool), Noise.of(frame), photometry)
+    assert photometry.amplitude == pytest.approx([4000.0, 40000.0], abs=5.0)
+    # And the darkest pixels, the background's mean, are expected to be that.
+    dark = pixels.pixel_counts > 30
+    background = (photometry.expected / pixels.pixel_counts)[dark & (photometry.light < 1e-6)]
+    assert background == pytest.approx(np.full(2, 40.0), abs=0.5)
+
+
+@pytest.mark.parametrize("aside", [(0.9, 0.0), (0.0, 0.9), (-0.6, 0.7)])
+def test_a_face_dims_away_from_the_axis_along_both_axes_of_the_image(aside: tuple[float, float]) -> None:
+    """Each edge pixel's light follows cos^4 of its own angle, 1 at the face's centre. Second order over the 8 px that
+    edge pixels are off it, of 1500: some 10 (8 / 1500)^2 = 3e-4, of effects of up to 4 x 0.3 x 8 / 1500 = 6e-3.
+    """
+    view = view_of(TARGET, 3.0, 0.0, 0.0, 0.0, size=(1200, 1200, 1500.0))
+    led = np.array([TARGET]) + [[*aside, 0.0]]
+    frame = frame_of(view, led, np.zeros((1200, 1200), dtype=np.uint32))
+    pixels = gather_led_pixels(frame, Pose(np.array(view.position_m), view.R_cam_world), SURE)
+    rois, (u, v) = pixels.model.rois, view.project(led)[0]
+    row, column = np.divmod(pixels.cells, rois.widths[0] + 1)
+    at = np.column_stack([column + rois.columns[0], row + rois.rows[0]]) + 0.5
+
+    def cos4(points: Floats) -> Floats:
+        return np.asarray(1 / (1 + (((points - 600) / 1500) ** 2).sum(axis=-1)) ** 2)
+
+    expected = cos4(at) / cos4(np.array([u, v]))
+    assert np.ptp(expected) > 4e-3
+    np.testing.assert_allclose(pixels.weights, expected, atol=3e-4)
+
+
+def test_a_true_led_is_left_out_once_in_100_000() -> None:
+    """An LED's chi-square has a freedom of its readings less two; its own scatter is sqrt(2 freedom), and five of them
+    are exceeded by chance once in 100 000, four ten times as often. Beyond them the model may be wrong at the edge by
+    0.05 of the amplitude A times 4 s (1 - s), s the share covered.
+    """
+    pixels, photometry = explained(drawn(600.0, 1))
+    edges = len(pixels.cells)
+    share, group = pixels.rendered.share[pixels.cells], pixels.group[:edges]
+    readings = np.bincount(pixels.group)
+    freedom = readings - 2
+    wrong_e = 0.05 * photometry.amplitude[group] * 4 * share * (1 - share)
+    allowed = np.bincount(group, wrong_e**2 * photometry.weight[:edges])
+    for sigmas, sign in ((4.9, -1), (5.1, 1)):
+        # All readings off by as many of their standard deviations.
+        off = np.sqrt((freedom + sigmas * np.sqrt(2 * freedom) + allowed) / readings)[pixels.group]
+        electrons = photometry.expected + off / np.sqrt(photometry.weight)
+        excess = excess_chi2(replace(pixels, electrons=electrons), pixels.rendered, photometry)
+        assert (np.sign(excess) == sign).all()
+    assert (chi2.sf(freedom + 5 * np.sqrt(2 * freedom), freedom) < 1e-5).all()
+    assert (chi2.sf(freedom + 4 * np.sqrt(2 * freedom), freedom) > 1e-4).all()
+
+
+@pytest.mark.parametrize(("shift_px", "is_explained"), [(0.03, True), (0.1, False)])
+def test_a_bright_led_may_be_displaced_by_a_twentieth_of_a_pixel(shift_px: float, is_explained: bool) -> None:
+    """A shift d changes an edge pixel by d |cos| of the amplitude, d^2 / 2 squared and averaged over the rim; the model
+    error is 0.05^2 16 s^2 (1 - s)^2, 0.05^2 16 / 30 averaged over shares. They are equal at d = 0.05 px.
+    """
+    frame = frame_of(VIEW, SIX, np.rint(render(VIEW, SIX, 0.01, 4000.0, samples=48)).astype(np.uint32))
+    pose = true_pose(frame).moved(np.array([0.0, 0.0, 0.0, shift_px / 1500, 0.0, 0.0]), frame.camera)
+    pixels = gather_led_pixels(frame, pose, SURE)
+    photometry = fit_photometry(pixels, pixels.rendered, np.ones(6, dtype=bool), Noise.of(frame))
+    assert ((excess_chi2(pixels, pixels.rendered, photometry) < 0) == is_explained).all()

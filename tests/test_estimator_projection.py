@@ -132,3 +132,12 @@ def test_undistortion_has_no_direction_beyond_the_fold_and_finds_all_before_it()
     # At the fold an error of the residual, 1e-12, is multiplied by 1 / (1 - 3 r^2 / 2), 63 at 0.81.
     np.testing.assert_allclose(rays[:, 0] / rays[:, 2], r, atol=1e-10)
     assert np.isnan(barrel.unproject(np.array([[0.55, 0.0]]))).all()
+
+
+def test_an_image_that_is_mirrored_through_the_centre_is_no_image() -> None:
+    """s(r) = 1 - 4 r^2 + 2.9 r^4 is -0.1 at r = 1, while the radius r s(r) grows again, by 1 - 12 + 14.5: a lens images
+    nothing on the other side of its axis.
+    """
+    wild = Perspective(Distortion(k1=-4.0, k2=2.9, k3=0.0, p1=0.0, p2=0.0))
+    image = wild.project(np.array([[1.0, 0.0, 1.0], [0.0, -1.0, 1.0], [0.1, 0.0, 1.0]]))[0]
+    assert np.isnan(image).all(axis=1).tolist() == [True, True, False]

@@ -99,3 +99,13 @@ def test_a_measured_kernel_is_used_unchanged() -> None:
     # Its mean is the measured one's: (0.1 - 0.2, 0.2 - 0.1).
     assert (fine * u).sum() == pytest.approx(-0.1)
     assert (fine * v).sum() == pytest.approx(0.1)
+
+
+def test_the_airy_pattern_grows_with_the_image_distance() -> None:
+    """Focused at 0.5 m an 18 mm lens has its sensor at 1 / (1 / 18 - 1 / 500) mm, and the pupil of 18 mm / 22 under a
+    smaller angle: the pattern is lambda f_i / D, 3.7 % wider than lambda N.
+    """
+    image_mm = 1 / (1 / 18 - 1 / 500)
+    close = camera(psf="diffraction", f_number=22.0, focus_distance_m=0.5, image_distance_mm=image_mm)
+    assert airy_scale_px(close) == pytest.approx(0.55 * image_mm / (18 / 22) / 1.2)
+    assert airy_scale_px(close) / airy_scale_px(camera(psf="diffraction", f_number=22.0)) > 1.037

@@ -6,17 +6,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from estimator_correspondences import device, simulated
-from estimator_synthetic import Array, grid, view_of
+from estimator_synthetic import Array, View, grid, view_of
 
 from estimator.camera.pose import Pose
 from estimator.errors import EstimationFailure
-from estimator.io.device import Distortion
+from estimator.io.device import DeviceFrame, Distortion
 from estimator.solvers.reprojection import (
     centroid_images,
     corrected_for_eccentricity,
     fit,
     observe,
 )
+from estimator.spots.identify import Correspondence
 
 RADIUS_M = 0.03
 LED_M = np.array([[3.0, 3.2, 3.4]])
@@ -118,20 +119,12 @@ def barrel(rays: Array) -> Array:
 BARREL = Distortion(k1=-0.12, k2=0.0, k3=0.0, p1=0.0, p2=0.0)
 
 
-@pytest.mark.parametrize(
-    ("lens", "changes"),
-    [
-        pytest.param(fish_eye, {"projection": "equidistant"}, id="fish-eye"),
-        pytest.param(barrel, {"distortion": BARREL}, id="barrel"),
-    ],
-)
-def test_eccentricity_by_a_lens_is_corrected(lens: Callable[[Array], Array], changes: dict[str, object]) -> None:
-    """Centroids on the sensor, summed up over discs of 2 cm, 2 m away, by the light that a cosine of the axis times a
-    solid angle gathers. What is left goes with (r / h)^4 = 1e-8 of 2 m, which the pattern makes some hundred times
-    more: 2 um. Left alone, (r / h)^2 = 1e-4 of a plane that is bent by a tenth makes some tens of micrometres.
+def bent_spots(
+    view: View, leds: Array, lens: Callable[[Array], Array], changes: dict[str, object]
+) -> tuple[DeviceFrame, list[Correspondence]]:
+    """Discs of 2 cm through a lens: centroids on the sensor, by the light that a cosine of the axis times a solid angle
+    gathers.
     """
-    leds = grid(3, 3, 0.6, (3, 3.2, 3.4))
-    view = view_of((3, 3.2, 3.4), 2.0, 15, -10, 30, (4000, 3000, 1500.0))
     offsets = np.column_stack([face("disc")[::4], np.zeros(len(face("disc")[::4]))])
     offsets[:, :2] -= offsets[:, :2].mean(axis=0)
     points = leds[:, None] + 0.02 * offsets - view.position_m
@@ -148,6 +141,24 @@ def test_eccentricity_by_a_lens_is_corrected(lens: Callable[[Array], Array], cha
         )
         for one, (u, v) in zip(simulated(view, leds, 0.01), pixels, strict=True)
     ]
+    return frame, seen
+
+
+@pytest.mark.parametrize(
+    ("lens", "changes"),
+    [
+        pytest.param(fish_eye, {"projection": "equidistant"}, id="fish-eye"),
+        pytest.param(barrel, {"distortion": BARREL}, id="barrel"),
+    ],
+)
+def test_eccentricity_by_a_lens_is_corrected(lens: Callable[[Array], Array], changes: dict[str, object]) -> None:
+    """Centroids on the sensor, summed up over discs of 2 cm, 2 m away, by the light that a cosine of the axis times a
+    solid angle gathers. What is left goes with (r / h)^4 = 1e-8 of 2 m, which the pattern makes some hundred times
+    more: 2 um. Left alone, (r / h)^2 = 1e-4 of a plane that is bent by a tenth makes some tens of micrometres.
+    """
+    leds = grid(3, 3, 0.6, (3, 3.2, 3.4))
+    view = view_of((3, 3.2, 3.4), 2.0, 15, -10, 30, (4000, 3000, 1500.0))
+    frame, seen = bent_spots(view, leds, lens, changes)
     observed = observe(frame, seen)
     start = Pose(np.array(view.position_m), view.R_cam_world)
     bent = fit(observed, start).pose

@@ -41,6 +41,9 @@ MAX_STEP_PX = 1.0
 # A step that multiplies the mean deviance by more was too long. Smaller increases occur when readings near saturation
 # enter or leave.
 MAX_DEVIANCE_RATIO = 1.01
+# A step that takes back more than this share of the one before overshoots and is halved: where an edge enters a pixel,
+# the likelihood is curved more than the information says, and full steps would go back and forth for ever.
+MAX_RETURN = 0.5
 # Signal-to-noise ratio of an LED's amplitude below which it is not used.
 MIN_SIGNAL_TO_NOISE = 5.0
 # Among LEDs that are not explained, those with at least this share of the largest excess are excluded together.
@@ -179,7 +182,9 @@ def _fisher_scoring(frame: DeviceFrame, pixels: LedPixels, gravity: Gravity, use
         photometry, accepted, min_deviance = candidate, pose, deviance
         information, gradient = score(pixels, rendered, photometry)
         information, gradient = information + gravity.information(), gradient + gravity.gradient(angles)
-        step = _solved(information, gradient)
+        before, step = step, _solved(information, gradient)
+        if step @ information @ before < -MAX_RETURN * (before @ information @ before):
+            step = step / 2
         centres = project(centres_m, pose, camera)
         step *= min(1.0, MAX_STEP_PX / max(float(np.linalg.norm(centres.slopes @ step, axis=1).max()), 1e-12))
         converged = float(step @ information @ step) < CONVERGED_STEP2

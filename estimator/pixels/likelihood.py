@@ -30,7 +30,7 @@ MIN_VARIANCE_E2 = 1e-3
 # Relative determinant below which readings do not determine amplitude and background; they are then not used.
 MIN_DETERMINANT = 1e-9
 # Limit of an LED's chi-square: its degrees of freedom, its own scatter in standard deviations, and a model error of the
-# edge, at most this share of the LED's light: by an inaccurate blur of the lens, or a shift of 0.1 px.
+# edge, at most this share of the LED's light: by an inaccurate blur of the lens, or a shift of 0.05 px.
 CHI2_SIGMA = 5.0
 MODEL_ERROR_SHARE = 0.05
 

@@ -1,0 +1,173 @@
+"""Robust fit: which spots are outliers, when covariances are widened, and minima that are told apart."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from estimator_correspondences import device, simulated
+from estimator_synthetic import Array, grid, view_of
+from test_estimator_reprojection import bent_spots, fish_eye
+
+from estimator.camera.pose import Pose, rotation
+from estimator.errors import EstimationFailure
+from estimator.methods.gravity_fit import agreement, ambiguous
+from estimator.solvers.reprojection import Fit, Observations, observe
+from estimator.solvers.robust_fit import Consensus, consensus, minima
+
+LEDS = grid(3, 3, 0.3, (3, 2, 3.0))
+VIEW = view_of((3, 2, 3.0), 2.8, 25, -15, 40, (4000, 3000, 3000.0))
+TRUTH = Pose(np.array(VIEW.position_m), VIEW.R_cam_world)
+LIMIT = 2 * np.log(1e6)
+"""Chi-square of two degrees of freedom exceeds x with the probability exp(-x / 2): one spot in a million this."""
+
+
+def observed(offsets_px: Array, sigma_px: Array, error_deg: float = 0.1) -> Observations:
+    """LEDS seen from VIEW, spots (9,) with offsets (9, 2) from their true pixels, and the sigma that each states."""
+    spots = [
+        replace(
+            one,
+            spot=replace(
+                one.spot, u_px=one.spot.u_px + du, v_px=one.spot.v_px + dv, covariance_px2=sigma**2 * np.eye(2)
+            ),
+        )
+        for one, (du, dv), sigma in zip(simulated(VIEW, LEDS), offsets_px, sigma_px, strict=True)
+    ]
+    return observe(device(VIEW, error_deg), spots)
+
+
+def agreed(observations: Observations) -> Consensus:
+    return consensus(observations, [TRUTH], list)
+
+
+def fitted(cost: float, spots_chi2: Array, tilt_chi2: float = 0.0) -> Fit:
+    return Fit(TRUTH, cost, spots_chi2, tilt_chi2, np.diag([1.0, 2.0, 3.0]))
+
+
+@pytest.mark.parametrize(("spots", "gravity"), [(3, True), (4, False)])
+def test_the_covariance_is_widened_where_chance_is_one_in_a_million(spots: int, gravity: bool) -> None:
+    """Two numbers a spot and two of gravity, less six of the pose: two degrees of freedom either way."""
+    for total, scale in ((0.99 * LIMIT, 1.0), (1.01 * LIMIT, 1.01 * LIMIT / 2)):
+        best = fitted(total, np.full(spots, (total - 2 * gravity) / spots), 2.0 * gravity)
+        found = Consensus(best, (), np.ones(spots, dtype=bool), gravity).covariance_m2
+        np.testing.assert_allclose(found, np.diag([1.0, 2.0, 3.0]) * scale, rtol=1e-12)
+
+
+def test_three_spots_alone_cannot_widen_their_covariance() -> None:
+    """Six numbers for six parameters leave nothing to judge by."""
+    lone = Consensus(fitted(1e3, np.full(3, 300.0)), (), np.ones(3, dtype=bool), gravity=False)
+    np.testing.assert_allclose(lone.covariance_m2, np.diag([1.0, 2.0, 3.0]))
+
+
+@pytest.mark.parametrize(("sigma_px", "what"), [(1.0, "noise"), (0.05, "the image model")])
+def test_a_spot_is_left_out_beyond_its_noise_and_the_model_s_error(sigma_px: float, what: str) -> None:
+    """The other spots state a thousandth of a pixel and fix the pose; this one is off by more or less than the limit.
+
+    0.1 px is what detection's centroids may be off behind the edge of a wall (test_estimator_detect), and a twentieth
+    of what an LED of 5 px radius is moved by that is half hidden, 4 r / 3 pi.
+    """
+    limit_px = np.sqrt(LIMIT * (sigma_px**2 + 0.1**2))
+    sigmas = np.full(9, 1e-3)
+    sigmas[4] = sigma_px
+    for share in (0.98, 1.02):
+        offsets = np.zeros((9, 2))
+        offsets[4] = share * limit_px * np.array([0.6, -0.8])
+        found = agreed(observed(offsets, sigmas))
+        expected = np.ones(9, dtype=bool)
+        expected[4] = share < 1
+        np.testing.assert_array_equal(found.inliers, expected, err_msg=what)
+        assert len(found.best.spots_chi2) == expected.sum()
+
+
+def test_true_spots_are_not_left_out() -> None:
+    """450 spots with normal errors of 1 px: one of a million is an outlier, so 4 in 10 000 such tests have one."""
+    rng = np.random.default_rng(5)
+    for _ in range(50):
+        found = agreed(observed(rng.standard_normal((9, 2)), np.ones(9)))
+        assert found.inliers.all()
+
+
+def test_two_wrong_spots_are_left_out_and_the_position_is_that_of_the_others() -> None:
+    """One off by 1 px, one by 30 px: the second alone moves a fit of all by pixels, so that true spots look wrong."""
+    offsets = np.zeros((9, 2))
+    offsets[2], offsets[7] = (1.0, 0.0), (-18.0, 24.0)
+    found = agreed(observed(offsets, np.full(9, 0.02)))
+    assert np.flatnonzero(~found.inliers).tolist() == [2, 7]
+    # Exact pixels of the others; 1e-4 px of them are some 1e-7 m.
+    np.testing.assert_allclose(found.best.pose.position_m, VIEW.position_m, atol=1e-7)
+
+
+def test_the_worst_spot_alone_is_removed() -> None:
+    """Two spots off by 3 and 5 px to one side: the robust fit leaves out the second alone, and a fit of the others does
+    not explain the first.
+    """
+    offsets = np.zeros((9, 2))
+    offsets[3], offsets[6] = (4.1, -2.8), (2.9, -0.8)
+    found = agreed(observed(offsets, np.full(9, 0.2)))
+    assert np.flatnonzero(~found.inliers).tolist() == [3, 6]
+
+
+@pytest.mark.parametrize("spots", [8, 9])
+def test_four_spots_are_not_most_of_eight(spots: int) -> None:
+    """The other four or five are anywhere: no more than half of all agree on a pose."""
+    rng = np.random.default_rng(2)
+    offsets = np.zeros((9, 2))
+    offsets[[1, 3, 5, 7, 4]] = rng.uniform(-60, 60, (5, 2))
+    chosen = np.arange(9) != (4 if spots == 8 else 9)
+    with pytest.raises(EstimationFailure, match="position: no pose explains gravity and most of the spots"):
+        agreed(observed(offsets, np.full(9, 0.02)).only(chosen))
+    offsets[[4, 5]] = 0
+    assert np.flatnonzero(~agreed(observed(offsets, np.full(9, 0.02))).inliers).tolist() == [1, 3, 7]
+
+
+def test_three_spots_do_not_outvote_a_fourth() -> None:
+    """Three spots fit some pose whichever they are: a fourth that does not fit it may be the only right one."""
+    offsets = np.zeros((9, 2))
+    offsets[8] = (20.0, 10.0)
+    corners = np.isin(np.arange(9), [0, 2, 6, 8])
+    with pytest.raises(EstimationFailure, match="position: no pose explains gravity and most of the spots"):
+        agreed(observed(offsets, np.full(9, 0.02), 1e-3).only(corners))
+
+
+def test_a_wrong_reading_of_gravity_is_left_out() -> None:
+    """Off by 2 deg, said to be good to 0.1 deg, and 9 spots of 0.02 px that fix the tilt to a hundredth of that."""
+    seen = observed(np.zeros((9, 2)), np.full(9, 0.02))
+    wrong = replace(seen, tilt_rad=seen.tilt_rad + np.radians([2.0, 0.0]))
+    with pytest.raises(EstimationFailure, match="position: no pose explains gravity"):
+        agreed(wrong)
+    found = agreement(wrong)
+    assert not found.gravity
+    assert agreement(seen).gravity
+    np.testing.assert_allclose(found.best.pose.position_m, VIEW.position_m, atol=1e-7)
+
+
+def test_one_minimum_is_given_once_and_the_best_first() -> None:
+    """Starts on all sides lead to the true pose, and to the second one of a plane, which gravity makes worse."""
+    small = grid(2, 2, 0.06, (3, 2, 3.0))
+    view = view_of((3, 2, 3.0), 3.0, 15, 0, 10, (800, 600, 3000.0))
+    seen = observe(device(view, 20.0), simulated(view, small, 0.1))
+    starts = [
+        Pose(np.array(view_of((3, 2, 3.0), 3.0, tilt, 0, 10).position_m), rotation(*np.radians([tilt, 0, 10])))
+        for tilt in (14.0, -14.0, 15.5, -16.0)
+    ]
+    found = minima(seen, starts[::-1])
+    assert len(found) == 2
+    assert found[0].cost < found[1].cost
+    np.testing.assert_allclose(found[0].pose.position_m, view.position_m, atol=1e-6)
+
+
+def test_centroids_of_a_lens_that_bends_are_corrected() -> None:
+    """A fish-eye, discs of 2 cm, 2 m away: 2 um are left, and some tens without the correction, as is derived in
+    test_estimator_reprojection.
+    """
+    leds = grid(3, 3, 0.6, (3, 3.2, 3.4))
+    view = view_of((3, 3.2, 3.4), 2.0, 15, -10, 30, (4000, 3000, 1500.0))
+    frame, spots = bent_spots(view, leds, fish_eye, {"projection": "equidistant"})
+    found = consensus(observe(frame, spots), [Pose(np.array(view.position_m), view.R_cam_world)], list)
+    assert np.linalg.norm(found.best.pose.position_m - view.position_m) < 2e-6
+
+
+@pytest.mark.parametrize(("share", "expected"), [(0.98, True), (1.02, False)])
+def test_a_minimum_of_a_hundredth_of_the_likelihood_is_ambiguous(share: float, expected: bool) -> None:
+    """The likelihood goes with exp(-cost / 2): a hundredth at a cost higher by 2 ln 100."""
+    other = fitted(3.0 + share * 2 * np.log(100), np.ones(4))
+    assert ambiguous(Consensus(fitted(3.0, np.ones(4)), (other,), np.ones(4, dtype=bool), True)) is expected
