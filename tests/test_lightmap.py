@@ -182,7 +182,7 @@ def test_daylight_through_glazing_agrees_with_form_factors(tmp_path: Path) -> No
                 a / np.sqrt(1 + a * a) * np.arctan(b / np.sqrt(1 + a * a))
                 + b / np.sqrt(1 + b * b) * np.arctan(a / np.sqrt(1 + b * b))
             ) / (2 * np.pi)
-    # a thin pane of index 1.52 reflects F = (0.52 / 2.52)^2 at each face, 2 F / (1 + F) = 8.2 %, to 1e-3 up to 20 deg
+    # thin glazing of index 1.52 reflects F = (0.52 / 2.52)^2 at each face, 2 F / (1 + F) = 8.2 %, to 1e-3 up to 20 deg
     face = (0.52 / 2.52) ** 2
     through = np.pi * 2000 * expected * (1 - 2 * face / (1 + face))
     ambient = scene.settings.ambient.illuminance_lux

@@ -305,7 +305,7 @@ def test_a_reading_that_is_no_number_is_refused_by_name(tmp_path: Path) -> None:
         read_dataset(folder)
 
 
-PANE = """
+GLAZING = """
 [[glazing]]
 wall = "x=0"
 corner_m = [1.0, 0.9]
@@ -316,7 +316,7 @@ luminance_cd_m2 = 40.0
 texel_m = 2.0
 paths = 16
 """
-PANE_POSES = """
+GLAZING_POSES = """
 [poses]
 kind = "list"
 pose = [{ position_m = [1.6, 3.5, 1.2], tilt_x_deg = 5.0, tilt_y_deg = -40.0 }]
@@ -325,10 +325,10 @@ pose = [{ position_m = [1.6, 3.5, 1.2], tilt_x_deg = 5.0, tilt_y_deg = -40.0 }]
 
 def test_specular_reflections_of_the_renderer_are_left_out(tmp_path: Path) -> None:
     """At -40 deg, grazing the glazing, some reflections are bright enough to be detected beside the LEDs."""
-    (tmp_path / "pane.toml").write_text((ROOT / "scenes/office.toml").read_text() + PANE)
+    (tmp_path / "glazing.toml").write_text((ROOT / "scenes/office.toml").read_text() + GLAZING)
     recipe = (ROOT / "datasets/quickstart.toml").read_text().split("[poses]")[0]
-    recipe = recipe.replace("../scenes/office.toml", "pane.toml")
-    (tmp_path / "pane_recipe.toml").write_text(recipe + PANE_POSES)
+    recipe = recipe.replace("../scenes/office.toml", "glazing.toml")
+    (tmp_path / "pane_recipe.toml").write_text(recipe + GLAZING_POSES)
     changes = ["camera.focal_length_mm=6.0", "accelerometer.error_deg=0.0"]
     generate(load_plan(tmp_path / "pane_recipe.toml", changes, scale=4), tmp_path / "set")
     dataset = read_dataset(tmp_path / "set")

@@ -255,4 +255,5 @@ class SceneSettings(Settings):
     furniture: tuple[Furniture, ...] = ()
     """Furniture, one `[[furniture]]` a file."""
     bake: Bake = Bake()
+    """Resolution of the baked light of the room."""
     """Resolution and accuracy of the lightmap."""
