@@ -314,8 +314,9 @@ def accelerometer(measure: Measurement) -> None:
     columns: dict[str, list[str]] = {}
     for error_deg in (0.0, 0.1, 0.5, 2.0):
         folder = _noisy(measure, error_deg)
-        true_m, predicted_m = (np.array(part) for part in zip(*predictions(folder), strict=True))
-        measured_m = np.array([one.position_m for one in measure.estimates(folder, "huynh2016")]) - true_m
+        rows = measure.estimates(folder, "huynh2016")
+        true_m, predicted_m = (np.array(part) for part in zip(*predictions(folder, rows), strict=True))
+        measured_m = np.array([one.position_m for one in rows]) - true_m
         predicted, measured, rest = (
             np.linalg.norm(errors, axis=1) for errors in (predicted_m, measured_m, measured_m - predicted_m)
         )
@@ -330,14 +331,15 @@ def accelerometer(measure: Measurement) -> None:
         row(kind, *cells)
 
 
-def predictions(folder: Path) -> Iterator[tuple[Floats, Floats]]:
-    """True position and error to first order in the tilt's error, (3,) each, of every frame, from exact pixels."""
+def predictions(folder: Path, estimates: Sequence[EstimateRow]) -> Iterator[tuple[Floats, Floats]]:
+    """True position and error to first order in the tilt's error, (3,) each, from exact pixels of the LEDs used."""
     dataset = est.read_dataset(folder)
-    for record, true in zip(dataset.frames, truth_of(folder), strict=True):
+    for record, estimate, true in zip(dataset.frames, estimates, truth_of(folder), strict=True):
         K = dataset.cameras[record.camera].matrix()
-        whole = [led for led in true["leds"] if led["visible_fraction"] == 1]
-        leds_m = np.array([dataset.leds[led["led"]].position_m for led in whole])
-        pixels = np.array([(led["u_px"], led["v_px"]) for led in whole])
+        used = {led_range.led for led_range in estimate.ranges}
+        leds = [led for led in true["leds"] if led["led"] in used]
+        leds_m = np.array([dataset.leds[led["led"]].position_m for led in leds])
+        pixels = np.array([(led["u_px"], led["v_px"]) for led in leds])
 
         def position(tilt: Floats, K: Floats = K, leds_m: Floats = leds_m, pixels: Floats = pixels) -> Floats:
             ranges_m = led_ranges(level(pixels, K, rotation(*tilt)), K, leds_m, law_of_sines)
