@@ -30,7 +30,7 @@ from estimator.spots.denoise import DENOISERS, Denoiser
 from estimator.spots.identify import Correspondence
 
 Floats = NDArray[np.float64]
-UNITS = ((1e9, "1e6 km"), (1e3, "km"), (1.0, "m"), (1e-3, "mm"), (1e-6, "um"))
+UNITS = ((1e3, "km"), (1.0, "m"), (1e-3, "mm"), (1e-6, "um"))
 REGIONS = {"regions.kind": "leds"}
 EXACT = {"accelerometer.error_deg": 0.0}
 TABLE1_DRAWS = 30
