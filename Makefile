@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: check demo test lint docs bench mutants clean
+.PHONY: check demo test lint docs figures bench mutants clean
 
 demo: $(READY)
 	$(BIN)/vlcrender generate datasets/quickstart.toml --out out/quickstart
@@ -27,6 +27,9 @@ docs: $(READY)
 	$(BIN)/python docs/make_reference.py
 	$(BIN)/python docs/make_api.py
 	$(BIN)/python docs/make_notebooks.py
+
+figures: $(READY)
+	$(BIN)/python docs/measure.py
 
 bench: $(READY)
 	$(BIN)/python benchmarks/full_frame.py
