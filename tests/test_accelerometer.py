@@ -226,6 +226,7 @@ def test_bad_values_are_refused_by_name(assignment: str) -> None:
         assert mention in str(refusal.value)
 
 
+@pytest.mark.slow
 def test_a_part_in_a_dataset(tmp_path: Path) -> None:
     """The reading with its errors goes to the device's table, the pose without them to the truth's."""
     part = [f"accelerometer.{key}" for key in ("preset=bmi270", "serial=4", "noise_density_ug_rthz=0")]

@@ -198,6 +198,7 @@ def test_bound_agrees_with_the_information_of_moving_edges(
     assert_same_bound(bound, by_hand_m2(renderer, small_camera, led_ids, sigmas_deg))
 
 
+@pytest.mark.slow
 def test_the_unknown_level_of_the_background_raises_the_bound() -> None:
     """LEDs of 1 px in regions without a margin, where few pixels tell the level from the LED's light.
 

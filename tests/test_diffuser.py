@@ -139,6 +139,7 @@ def test_a_rim_hides_leds_from_the_side(slope: float, share: float) -> None:
     assert sum(patch.visible_fraction for patch in seen) == pytest.approx(share, abs=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "frame",
     [pytest.param(False, id="diffuser"), pytest.param(True, id="frame and diffuser", marks=pytest.mark.slow)],
