@@ -1,6 +1,7 @@
 """Device knowledge: camera, sensor, accelerometer, LED map, and a frame with all of them (datasets/FORMAT.md)."""
 
 import json
+from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Self
@@ -153,14 +154,14 @@ class Led(Row):
     shape: str
 
     @property
+    @abstractmethod
     def half_width_m(self) -> float:
         """Radius of a disc, half the side of a square, metres."""
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def mean_square_extent_m2(self) -> float:
         """Mean of x^2 over the face, x measured from the centre along any direction of the face, m^2."""
-        raise NotImplementedError
 
 
 class DiscLed(Led):
