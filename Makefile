@@ -53,7 +53,7 @@ $(READY): requirements.txt pyproject.toml
 
 # Not in CI: the map takes about ten minutes, each mutant a few seconds to minutes; runs go on where they stopped.
 mutants: $(READY)
-	test -f out/mutants/coverage.sqlite || $(BIN)/python tests/mutation/run.py map
+	test -f out/mutants/branches.sqlite || $(BIN)/python tests/mutation/run.py map
 	$(BIN)/python tests/mutation/run.py chosen
 	$(BIN)/python tests/mutation/run.py sample --count 150 --seed 7
 

@@ -1,12 +1,14 @@
 """Mutation testing: does a test fail where the code is changed?
 
-    python tests/mutation/run.py map                        which tests execute which lines (once, some ten minutes)
+    python tests/mutation/run.py map                        which tests execute which lines (once, some ten minutes),
+                                                            with the statements and branches that none executes
     python tests/mutation/run.py chosen [--only NAME]       the kept lists, chosen_*.toml
     python tests/mutation/run.py sample --count 150 --seed 7
 
 Each mutant is one change to one file of a copy of the checkout. The tests that execute the changed line run against it,
 those of its module first, then the quickest, up to the first failure: killed. A mutant whose tests all pass survived:
-a test is missing, or the change is equivalent (equivalent_*.toml says why). Runs go on where they stopped: results are
+a test is missing, or the change is equivalent (equivalent_*.toml says why: `file`, `change`, and `line`, a part of the
+source line, where the same change elsewhere in the file would not be). Runs go on where they stopped: results are
 kept in out/mutants/results.jsonl under a hash of the mutated source and of the tests.
 """
 
@@ -104,24 +106,25 @@ class Map:
 
     def __init__(self) -> None:
         """Read what `make_map` recorded."""
-        if not (OUT / "coverage.sqlite").exists():
+        if not (OUT / "branches.sqlite").exists():
             sys.exit("no map of tests yet: run `python tests/mutation/run.py map` first")
         self._times = json.loads((OUT / "times.json").read_text())
         self._rows: dict[str, dict[int, set[str]]] = {}
         of_file: dict[str, set[str]] = {}
         for test in self._times:
             of_file.setdefault(test.split("::")[0], set()).add(test)
-        connection = sqlite3.connect(OUT / "coverage.sqlite")
+        connection = sqlite3.connect(OUT / "branches.sqlite")
         contexts = dict(connection.execute("select id, context from context"))
-        query = "select path, context_id, numbits from line_bits join file on file.id = line_bits.file_id"
-        for path, context, bits in connection.execute(query):
+        # A branch from one line to another executes both; entries and exits of a function have negative numbers.
+        query = "select path, context_id, fromno, tono from arc join file on file.id = arc.file_id"
+        for path, context, *ends in connection.execute(query):
             test, _, phase = contexts[context].partition("|")
             if not test:
                 continue
             # What a fixture of a module or a session executes stands under the first test that needs it alone.
             tests = of_file[test.split("::")[0]] if phase == "setup" else {test}
             lines = self._rows.setdefault(str(Path(path).resolve().relative_to(ROOT)), {})
-            for line in (8 * i + bit for i, byte in enumerate(bits) for bit in range(8) if byte >> bit & 1):
+            for line in (end for end in ends if end > 0):
                 lines.setdefault(line, set()).update(tests)
 
     def tests(self, file: str, line: int) -> tuple[list[str], float]:
@@ -143,15 +146,15 @@ class Map:
 
 
 def make_map() -> None:
-    """Run all tests once under coverage.py with a context a test, and keep lines, branches and times."""
+    """Run all tests once under coverage.py with a context a test; keep branches and times, print what never runs."""
     OUT.mkdir(parents=True, exist_ok=True)
     settings = OUT / "coverage.ini"
-    settings.write_text(
-        f"[run]\nbranch = false\nsource = {','.join(PACKAGES)}\ndata_file = {OUT / 'coverage.sqlite'}\n"
-    )
+    settings.write_text(f"[run]\nbranch = true\nsource = {','.join(PACKAGES)}\ndata_file = {OUT / 'branches.sqlite'}\n")
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--cov", "--cov-context=test"]
     command += [f"--cov-config={settings}", "--cov-report=", f"--junitxml={OUT / 'times.xml'}"]
     subprocess.run(command, cwd=ROOT, check=False, env=_environment(ROOT))
+    report = [sys.executable, "-m", "coverage", "report", f"--rcfile={settings}", "--skip-covered", "--show-missing"]
+    subprocess.run(report, cwd=ROOT, check=False)
     import xml.etree.ElementTree as Tree
 
     times: dict[str, float] = {}
@@ -242,10 +245,9 @@ def run(mutants: list[Mutant], workers: int) -> int:
             # A kill stays one; a survivor is tried again when tests have changed.
             if row["outcome"] == "killed" or row["state"] == state:
                 known[row["digest"]] = row
-    explained = {}
-    for path in HERE.glob("equivalent*.toml"):
-        entries = tomllib.loads(path.read_text()).get("mutant", [])
-        explained |= {(entry["file"], entry["change"]): entry["why"] for entry in entries}
+    equivalents = [
+        entry for path in HERE.glob("equivalent*.toml") for entry in tomllib.loads(path.read_text())["mutant"]
+    ]
     lock, outcomes, survivors = threading.Lock(), Counter[str](), []
     try:
         with concurrent.futures.ThreadPoolExecutor(workers) as pool:
@@ -253,8 +255,7 @@ def run(mutants: list[Mutant], workers: int) -> int:
             for future in concurrent.futures.as_completed(pending):
                 mutant, row = pending[future], future.result()
                 outcome = str(row["outcome"])
-                why = explained.get((mutant.file, mutant.change))
-                if outcome == "survived" and why:
+                if outcome == "survived" and any(_is(mutant, entry) for entry in equivalents):
                     outcome = "equivalent"
                 with lock:
                     outcomes[outcome] += 1
@@ -272,6 +273,12 @@ def run(mutants: list[Mutant], workers: int) -> int:
         f"{outcomes['equivalent']} equivalent and not counted"
     )
     return len(survivors)
+
+
+def _is(mutant: Mutant, entry: dict[str, str]) -> bool:
+    """Whether an entry of equivalent_*.toml explains a mutant."""
+    line = (ROOT / mutant.file).read_text().splitlines()[mutant.line - 1]
+    return (entry["file"], entry["change"]) == (mutant.file, mutant.change) and entry.get("line", "") in line
 
 
 def _digest_of_tests() -> str:
