@@ -46,6 +46,8 @@ class Uncertainty:
     """Of the radius or side, relative, (n,)."""
     led_gradients: Array
     """Of the luminance's gradient along x and along y, relative change from the centre to the edge, (n,)."""
+    led_faces_rad: Array
+    """Of the tilt of the LED's face about x and about y, radians, (n,)."""
     datum_m: Array
     """Of the whole map, (3,)."""
     scale: float = 0.0
@@ -58,12 +60,19 @@ class Uncertainty:
         """All sigmas 0, for a scene of so many LEDs, each a luminaire of its own."""
         each = np.arange(leds)
         zeros = np.zeros
-        return cls(zeros(7), each, zeros((leds, 6)), zeros((leds, 3)), zeros(leds), zeros(leds), zeros(3))
+        return cls(zeros(7), each, zeros((leds, 6)), zeros((leds, 3)), zeros(leds), zeros(leds), zeros(leds), zeros(3))
 
     @property
     def is_zero(self) -> bool:
         """Whether everything is known without error."""
-        arrays = (self.intrinsics, self.luminaires, self.led_positions_m, self.led_sizes, self.led_gradients)
+        arrays = (
+            self.intrinsics,
+            self.luminaires,
+            self.led_positions_m,
+            self.led_sizes,
+            self.led_gradients,
+            self.led_faces_rad,
+        )
         return not any(a.any() for a in (*arrays, self.datum_m)) and self.scale == 0 and self.mounting_rad == 0
 
     def luminaire_centers_m(self, leds: Leds) -> Array:
