@@ -11,7 +11,6 @@ from vlcrender.scene.as_built import luminaires_of
 from vlcrender.scene.loader import Scene
 from vlcrender.sensor.accelerometer import TiltError
 
-
 FREE_TILT_RAD = 1.0
 """Sigma of the tilt of an LED's face where the map errs, about either axis: next to no knowledge of it. The shape of an
 LED's image would tell the camera's tilt to some 0.01 deg if faces were exactly level and round, as the rendered ones
