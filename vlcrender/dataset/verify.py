@@ -62,14 +62,16 @@ def missing_files(directory: Path, folders: Iterable[str], frames: Iterable[int]
 
 def _camera_of(entry: CameraEntry, source: str) -> Camera:
     """A camera that images points as the entry says. `source` names it in the InputError for an impossible one."""
-    (_, skew, u), (_, _, v), _ = entry.K
+    (fx, skew, u), (_, fy, v), _ = entry.K
     shared = entry.model_dump(include={"width_px", "height_px", "pixel_pitch_um", "projection", "distortion"})
     # A lens focused at infinity has its image distance as focal length, and a projection uses nothing else.
     lens = {"focal_length_mm": entry.image_distance_mm, "principal_point_px": (u, v), "skew_px": skew}
+    lens |= {"aspect_ratio": fx / fy if fy > 0 else 1.0}
     camera = check({**shared, **lens}, Camera, source)
     if not np.allclose(camera.matrix, entry.K, rtol=1e-12, atol=0):
         raise InputError(
-            f"{source}: K is not [[f, skew, cx], [0, f, cy], [0, 0, 1]] with f = image_distance_mm / pitch"
+            f"{source}: K is not [[fx, skew, cx], [0, fy, cy], [0, 0, 1]] with the mean of fx and fy "
+            "image_distance_mm / pitch"
         )
     return camera
 
