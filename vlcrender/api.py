@@ -123,14 +123,13 @@ class RawFrame:
         and `spots` as in frames.parquet, and `parts`: `row`, `column` and `image_dn` of each region.
         """
         from vlcrender.camera.rig import mounted_cameras
-        from vlcrender.dataset.schema import AccelerometerEntry, SensorEntry, camera_entry, led_map
+        from vlcrender.dataset.schema import SensorEntry, accelerometer_entry, camera_entry, led_map
 
         (mounted,) = mounted_cameras(self.camera, ())
-        device = AccelerometerEntry(kind=self.accelerometer.kind, error_deg=self.accelerometer.error_deg)
         return {
             "camera": camera_entry(mounted).model_dump(mode="json"),
             "sensor": SensorEntry(**self.sensor.acting()).model_dump(mode="json"),
-            "accelerometer": device.model_dump(mode="json"),
+            "accelerometer": accelerometer_entry(self.accelerometer).model_dump(mode="json"),
             "led_map": [entry.model_dump(mode="json") for entry in led_map(self.scene.leds)],
             "exposure_s": self.exposure_s,
             "accelerometer_m_s2": self.accelerometer_m_s2.tolist(),

@@ -72,7 +72,7 @@ def led_images(
         imaged.append((i, image))
     clear: Sequence[Array | float] = [1.0] * len(imaged)
     if occlusion.possible:
-        lit = [LitRegion(float(leds.centers_m[i, 2]), image.roi, image.coverage > 0) for i, image in imaged]
+        lit = [LitRegion(float(occlusion.heights_m[i]), image.roi, image.coverage > 0) for i, image in imaged]
         clear = occlusion.clear_shares(posed, lit)
     images = {}
     for (i, image), share in zip(imaged, clear, strict=True):

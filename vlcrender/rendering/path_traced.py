@@ -57,7 +57,7 @@ def reference_cd_m2(scene: Scene, posed: PosedCamera, samples_per_pixel: int, se
     all_light = mi.load_dict({"type": "path", "max_depth": MAX_DEPTH, "rr_depth": 8})
     ambient = _FirstSurface(scene.settings.ambient.illuminance_lux)
     pinhole = camera.lens_projection.keeps_lines_straight and camera.focus_distance_m is None
-    render = _by_sensor if pinhole and camera.skew_px == 0 else _by_rays
+    render = _by_sensor if pinhole and camera.skew_px == 0 and camera.aspect_ratio == 1 else _by_rays
     each = -(-samples_per_pixel // BATCHES)
     images = []
     for batch in range(BATCHES):

@@ -67,7 +67,7 @@ def specular_reflections(
         roi = image.roi
         if not any(region.overlaps(roi) for region in rois):
             continue
-        lit = LitRegion(float(leds.centers_m[i, 2]), roi, image.coverage > 0)
+        lit = LitRegion(float(occlusion.heights_m[i]), roi, image.coverage > 0)
         (clear,) = occlusion.clear_shares(posed, [lit], Mirror(number, mirrored.pose))
         u, v = roi.centers_px()
         x, y, z = mirrored.ray_world(u, v)
