@@ -2,14 +2,11 @@
 
 import numpy as np
 
-from vlcrender.camera.intrinsics import Pose
 from vlcrender.camera.rig import Mounted
-from vlcrender.dataset.belief import Sigmas
 from vlcrender.dataset.recipe import Recipe
 from vlcrender.rendering.uncertainty import Uncertainty
 from vlcrender.scene.as_built import luminaires_of
 from vlcrender.scene.loader import Scene
-from vlcrender.sensor.accelerometer import TiltError
 
 FREE_TILT_RAD = 1.0
 """Sigma of the tilt of an LED's face where the map errs, about either axis: next to no knowledge of it. The shape of an
@@ -17,16 +14,15 @@ LED's image would tell the camera's tilt to some 0.01 deg if faces were exactly 
 are; luminaires that hang by a tilt, and real faces, are not."""
 
 
-def true_sigmas(recipe: Recipe) -> Sigmas | None:
-    """Standard deviations of the truth about the recipe; None where the recipe has no belief."""
-    return None if recipe.belief is None else recipe.belief.true_sigmas(recipe.cameras, recipe.accelerometer)
+def uncertainty_of(recipe: Recipe, scene: Scene, mounted: Mounted) -> Uncertainty:
+    """Standard deviations of lens, map and mounting for one frame of a camera: errors of device and shot together.
 
-
-def uncertainty_of(sigmas: Sigmas | None, scene: Scene, mounted: Mounted) -> Uncertainty:
-    """Standard deviations of lens, map and mounting for one frame of a camera: errors of device and shot together."""
+    scene: with the LEDs as told or as built; `mounted`: as told or true. All are 0 where the recipe has no belief.
+    """
     leds = scene.leds
-    if sigmas is None:
+    if recipe.belief is None:
         return Uncertainty.none(len(leds))
+    sigmas = recipe.belief.true_sigmas(recipe.cameras, recipe.accelerometer)
     camera = sigmas.cameras[mounted.name]
     luminaires = luminaires_of(scene.settings, leds)
     map_errs = any(a.any() for a in (sigmas.luminaire_m, sigmas.luminaire_rotation_deg, sigmas.led_m))
@@ -43,11 +39,3 @@ def uncertainty_of(sigmas: Sigmas | None, scene: Scene, mounted: Mounted) -> Unc
         scale=sigmas.datum_scale_ppm * 1e-6,
         mounting_rad=float(np.radians(camera.rotation_deg)),
     )
-
-
-def tilt_sigmas_deg(sigmas: Sigmas | None, recipe: Recipe, main: Pose) -> tuple[float, float]:
-    """Standard deviations of the accelerometer's tilt_x and tilt_y, degrees, of one frame at a pose of `main`."""
-    if sigmas is not None and isinstance(recipe.accelerometer, TiltError):
-        both = float(np.hypot(sigmas.accelerometer_device_deg, sigmas.accelerometer_shot_deg))
-        return both, both
-    return recipe.accelerometer.tilt_errors_deg(main)

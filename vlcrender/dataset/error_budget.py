@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.rig import MAIN, Mounted
 from vlcrender.camera.roi import RegionImage
-from vlcrender.dataset.belief import Sigmas
-from vlcrender.dataset.bound_uncertainty import tilt_sigmas_deg, true_sigmas, uncertainty_of
+from vlcrender.dataset.bound_uncertainty import uncertainty_of
 from vlcrender.dataset.pose_sampling import pose_of_frame
 from vlcrender.dataset.recipe import Plan, Recipe
+from vlcrender.dataset.true_world import tilt_sigmas_deg
 from vlcrender.errors import InputError
 from vlcrender.rendering.bayer import MosaicRenderer
 from vlcrender.rendering.crlb import FrameSlopes
+from vlcrender.rendering.expected_image import LedPatch
 from vlcrender.rendering.renderer import Renderer, check_inside
 from vlcrender.rendering.spot_errors import ACCELEROMETER, NOISE, SpotErrors
 from vlcrender.rendering.uncertainty import Uncertainty
@@ -114,14 +115,13 @@ def error_budget(
         raise InputError('budget: needs noise; sensor.noise must not be "none"')
     if poses < 1:
         raise InputError(f"poses = {poses}: has to be 1 or more")
-    sigmas = true_sigmas(recipe)
-    uncertainty = uncertainty_of(sigmas, scene, mounted)
-    parts = _parts(recipe, sigmas, mounted)
+    uncertainty = uncertainty_of(recipe, scene, mounted)
+    parts = _parts(recipe, mounted)
     scales_without = [{part.effect: float(np.sqrt(max(0.0, 1.0 - part.share)))} for part in parts]
     numbers = np.unique(np.linspace(0, recipe.poses.count - 1, min(poses, recipe.poses.count)).round().astype(int))
     shares, trusting, exact, bounds, leds, luminaires = [], [], [], [], [], []
     for done, number in enumerate(numbers.tolist()):
-        model, of_pixels = _of_pose(plan, renderer, mounted, number, sigmas, uncertainty, bound)
+        model, of_pixels = _of_pose(plan, renderer, mounted, number, uncertainty, bound)
         own = None if model is None else model.gain()
         if model is not None and own is not None:
             contributions = model.contributions_m2(own)
@@ -170,7 +170,6 @@ def _of_pose(
     renderer: Renderer | MosaicRenderer,
     mounted: Mounted,
     number: int,
-    sigmas: Sigmas | None,
     uncertainty: Uncertainty,
     bound: bool,
 ) -> tuple[SpotErrors | None, Array | None]:
@@ -181,9 +180,9 @@ def _of_pose(
     check_inside(scene, at.pose)
     view = renderer.expected_image(at, recipe.regions)
     exposure_s = recipe.time_s(view)
-    tilts = tilt_sigmas_deg(sigmas, recipe, main)
+    tilts = tilt_sigmas_deg(recipe, main)
 
-    def patches(posed: PosedCamera):  # type: ignore[no-untyped-def]
+    def patches(posed: PosedCamera) -> Sequence[LedPatch]:
         return renderer.led_patches(posed, recipe.regions, at.pose)
 
     slopes = FrameSlopes.rendered(
@@ -223,13 +222,14 @@ def _share(variances_m2: Array) -> Share:
     return Share(1e3 * float(np.sqrt(x + y)), 1e3 * float(np.sqrt(z)))
 
 
-def _parts(recipe: Recipe, sigmas: Sigmas | None, mounted: Mounted) -> list[_Part]:
+def _parts(recipe: Recipe, mounted: Mounted) -> list[_Part]:
     """The unknowns of a recipe that have an error, with those of device and shot apart."""
     pixel_noise = _Part("noise", "pixel noise", "", NOISE, 1.0)
-    if sigmas is None:
+    if recipe.belief is None:
         sigma = f"{recipe.accelerometer.error_deg:g} deg"
         accelerometer = [_Part("accelerometer", "accelerometer", sigma, ACCELEROMETER, 1.0)]
         return [*(accelerometer if recipe.accelerometer.error_deg else []), pixel_noise]
+    sigmas = recipe.belief.true_sigmas(recipe.cameras, recipe.accelerometer)
     own = sigmas.cameras[mounted.name]
     camera = mounted.camera
     device, shot = own.device, own.shot

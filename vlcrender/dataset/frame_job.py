@@ -11,6 +11,7 @@ from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.rig import Mounted
 from vlcrender.camera.roi import RegionImage, Roi
 from vlcrender.core.random_keys import random_key, stream
+from vlcrender.dataset.bound_uncertainty import uncertainty_of
 from vlcrender.dataset.downlink import decoded_spots
 from vlcrender.dataset.exr import exr_attributes, write_exr
 from vlcrender.dataset.files import EXPECTED, FRAMES, PREVIEWS, PROCESSED
@@ -31,7 +32,7 @@ from vlcrender.dataset.true_world import (
 )
 from vlcrender.light.lightmap import bake
 from vlcrender.rendering.bayer import MosaicRenderer
-from vlcrender.rendering.crlb import position_bound_m2
+from vlcrender.rendering.crlb import FrameSlopes
 from vlcrender.rendering.expected_image import ExpectedImage
 from vlcrender.rendering.renderer import Renderer
 from vlcrender.scene.loader import Scene, build_scene
@@ -145,36 +146,43 @@ def _noise_free_frame(job: Job, pose_number: int, which: int, frame: int | None)
     view = renderer.expected_image(posed, recipe.regions, during)
     exposure_s = recipe.time_s(view)
     expected = [RegionImage(part.roi, part.expected_electrons(exposure_s)) for part in view.parts]
-    bound = _bound_m2(recipe, renderer, mounted, main, exposure_s, expected)
-    return _NoiseFreeFrame(main, posed.pose, mounted.camera, view, exposure_s, expected, bound, bound)
+    hybrid, exact = _bounds_m2(recipe, renderer, mounted, main, exposure_s, expected)
+    return _NoiseFreeFrame(main, posed.pose, mounted.camera, view, exposure_s, expected, hybrid, exact)
 
 
-def _bound_m2(
+def _bounds_m2(
     recipe: Recipe,
     renderer: Renderer | MosaicRenderer,
     mounted: Mounted,
     main: Pose,
     exposure_s: float,
     expected: Sequence[RegionImage],
-) -> Flat9 | None:
-    """Cramér-Rao bound of the frame's position, row by row.
+) -> tuple[Flat9 | None, Flat9 | None]:
+    """Cramér-Rao bounds of the frame's position, row by row: hybrid, and exact; the same without [belief].
 
-    None where the recipe does not ask for it, or where the frame does not determine a position.
+    None where the recipe does not ask for them, or where the frame does not determine a position.
     """
     if not recipe.bound:
-        return None
+        return None, None
     at = mounted.posed(main)
-    bound = position_bound_m2(
+    slopes = FrameSlopes.rendered(
         mounted,
         main,
         lambda posed: renderer.led_patches(posed, recipe.regions, at.pose),
         exposure_s,
         [RegionImage(roi, variance_e2(recipe.sensor, image, exposure_s)) for roi, image in expected],
         float(np.median(np.linalg.norm(renderer.scene.leds.centers_m - at.position_m, axis=1))),
-        tilt_sigmas_deg(recipe, main),
         recipe.regions is not None and recipe.regions.overscan,
     )
-    return None if bound is None else flat9(bound)
+    if slopes is None:
+        return None, None
+    tilts_deg = tilt_sigmas_deg(recipe, main)
+    exact = slopes.exact_bound_m2(tilts_deg)
+    hybrid = exact
+    if recipe.belief is not None:
+        uncertainty = uncertainty_of(recipe, renderer.scene, mounted)
+        hybrid = slopes.hybrid_bound_m2(tilts_deg, renderer.scene.leds, uncertainty)
+    return None if hybrid is None else flat9(hybrid), None if exact is None else flat9(exact)
 
 
 def poses_of(recipe: Recipe, scene: Scene, pose_number: int, mounted: Mounted) -> tuple[Pose, tuple[Pose, ...]]:
