@@ -7,6 +7,7 @@ alone, as if lens and map were exact. Figures are root mean squares over the pos
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +42,10 @@ class Share:
     def total_mm(self) -> float:
         """Of the distance in space, mm."""
         return float(np.hypot(self.horizontal_mm, self.vertical_mm))
+
+    def record(self) -> dict[str, float]:
+        """The three figures by name, for JSON."""
+        return {"horizontal_mm": self.horizontal_mm, "vertical_mm": self.vertical_mm, "total_mm": self.total_mm}
 
 
 @dataclass(frozen=True)
@@ -81,6 +86,32 @@ class ErrorBudget:
     bound: Share | None
     """Hybrid Cramér-Rao bound of the pixels; None where it was not computed."""
 
+    def record(self) -> dict[str, Any]:
+        """The budget for JSON: fields by name, rows in order, errors as of `Share.record`."""
+        rows = [
+            {
+                "key": row.key,
+                "name": row.name,
+                "sigma": row.sigma,
+                **row.share.record(),
+                "exact_mm": row.exact_mm,
+                "trusting": row.trusting.record(),
+            }
+            for row in self.rows
+        ]
+        return {
+            "recipe": self.recipe,
+            "camera": self.camera,
+            "poses": self.poses,
+            "undetermined": self.undetermined,
+            "median_leds": self.median_leds,
+            "median_luminaires": self.median_luminaires,
+            "rows": rows,
+            "total": self.total.record(),
+            "trusting_total": self.trusting_total.record(),
+            "bound": self.bound and self.bound.record(),
+        }
+
 
 @dataclass(frozen=True)
 class _Part:
@@ -95,7 +126,7 @@ class _Part:
 
 def error_budget(
     plan: Plan,
-    renderer: Renderer | MosaicRenderer,
+    renderer: Callable[[], Renderer | MosaicRenderer],
     poses: int,
     camera: str = MAIN,
     bound: bool = True,
@@ -103,6 +134,7 @@ def error_budget(
 ) -> ErrorBudget:
     """The error budget of a recipe's camera, over so many of its poses, evenly spread.
 
+    renderer: makes the scene's renderer, once the recipe is known to be good.
     bound: compute the hybrid bound of the pixels too, at about three times the cost. progress: called with the number
     of finished poses and of all. Raises InputError for a camera that is not on the rig, for a recipe with motion or
     without noise, and where no pose determines a position.
@@ -118,10 +150,11 @@ def error_budget(
     uncertainty = uncertainty_of(recipe, scene, mounted)
     parts = _parts(recipe, mounted)
     scales_without = [{part.effect: float(np.sqrt(max(0.0, 1.0 - part.share)))} for part in parts]
+    of_scene = renderer()
     numbers = np.unique(np.linspace(0, recipe.poses.count - 1, min(poses, recipe.poses.count)).round().astype(int))
     shares, trusting, exact, bounds, leds, luminaires = [], [], [], [], [], []
     for done, number in enumerate(numbers.tolist()):
-        model, of_pixels = _of_pose(plan, renderer, mounted, number, uncertainty, bound)
+        model, of_pixels = _of_pose(plan, of_scene, mounted, number, uncertainty, bound)
         own = None if model is None else model.gain()
         if model is not None and own is not None:
             contributions = model.contributions_m2(own)
