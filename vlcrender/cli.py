@@ -359,7 +359,8 @@ def _print_budget(found: "ErrorBudget") -> None:
     for row in found.rows:
         own = [f"{x:.4g}" for x in (row.share.horizontal_mm, row.share.vertical_mm, row.share.total_mm)]
         share = f"{100 * row.share.total_mm**2 / variance:.1f} %"
-        table.add_row(row.name, row.sigma, *own, share, f"{row.exact_mm:.4g}", f"{row.trusting.total_mm:.4g}")
+        exact = "" if row.exact_mm is None else f"{row.exact_mm:.4g}"
+        table.add_row(row.name, row.sigma, *own, share, exact, f"{row.trusting.total_mm:.4g}")
     table.add_section()
     for name, sums, trusting in (
         ("all", found.total, f"{found.trusting_total.total_mm:.4g}"),

@@ -58,8 +58,9 @@ class BudgetRow:
     """Its standard deviation, with unit."""
     share: Share
     """Its contribution to the error of the estimator that knows all standard deviations."""
-    exact_mm: float
-    """Error of that estimator in space if this unknown had no error: what calibrating it would give, mm."""
+    exact_mm: float | None
+    """Error of that estimator in space if this unknown had no error: what calibrating it would give, mm. None for pixel
+    noise, which cannot be calibrated."""
     trusting: Share
     """Its contribution to the error of the estimator that takes lens and map as exact."""
 
@@ -174,7 +175,14 @@ def error_budget(
     share, blind_share = np.mean(shares, axis=0), np.mean(trusting, axis=0)
     without_mm = 1e3 * np.sqrt(np.mean(exact, axis=0))
     rows = [
-        BudgetRow(part.key, part.name, part.sigma, _share(share[i]), float(without_mm[i]), _share(blind_share[i]))
+        BudgetRow(
+            part.key,
+            part.name,
+            part.sigma,
+            _share(share[i]),
+            None if part.effect == NOISE else float(without_mm[i]),
+            _share(blind_share[i]),
+        )
         for i, part in enumerate(parts)
     ]
     return ErrorBudget(
@@ -243,8 +251,8 @@ def _diagonals(contributions: Mapping[str, Array], parts: Sequence[_Part]) -> Ar
 
 
 def _trace_without(model: SpotErrors, scales: Mapping[str, float]) -> float:
-    """Variance in space of the estimator, m2, with some effects scaled down."""
-    gain = model.gain(scales)
+    """Variance in space of the estimator, m2, with some effects scaled down; NaN without noise."""
+    gain = None if NOISE in scales else model.gain(scales)
     if gain is None:
         return float("nan")
     return float(sum(np.trace(part) for part in model.contributions_m2(gain, scales).values()))
