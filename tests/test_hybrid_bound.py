@@ -156,7 +156,7 @@ def only(names: tuple[str, ...]) -> Uncertainty:
 
 @pytest.mark.parametrize("names", ONLY.values(), ids=ONLY.keys())
 def test_bound_is_that_of_dense_least_squares(slopes: FrameSlopes, renderer: Renderer, names: tuple[str, ...]) -> None:
-    """LEDs of 6 px in radius, whose images tell their place to some 0.004 px: the map's errors of 0.2 px hide that.
+    """LEDs of 6 px in radius, whose images tell their place to 0.003 px: the map's errors of 0.2 px hide that.
 
     The noise by hand is the spots' own. What remains: LEDs are no points. Linear terms agree to (6 px / 1500 px)^2 =
     2e-5; shapes that the six numbers describe, but whose slopes are those of rim points next to pixels' centres, tell
