@@ -38,7 +38,7 @@ from vlcrender.dataset.schema import (
     map_datum_entry,
 )
 from vlcrender.dataset.tables import write_table
-from vlcrender.dataset.true_world import device_of_pose, device_rows, map_rows, true_camera
+from vlcrender.dataset.true_world import built_leds, device_of_pose, device_rows, map_rows, true_camera
 from vlcrender.dataset.verify import extra_folders, missing_files, verify
 from vlcrender.errors import InputError
 from vlcrender.light.lightmap import bake, room_mesh
@@ -59,7 +59,7 @@ def generate(
 
     Resumes an interrupted run of the same plan. `workers` is the number of processes; `scheduler` is the address of a
     dask scheduler whose workers share the folder. `progress` is called with each report. Raises InputError where the
-    folder holds anything else, and where a pose or the furniture of the plan is impossible.
+    folder holds anything else, and where a pose, the furniture, or a true camera or LED of the plan is impossible.
     """
     report = progress or (lambda report: None)
     try:
@@ -80,6 +80,9 @@ def generate(
             _, during = poses_of(plan.recipe, plan.scene, pose_number, mounted)
             check_inside(plan.scene, during[0])
             check_inside(plan.scene, during[-1])
+    if plan.recipe.belief is not None:
+        for map_number in range(plan.recipe.belief.maps):  # an impossible LED, too
+            built_leds(plan.recipe, plan.scene, map_number)
     room_mesh(plan.scene)  # impossible furniture ends the run before anything is written
     _prepare(directory, provenance, plan.recipe)
     job = Job(

@@ -16,10 +16,12 @@ from vlcrender.camera.distortion import Distortion
 from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.rig import MAIN, Mounted
 from vlcrender.config.toml_model import check
+from vlcrender.core.face_profile import lowest_share
 from vlcrender.core.random_keys import key_number, stream
 from vlcrender.dataset.belief import CAMERA_PARAMETERS, Sigmas
 from vlcrender.dataset.recipe import Recipe
 from vlcrender.dataset.schema import DeviceTruthRow, MapTruthRow, five, flat9
+from vlcrender.errors import InputError
 from vlcrender.scene.as_built import BuildingErrors, as_built, luminaires_of
 from vlcrender.scene.leds import Leds
 from vlcrender.scene.loader import Scene
@@ -100,7 +102,10 @@ def _mean_factor(ratio: float, aspect: float) -> float:
 
 
 def built_leds(recipe: Recipe, scene: Scene, map_number: int) -> Leds:
-    """The LEDs of a map as built; the scene's without [belief]."""
+    """The LEDs of a map as built; the scene's without [belief].
+
+    Raises InputError where an LED's gradient is steeper than its luminance allows.
+    """
     sigmas, leds = _true_sigmas(recipe), scene.leds
     if sigmas is None:
         return leds
@@ -120,10 +125,18 @@ def built_leds(recipe: Recipe, scene: Scene, map_number: int) -> Leds:
         luminaire_rotation_deg=sigmas.luminaire_rotation_deg * of_luminaires("rotation"),
         led_m=sigmas.led_m * of_leds("position", 3),
         led_size=sigmas.led_size * of_leds("size", 1)[:, 0],
+        led_gradient=sigmas.led_gradient * of_leds("gradient", 2),
         datum_m=sigmas.datum_m * normals("datum position", 0, 3),
         datum_scale=sigmas.datum_scale_ppm * 1e-6 * float(normals("datum scale", 0, 1)[0]),
     )
-    return as_built(leds, luminaires, errors)
+    built = as_built(leds, luminaires, errors)
+    for i, (gx, gy) in enumerate(built.face_gradients.tolist()):
+        if lowest_share((gx, gy), float(built.face_falloffs[i]), bool(built.squares[i])) < 0:
+            raise InputError(
+                f"[belief.leds]: LED {built.ids[i]} of map {map_number} has the gradient [{gx:.3g}, {gy:.3g}], which "
+                "makes its rim darker than 0; lower belief.leds.gradient_percent"
+            )
+    return built
 
 
 def tilt_errors_deg(recipe: Recipe, device: int) -> tuple[float, float]:
@@ -196,8 +209,17 @@ def map_rows(recipe: Recipe, scene: Scene) -> list[MapTruthRow]:
     for map_number in range(recipe.belief.maps):
         leds = built_leds(recipe, scene, map_number)
         sizes = leds.half_widths_m * np.where(leds.squares, 2.0, 1.0)
-        for led, (x, y, z), size in zip(leds.ids.tolist(), leds.centers_m.tolist(), sizes.tolist(), strict=True):
-            rows.append(MapTruthRow(map=map_number, led=led, position_m=(x, y, z), size_m=size, gradient=(0.0, 0.0)))
+        for i, (x, y, z) in enumerate(leds.centers_m.tolist()):
+            gx, gy = leds.face_gradients[i].tolist()
+            rows.append(
+                MapTruthRow(
+                    map=map_number,
+                    led=int(leds.ids[i]),
+                    position_m=(x, y, z),
+                    size_m=float(sizes[i]),
+                    gradient=(gx, gy),
+                )
+            )
     return rows
 
 

@@ -74,7 +74,7 @@ def specular_reflections(
         normal_x, normal_y, normal_z = glazing.normal.tolist()
         cosine = np.abs(x * normal_x + y * normal_y + z * normal_z) / np.sqrt(x * x + y * y + z * z)
         weight = relative_illumination(camera, u, v) * glazing_reflectance(cosine, glazing.refractive_index, np.sqrt)
-        pattern = luminance_pattern(leds, i, mirrored, roi)
+        pattern = luminance_pattern(leds, i, mirrored, roi) * image.profile
         light = led_rate * leds.luminances_cd_m2[i] * image.coverage * clear * weight * pattern
         for region in rois:
             if region.overlaps(roi):

@@ -38,6 +38,8 @@ class BuildingErrors:
     """Displacements of the LEDs within their luminaires, (n, 3)."""
     led_size: Array
     """Relative errors of radii and sides, (n,)."""
+    led_gradient: Array
+    """Errors of the luminance gradients over the faces, (n, 2)."""
     datum_m: Array
     """Displacement of the whole map, (3,)."""
     datum_scale: float
@@ -76,4 +78,10 @@ def as_built(leds: Leds, luminaires: Luminaires, errors: BuildingErrors) -> Leds
         diffuser and diffuser.as_built(x, y, size)
         for diffuser, (x, y, _), size in zip(leds.diffusers, shifts.tolist(), sizes.tolist(), strict=True)
     )
-    return replace(leds, centers_m=positions, half_widths_m=leds.half_widths_m * sizes, diffusers=diffusers)
+    return replace(
+        leds,
+        centers_m=positions,
+        half_widths_m=leds.half_widths_m * sizes,
+        diffusers=diffusers,
+        face_gradients=leds.face_gradients + errors.led_gradient,
+    )
