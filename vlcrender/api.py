@@ -295,7 +295,7 @@ def budget(
     from vlcrender.dataset.error_budget import error_budget
 
     plan = _plan(recipe, overrides)
-    return error_budget(plan, lambda: _renderer(plan.scene, plan.recipe.sensor), poses, camera, bound, progress)
+    return error_budget(plan, lambda: renderer_of(plan), poses, camera, bound, progress)
 
 
 def verify(directory: str | Path) -> list[str]:
@@ -321,6 +321,11 @@ def _plan(
 
 def _spectral_response(sensor: Sensor) -> str:
     return sensor.model_dump_json(include={"quantum_efficiency", "mosaic"})
+
+
+def renderer_of(plan: "Plan") -> "Renderer | MosaicRenderer":
+    """The renderer of a plan's scene for its sensor, made or kept from before."""
+    return _renderer(plan.scene, plan.recipe.sensor)
 
 
 _renderers: "dict[tuple[int, str], Renderer | MosaicRenderer]" = {}

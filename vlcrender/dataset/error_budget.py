@@ -155,7 +155,7 @@ def error_budget(
     numbers = np.unique(np.linspace(0, recipe.poses.count - 1, min(poses, recipe.poses.count)).round().astype(int))
     shares, trusting, exact, bounds, leds, luminaires = [], [], [], [], [], []
     for done, number in enumerate(numbers.tolist()):
-        model, of_pixels = _of_pose(plan, of_scene, mounted, number, uncertainty, bound)
+        model, of_pixels = spot_errors_at(plan, of_scene, mounted, number, uncertainty, bound)
         own = None if model is None else model.gain()
         if model is not None and own is not None:
             contributions = model.contributions_m2(own)
@@ -206,7 +206,7 @@ def _mounted(recipe: Recipe, camera: str) -> Mounted:
     return by_name[camera]
 
 
-def _of_pose(
+def spot_errors_at(
     plan: Plan,
     renderer: Renderer | MosaicRenderer,
     mounted: Mounted,
@@ -214,7 +214,10 @@ def _of_pose(
     uncertainty: Uncertainty,
     bound: bool,
 ) -> tuple[SpotErrors | None, Array | None]:
-    """The spots' model at a pose of the recipe, and with `bound` the hybrid bound of the pixels, (3, 3), m2."""
+    """The spots' model at a pose of the recipe, and with `bound` the hybrid bound of the pixels, (3, 3), m2.
+
+    None where the pose sees no LED whole; the bound also where the pixels do not determine a position.
+    """
     recipe, scene = plan.recipe, plan.scene
     main = pose_of_frame(recipe.poses, number, recipe.seed, recipe.camera, scene)
     at = mounted.posed(main)

@@ -44,6 +44,8 @@ WHOLE = 1 - 1e-9
 class SpotErrors:
     """First-order model of one frame's spots and tilts: n spots, so m = 2 n + 2 measurements, px and radians."""
 
+    led_ids: NDArray[np.int64]
+    """The LEDs of the spots, in their order, (n,)."""
     pose: Array
     """A, (m, 6): slopes by x, y, z, m, and tilt_x, tilt_y, yaw of `main`, radians."""
     lever: Array
@@ -104,6 +106,7 @@ class SpotErrors:
         is_main = slopes.mounted.name == MAIN or uncertainty.mounting_rad == 0
         mounting = np.zeros((2, 3)) if is_main else mounting_tilt_slopes(slopes.mounted, slopes.main)
         return cls(
+            leds.ids[indices],
             pose,
             slopes.lever(),
             {
