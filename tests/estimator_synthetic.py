@@ -142,6 +142,7 @@ FRAMES_SCHEMA = pa.schema(
         ("capturable", pa.bool_()),
         ("accelerometer_m_s2", pa.list_(pa.float64(), 3)),
         ("spots", pa.list_(SPOT)),
+        ("device", pa.int64()),
     ]
 )
 TRUTH_SCHEMA = pa.schema(
@@ -193,6 +194,7 @@ def write_dataset(
                 "capturable": True,
                 "accelerometer_m_s2": view.gravity_m_s2.tolist(),
                 "spots": [{"led": 10 + k, "u_px": rough[k, 0], "v_px": rough[k, 1]} for k in seen],
+                "device": 0,
             }
         )
         truth.append(
@@ -240,6 +242,7 @@ def description(view: View, frame_count: int, leds_m: Array, radius_m: float) ->
                 "psf_kernel": None,
                 "R_cam_rig": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
                 "offset_m": [0.0, 0.0, 0.0],
+                "uncertainty": None,
             }
         },
         "sensor": {
@@ -247,9 +250,14 @@ def description(view: View, frame_count: int, leds_m: Array, radius_m: float) ->
             **{"prnu": 0.0, "dark_current_e_s": 0.0, "dsnu_e": 0.0, "read_noise_e": 0.0, "adc_noise_dn": 0.0},
             **{"row_offset_e": 0.0, "column_offset_e": 0.0, "mosaic": "none"},
         },
-        "accelerometer": {"kind": "tilt-error", "error_deg": 0.0},
+        "accelerometer": {"kind": "tilt-error", "error_deg": 0.0, "device_error_deg": None, "shot_error_deg": None},
+        "luminaires": [],
+        "map_datum": None,
         "led_map": [
-            {"id": 10 + k, "position_m": led.tolist(), "radius_m": radius_m, "shape": "disc"}
+            {
+                **{"id": 10 + k, "position_m": led.tolist(), "radius_m": radius_m, "shape": "disc"},
+                **{"luminaire": None, "sigma_m": None, "radius_sigma_m": None, "gradient_sigma": None},
+            }
             for k, led in enumerate(np.asarray(leds_m))
         ],
         "room_m": [7.0, 7.0, 3.5],

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
         ExpectedFrame,
         RawFrame,
         RawRegion,
+        budget,
         expose,
         generate,
         load_recipe,
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from vlcrender.camera.intrinsics import Camera, Pose
     from vlcrender.camera.posed_camera import PosedCamera
     from vlcrender.camera.roi import LedRegions, Roi
+    from vlcrender.dataset.error_budget import BudgetRow, ErrorBudget
     from vlcrender.dataset.progress import Progress
     from vlcrender.dataset.recipe import Plan, Recipe
     from vlcrender.errors import InputError
@@ -45,10 +47,13 @@ _MODULES = {
     "render": "vlcrender.api",
     "expose": "vlcrender.api",
     "generate": "vlcrender.api",
+    "budget": "vlcrender.api",
     "verify": "vlcrender.api",
     "ExpectedFrame": "vlcrender.api",
     "RawFrame": "vlcrender.api",
     "RawRegion": "vlcrender.api",
+    "BudgetRow": "vlcrender.dataset.error_budget",
+    "ErrorBudget": "vlcrender.dataset.error_budget",
     "Progress": "vlcrender.dataset.progress",
     "Scene": "vlcrender.scene.loader",
     "Recipe": "vlcrender.dataset.recipe",
@@ -67,7 +72,9 @@ _MODULES = {
 """Public name -> module that defines it."""
 
 __all__ = [
+    "BudgetRow",
     "Camera",
+    "ErrorBudget",
     "ExpectedFrame",
     "ExpectedImage",
     "Imu",
@@ -85,6 +92,7 @@ __all__ = [
     "Sensor",
     "TiltError",
     "__version__",
+    "budget",
     "expose",
     "generate",
     "load_recipe",

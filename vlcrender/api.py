@@ -6,7 +6,7 @@ recipe is refused before Mitsuba is loaded.
 
 import json
 import threading
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
@@ -25,6 +25,7 @@ from vlcrender.scene.loader import Scene
 from vlcrender.sensor.sensor import Sensor
 
 if TYPE_CHECKING:
+    from vlcrender.dataset.error_budget import ErrorBudget
     from vlcrender.dataset.progress import ProgressCallback
     from vlcrender.dataset.recipe import Plan
     from vlcrender.dataset.schema import SpotRow
@@ -123,14 +124,13 @@ class RawFrame:
         and `spots` as in frames.parquet, and `parts`: `row`, `column` and `image_dn` of each region.
         """
         from vlcrender.camera.rig import mounted_cameras
-        from vlcrender.dataset.schema import AccelerometerEntry, SensorEntry, camera_entry, led_map
+        from vlcrender.dataset.schema import SensorEntry, accelerometer_entry, camera_entry, led_map
 
         (mounted,) = mounted_cameras(self.camera, ())
-        device = AccelerometerEntry(kind=self.accelerometer.kind, error_deg=self.accelerometer.error_deg)
         return {
             "camera": camera_entry(mounted).model_dump(mode="json"),
             "sensor": SensorEntry(**self.sensor.acting()).model_dump(mode="json"),
-            "accelerometer": device.model_dump(mode="json"),
+            "accelerometer": accelerometer_entry(self.accelerometer).model_dump(mode="json"),
             "led_map": [entry.model_dump(mode="json") for entry in led_map(self.scene.leds)],
             "exposure_s": self.exposure_s,
             "accelerometer_m_s2": self.accelerometer_m_s2.tolist(),
@@ -270,15 +270,32 @@ def generate(
     """
     if workers < 1:
         raise InputError(f"workers = {workers}: has to be 1 or more")
-    if isinstance(recipe, str | Path):
-        plan = load_recipe(recipe, overrides, scale=scale, scale_mode=scale_mode)
-    elif overrides is None and scale == 1:
-        plan = recipe
-    else:
-        raise InputError("overrides, scale: are for a recipe's name or path; give them to load_recipe")
+    plan = _plan(recipe, overrides, scale, scale_mode)
     from vlcrender.dataset.generate import generate as make  # loads Mitsuba: after the recipe is known to be good
 
     return make(plan, Path(out), workers, scheduler, progress)
+
+
+def budget(
+    recipe: "str | Path | Plan",
+    *,
+    overrides: Overrides | None = None,
+    poses: int = 40,
+    camera: str = "main",
+    bound: bool = True,
+    progress: Callable[[int, int], None] | None = None,
+) -> "ErrorBudget":
+    """The error budget of a recipe: what each unknown contributes to the position's error of one frame.
+
+    `recipe` and `overrides` as in `generate`. Of the recipe's poses, `poses` evenly spread ones are taken. `camera` is
+    the name of a camera of the rig. With `bound` the Cramér-Rao bound of the pixels is computed too, at three times the
+    cost. `progress` is called with the numbers of finished and of all poses. Raises InputError for bad input, for a
+    recipe with motion or without noise, and if no pose determines a position.
+    """
+    from vlcrender.dataset.error_budget import error_budget
+
+    plan = _plan(recipe, overrides)
+    return error_budget(plan, lambda: renderer_of(plan), poses, camera, bound, progress)
 
 
 def verify(directory: str | Path) -> list[str]:
@@ -291,8 +308,24 @@ def verify(directory: str | Path) -> list[str]:
     return problems_of(Path(directory))
 
 
+def _plan(
+    recipe: "str | Path | Plan", overrides: Overrides | None, scale: int = 1, scale_mode: ScaleMode = "binned"
+) -> "Plan":
+    """The plan of a recipe's name or path. Raises InputError for overrides or a scale of a plan made already."""
+    if isinstance(recipe, str | Path):
+        return load_recipe(recipe, overrides, scale=scale, scale_mode=scale_mode)
+    if overrides is not None or scale != 1:
+        raise InputError("overrides, scale: are for a recipe's name or path; give them to load_recipe")
+    return recipe
+
+
 def _spectral_response(sensor: Sensor) -> str:
     return sensor.model_dump_json(include={"quantum_efficiency", "mosaic"})
+
+
+def renderer_of(plan: "Plan") -> "Renderer | MosaicRenderer":
+    """The renderer of a plan's scene for its sensor, made or kept from before."""
+    return _renderer(plan.scene, plan.recipe.sensor)
 
 
 _renderers: "dict[tuple[int, str], Renderer | MosaicRenderer]" = {}

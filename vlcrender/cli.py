@@ -18,6 +18,7 @@ from cyclopts import App, CycloptsError, Parameter
 from vlcrender.errors import InputError
 
 if TYPE_CHECKING:
+    from vlcrender.dataset.error_budget import ErrorBudget
     from vlcrender.dataset.progress import Progress
     from vlcrender.emva1288.datasheet import Datasheet
 
@@ -270,6 +271,108 @@ def _print_datasheet(name: str, sheet: "Datasheet") -> None:
         set_text, measured, tolerance, verdict = cells(row)
         table.add_row(row.key, row.name, set_text, measured, tolerance and f"± {tolerance}", row.unit, verdict)
     Console(width=max(Console().width, 100)).print(table)
+
+
+@app.command
+def budget(
+    recipe: str,
+    /,
+    *,
+    set_: Annotated[list[str] | None, Parameter(name="--set", negative=())] = None,
+    scale: int = 1,
+    scale_mode: Literal["binned", "same-photons"] = "binned",
+    poses: int = 40,
+    camera: str = "main",
+    bound: bool = True,
+    plot: Path | None = None,
+    json_: Annotated[bool, Parameter(name="--json", negative=())] = False,
+) -> None:
+    """Print what each thing that a device does not know contributes to the error of its position, the largest first.
+
+    Parameters
+    ----------
+    recipe
+        Recipe file (TOML), or the name of a recipe that comes with vlcrender. Its [belief] says what a device does not
+        know; --set belief.preset=calibrated gives it one.
+    set_
+        key=value that replaces a value of the recipe, e.g. belief.camera.focal_percent=0.02. May be repeated.
+    scale
+        Bin N x N pixels into one, as `generate` does.
+    scale_mode
+        As of `generate`.
+    poses
+        Number of poses of the recipe, evenly spread, of which the root mean square is taken.
+    camera
+        Name of a camera of the rig.
+    bound
+        Compute the Cramér-Rao bound of the pixels too; it takes most of the time.
+    plot
+        Chart to write: a .png, .svg or .pdf file.
+    json_
+        Print JSON instead of a table.
+    """
+    import json
+
+    from rich.console import Console
+
+    from vlcrender import api
+
+    if plot is not None:
+        if plot.suffix.lower() not in (".png", ".svg", ".pdf"):
+            raise InputError(f"--plot {plot}: has to end in .png, .svg or .pdf")
+        if not plot.parent.is_dir():
+            raise InputError(f"--plot {plot}: there is no folder {plot.parent}")
+    plan = api.load_recipe(recipe, set_, scale=scale, scale_mode=scale_mode)
+    with Console(stderr=True).status("poses") as status:
+        found = api.budget(
+            plan,
+            poses=poses,
+            camera=camera,
+            bound=bound,
+            progress=lambda done, total: status.update(f"poses: {done} of {total}"),
+        )
+    if json_:
+        print(json.dumps(found.record(), indent=2, ensure_ascii=False))
+    else:
+        _print_budget(found)
+    if plot is not None:
+        from vlcrender.dataset.budget_plot import draw_budget
+
+        draw_budget(found, plot)
+        if not json_:
+            print(f"{plot}: written")
+
+
+def _print_budget(found: "ErrorBudget") -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(
+        title=f"{found.recipe}, camera {found.camera}: error of the position, mm, rms over {found.poses} poses "
+        f"(median {found.median_leds:g} LEDs of {found.median_luminaires:g} luminaires)"
+    )
+    for heading in ("unknown", "sigma"):
+        table.add_column(heading)
+    for heading in ("horizontal", "vertical", "in space", "share", "if exact", "trusting"):
+        table.add_column(heading, justify="right")
+    variance = found.total.total_mm**2
+    for row in found.rows:
+        own = [f"{x:.4g}" for x in (row.share.horizontal_mm, row.share.vertical_mm, row.share.total_mm)]
+        share = f"{100 * row.share.total_mm**2 / variance:.1f} %"
+        exact = "" if row.exact_mm is None else f"{row.exact_mm:.4g}"
+        table.add_row(row.name, row.sigma, *own, share, exact, f"{row.trusting.total_mm:.4g}")
+    table.add_section()
+    for name, sums, trusting in (
+        ("all", found.total, f"{found.trusting_total.total_mm:.4g}"),
+        ("bound", found.bound, ""),
+    ):
+        if sums is not None:
+            own = [f"{x:.4g}" for x in (sums.horizontal_mm, sums.vertical_mm, sums.total_mm)]
+            table.add_row(name, "", *own, "", "", trusting)
+    Console(width=max(Console().width, 130)).print(table)
+    print("if exact: the error in space without that unknown. trusting: an estimator that takes lens and map as exact.")
+    if found.undetermined:
+        print(f"{found.undetermined} further poses do not determine a position and are left out")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -2,15 +2,15 @@
 
 import hashlib
 import io
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import numpy as np
 import OpenEXR
 import pyarrow as pa
 from numpy.typing import NDArray
-from pydantic import Field, Strict, ValidationError, field_validator
+from pydantic import Field, Strict, ValidationError, field_validator, model_validator
 
 from estimator.errors import InputError
 from estimator.io.device import (
@@ -20,11 +20,15 @@ from estimator.io.device import (
     Camera,
     DecodedSpot,
     DeviceFrame,
+    DeviceNumber,
+    Luminaire,
+    MapDatum,
     Part,
     Sensor,
     decoding_problem,
     depth_problem,
     leds_by_id,
+    luminaires_by_id,
     regions_problem,
 )
 from estimator.io.records import Positive, Row, Triple, first_line, first_problem, read_rows
@@ -42,7 +46,9 @@ FRAME_COLUMNS = {
     "capturable": pa.bool_(),
     "accelerometer_m_s2": pa.list_(pa.float64()),
     "spots": pa.list_(SPOT_TYPE),
+    "device": pa.int64(),
 }
+OPTIONAL_COLUMNS = ("device",)
 
 
 class FrameRecord(Row):
@@ -58,6 +64,7 @@ class FrameRecord(Row):
     capturable: bool
     accelerometer_m_s2: Triple
     spots: Annotated[tuple[DecodedSpot, ...], Strict(False)]
+    device: DeviceNumber = 0
 
     @field_validator("file")
     @classmethod
@@ -85,6 +92,8 @@ class _Description(Row):
     accelerometer: Accelerometer
     led_map: tuple[AnyLed, ...]
     room_m: tuple[Positive, Positive, Positive]
+    luminaires: tuple[Luminaire, ...] = ()
+    map_datum: MapDatum | None = None
 
     @field_validator("led_map")
     @classmethod
@@ -92,12 +101,17 @@ class _Description(Row):
         leds_by_id(leds)
         return leds
 
+    @model_validator(mode="after")
+    def _luminaires_of_leds(self) -> Self:
+        luminaires_by_id(self.luminaires, self.led_map)
+        return self
+
 
 @dataclass(frozen=True)
 class Dataset:
     """Device knowledge of a dataset, and its frame records; `read_frame` reads the images, a frame at a time.
 
-    `cameras` are by name, `leds` by id; `room_m` is the room's extent along x, y and z, metres.
+    `cameras` are by name, `leds` and `luminaires` by id; `room_m` is the room's extent along x, y and z, metres.
     """
 
     folder: Path
@@ -108,6 +122,8 @@ class Dataset:
     leds: dict[int, AnyLed]
     room_m: tuple[float, float, float]
     frames: tuple[FrameRecord, ...]
+    luminaires: dict[int, Luminaire] = field(default_factory=dict)
+    map_datum: MapDatum | None = None
 
 
 def read_dataset(path: str | Path) -> Dataset:
@@ -153,7 +169,9 @@ def read_dataset(path: str | Path) -> Dataset:
         accelerometer=description.accelerometer,
         leds=leds_by_id(description.led_map),
         room_m=description.room_m,
-        frames=read_rows(folder / "frames.parquet", FRAME_COLUMNS, FrameRecord),
+        frames=read_rows(folder / "frames.parquet", FRAME_COLUMNS, FrameRecord, OPTIONAL_COLUMNS),
+        luminaires=luminaires_by_id(description.luminaires, description.led_map),
+        map_datum=description.map_datum,
     )
     _check_frames(folder / "frames.parquet", dataset, description.frame_count)
     return dataset
@@ -218,6 +236,9 @@ def read_frame(dataset: Dataset, frame: FrameRecord | int, *, with_other_cameras
         record.exposure_s,
         record.spots,
         dataset.leds,
+        luminaires=dataset.luminaires,
+        map_datum=dataset.map_datum,
+        device=record.device,
     )
     if not with_other_cameras:
         return made

@@ -3,15 +3,15 @@
 import json
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, Strict, ValidationError, field_validator, model_validator
+from pydantic import ConfigDict, Field, Strict, ValidationError, field_validator, model_validator
 
 from estimator.errors import InputError
-from estimator.io.records import NotNegative, Number, Positive, Row, Triple, first_problem
+from estimator.io.records import NotNegative, NotNegativeTriple, Number, Positive, Row, Triple, first_problem
 
 Floats = NDArray[np.float64]
 
@@ -21,6 +21,7 @@ MAX_SENSOR_AREAS = 16
 # Pixels within this many standard deviations of the full well count as possibly full.
 FULL_SIGMA = 4.0
 LedId = Annotated[int, Field(ge=0, le=INT64_MAX)]
+DeviceNumber = Annotated[int, Field(ge=0, le=INT64_MAX)]
 # Within 1000 km of the origin: any range to an LED, even a wrong one, can then be written.
 Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
 
@@ -36,7 +37,12 @@ def to_pixels(image: Floats, K: Floats) -> Floats:
 
 
 class Distortion(Row):
-    """Brown-Conrady coefficients in OpenCV's convention, for normalized image coordinates."""
+    """Brown-Conrady coefficients in OpenCV's convention, for normalized image coordinates.
+
+    Other keys are refused: a coefficient that this model lacks must not be dropped silently.
+    """
+
+    model_config = ConfigDict(extra="forbid")
 
     k1: Number
     k2: Number
@@ -45,10 +51,55 @@ class Distortion(Row):
     p2: Number
 
 
+IntrinsicName = Literal["focal", "aspect", "cx_px", "cy_px", "k1", "p1", "p2"]
+INTRINSICS: tuple[IntrinsicName, ...] = ("focal", "aspect", "cx_px", "cy_px", "k1", "p1", "p2")
+"""Names of the errors of a camera's intrinsics, in the order of all arrays of them.
+
+True from stated: fx (1 + focal) (1 + aspect / 2), fy (1 + focal) (1 - aspect / 2), cx + cx_px, cy + cy_px, and the
+coefficients of distortion plus k1, p1, p2. `focal` and `aspect` are relative, cx_px and cy_px in pixels.
+"""
+
+
+class CameraUncertainty(Row):
+    """Standard deviations of the stated intrinsics and mounting of a camera; keys as in dataset.json.
+
+    The errors are independent and normal. Those of `device_sigma` are the same in every frame of a device, those of
+    `shot_sigma` new in every frame. `offset_sigma_m` and `rotation_sigma_deg` are those of the mounting on the rig,
+    along and about each axis.
+    """
+
+    parameters: tuple[IntrinsicName, ...]
+    device_sigma: tuple[NotNegative, ...]
+    shot_sigma: tuple[NotNegative, ...]
+    offset_sigma_m: NotNegative
+    rotation_sigma_deg: NotNegative
+
+    @model_validator(mode="after")
+    def _one_of_each(self) -> Self:
+        if len(set(self.parameters)) != len(self.parameters):
+            raise ValueError("parameters have to be unique")
+        if not len(self.parameters) == len(self.device_sigma) == len(self.shot_sigma):
+            raise ValueError("device_sigma and shot_sigma need one number for each of parameters")
+        return self
+
+    def device_sigmas(self) -> Floats:
+        """Standard deviations (7,) of the errors of a device, in the order of INTRINSICS; 0 where there is no entry."""
+        return self._in_order(self.device_sigma)
+
+    def shot_sigmas(self) -> Floats:
+        """Standard deviations (7,) of the errors of a frame, in the order of INTRINSICS; 0 where there is no entry."""
+        return self._in_order(self.shot_sigma)
+
+    def _in_order(self, sigmas: tuple[float, ...]) -> Floats:
+        stated: dict[str, float] = dict(zip(self.parameters, sigmas, strict=True))
+        return np.array([stated.get(name, 0.0) for name in INTRINSICS])
+
+
 class Camera(Row):
     """Camera of a device: intrinsics, lens, and mounting on the rig; keys as in dataset.json.
 
-    `K` maps normalized image coordinates to continuous pixels with pixel centres at +0.5.
+    `K` maps normalized image coordinates to continuous pixels with pixel centres at +0.5. `uncertainty` is None where
+    the device does not state how well it knows its camera.
     """
 
     width_px: int = Field(ge=1, le=65536)
@@ -66,6 +117,7 @@ class Camera(Row):
     psf_kernel: tuple[tuple[Number, ...], ...] | None
     R_cam_rig: tuple[Triple, Triple, Triple]
     offset_m: Triple
+    uncertainty: CameraUncertainty | None = None
 
     @field_validator("K")
     @classmethod
@@ -78,6 +130,10 @@ class Camera(Row):
     def _no_distortion_of_a_fish_eye(self) -> Self:
         if self.projection == "equidistant" and self.distortion is not None:
             raise ValueError('distortion has to be null with projection "equidistant"')
+        if self.projection == "equidistant" and self.uncertainty is not None:
+            of_distortion = [INTRINSICS.index(name) for name in ("k1", "p1", "p2")]
+            if (self.uncertainty.device_sigmas() + self.uncertainty.shot_sigmas())[of_distortion].any():
+                raise ValueError('sigmas of k1, p1 and p2 have to be 0 with projection "equidistant"')
         return self
 
     def matrix(self) -> Floats:
@@ -146,12 +202,40 @@ class Sensor(Row):
         return self.dsnu_e**2 + self.read_noise_e**2 + (self.adc_noise_dn * self.gain_e_per_dn) ** 2 + rounding
 
 
+class Luminaire(Row):
+    """Luminaire of the map: LEDs whose errors of position are common; keys as in dataset.json.
+
+    Its LEDs are shifted together by an error of standard deviation `sigma_m` along x, y, z, and turned together about
+    `position_m`, the mean of their positions, by one of `sigma_rotation_deg` about x, y, z.
+    """
+
+    id: LedId
+    position_m: Annotated[tuple[Coordinate, Coordinate, Coordinate], Strict(False)]
+    sigma_m: NotNegativeTriple
+    sigma_rotation_deg: NotNegativeTriple
+
+
+class MapDatum(Row):
+    """Standard deviations of the map's origin, along x, y, z, and of its scale about the origin, parts per million."""
+
+    sigma_m: NotNegativeTriple
+    scale_sigma_ppm: NotNegative
+
+
 class Led(Row):
-    """LED of the map: identity, and centre of its horizontal face, world metres. See `DiscLed`, `SquareLed`."""
+    """LED of the map: identity, and centre of its horizontal face, world metres. See `DiscLed`, `SquareLed`.
+
+    `luminaire` is the id of its luminaire, None for none. Standard deviations are None where the device does not state
+    them: `sigma_m` of the position within the luminaire along x, y, z; `gradient_sigma` of gx and of gy, where the
+    luminance is L (1 + gx x / r + gy y / r) over a face of half width r.
+    """
 
     id: LedId
     position_m: Annotated[tuple[Coordinate, Coordinate, Coordinate], Strict(False)]
     shape: str
+    luminaire: LedId | None = None
+    sigma_m: NotNegativeTriple | None = None
+    gradient_sigma: NotNegative | None = None
 
     @property
     @abstractmethod
@@ -160,20 +244,31 @@ class Led(Row):
 
     @property
     @abstractmethod
+    def size_sigma_m(self) -> float | None:
+        """Standard deviation of the half width, metres; None where the device does not state it."""
+
+    @property
+    @abstractmethod
     def mean_square_extent_m2(self) -> float:
         """Mean of x^2 over the face, x measured from the centre along any direction of the face, m^2."""
 
 
 class DiscLed(Led):
-    """Disc of radius `radius_m`."""
+    """Disc of radius `radius_m`, of standard deviation `radius_sigma_m`."""
 
     shape: Literal["disc"] = "disc"
     radius_m: Positive
+    radius_sigma_m: NotNegative | None = None
 
     @model_validator(mode="before")
     @classmethod
     def _has_no_side(cls, entry: Any) -> Any:
         return _without_key(entry, "side_m", "a disc has radius_m, not side_m")
+
+    @property
+    def size_sigma_m(self) -> float | None:
+        """Standard deviation of the half width, metres."""
+        return self.radius_sigma_m
 
     @property
     def half_width_m(self) -> float:
@@ -187,15 +282,21 @@ class DiscLed(Led):
 
 
 class SquareLed(Led):
-    """Square of side `side_m`, its sides along x and y of the world."""
+    """Square of side `side_m`, of standard deviation `side_sigma_m`; its sides are along x and y of the world."""
 
     shape: Literal["square"] = "square"
     side_m: Positive
+    side_sigma_m: NotNegative | None = None
 
     @model_validator(mode="before")
     @classmethod
     def _has_no_radius(cls, entry: Any) -> Any:
         return _without_key(entry, "radius_m", "a square has side_m (the whole side), not radius_m")
+
+    @property
+    def size_sigma_m(self) -> float | None:
+        """Standard deviation of the half width, metres."""
+        return None if self.side_sigma_m is None else self.side_sigma_m / 2
 
     @property
     def half_width_m(self) -> float:
@@ -227,6 +328,21 @@ def leds_by_id(leds: Iterable[AnyLed]) -> dict[int, AnyLed]:
     return mapped
 
 
+def luminaires_by_id(luminaires: Iterable[Luminaire], leds: Iterable[Led]) -> dict[int, Luminaire]:
+    """Luminaires by id; raises ValueError for an id that occurs twice, and for one that an LED names and is missing.
+
+    Without any luminaires, which states nothing of them, LEDs may still say which of them belong together.
+    """
+    entries = list(luminaires)
+    mapped = {luminaire.id: luminaire for luminaire in entries}
+    if len(mapped) != len(entries):
+        raise ValueError("luminaire ids have to be unique")
+    for led in leds:
+        if mapped and led.luminaire is not None and led.luminaire not in mapped:
+            raise ValueError(f"LED {led.id} names luminaire {led.luminaire}, which is not in luminaires")
+    return mapped
+
+
 class DecodedSpot(Row):
     """Decoded identity: the LED that a demodulator reports near this pixel. The pixel is rough, not a centroid."""
 
@@ -249,11 +365,14 @@ class Accelerometer(Row):
     """Error of the accelerometer as the device knows it, degrees, one standard deviation.
 
     Of kind "tilt-error" it is the error of each tilt; of kind "imu" the error of the direction of gravity, along each
-    of two perpendicular axes.
+    of two perpendicular axes. `device_error_deg` is the part of it that is the same in every frame of a device, and
+    `shot_error_deg` the part that is new in every frame; None where the device does not state them.
     """
 
     kind: Literal["tilt-error", "imu"]
     error_deg: NotNegative
+    device_error_deg: NotNegative | None = None
+    shot_error_deg: NotNegative | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -286,6 +405,12 @@ class DeviceFrame:
     leds: Mapping[int, Led]
     other_cameras: "tuple[DeviceFrame, ...]" = ()
     """Frames of the rig's other cameras of the same shot; their own `other_cameras` are empty."""
+    luminaires: Mapping[int, Luminaire] = field(default_factory=dict)
+    """Luminaires by id; empty where the device does not state how well it knows the map."""
+    map_datum: MapDatum | None = None
+    """Accuracy of the map's origin and scale; None where the device does not state it."""
+    device: int = 0
+    """Number of the device in its dataset: frames of one device share the errors of its camera and accelerometer."""
 
     def electrons(self, part: Part) -> NDArray[np.float32]:
         """Electrons above the black level of a part, (rows, columns)."""
@@ -312,6 +437,9 @@ class _Record(Row):
     exposure_s: Positive
     accelerometer_m_s2: Triple
     spots: tuple[DecodedSpot, ...]
+    luminaires: tuple[Luminaire, ...] = ()
+    map_datum: MapDatum | None = None
+    device: DeviceNumber = 0
 
 
 class _Origin(Row):
@@ -331,7 +459,8 @@ def frame(record: Mapping[str, Any]) -> DeviceFrame:
         (x, y, z in camera axes, m/s^2) and `spots` (`{led, u_px, v_px}`) as in frames.parquet; and `parts`, a sequence
         of `{"row": int, "column": int, "image_dn": array}`, where `image_dn` (rows, columns) uint32 holds digital
         numbers and its first pixel is pixel (row, column) of the sensor. NumPy arrays and scalars may stand for lists
-        and numbers. Other keys are ignored.
+        and numbers. What the device does not state may be missing: `luminaires`, `map_datum`, `device` (0), and in
+        `camera`, `accelerometer` and `led_map` the keys of standard deviations. Other keys are ignored.
 
     Returns
     -------
@@ -349,6 +478,7 @@ def frame(record: Mapping[str, Any]) -> DeviceFrame:
         text = json.dumps({key: record[key] for key in _Record.model_fields if key in record}, default=_plain)
         known = _Record.model_validate_json(text)
         leds = leds_by_id(known.led_map)
+        luminaires = luminaires_by_id(known.luminaires, known.led_map)
     except ValidationError as error:
         raise InputError(f"record: {first_problem(error)}") from None
     except (TypeError, ValueError) as error:
@@ -364,6 +494,9 @@ def frame(record: Mapping[str, Any]) -> DeviceFrame:
         exposure_s=known.exposure_s,
         spots=known.spots,
         leds=leds,
+        luminaires=luminaires,
+        map_datum=known.map_datum,
+        device=known.device,
     )
 
 

@@ -1,6 +1,6 @@
 """Parquet files as validated rows, and one-line messages about invalid ones."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, TypeVar
 
@@ -27,6 +27,7 @@ Size = Annotated[float, Field(ge=0)]
 """Computed, and so allowed to exceed MAX_NUMBER."""
 # Arrow returns lists: convert the container, keep the numbers strict.
 Triple = Annotated[tuple[Number, Number, Number], Strict(False)]
+NotNegativeTriple = Annotated[tuple[NotNegative, NotNegative, NotNegative], Strict(False)]
 
 MIN_VARIANCE = 1e-60
 """Smaller variances would overflow in e^T C^-1 e."""
@@ -74,14 +75,20 @@ def first_problem(error: ValidationError) -> str:
     return f"{where}: {problem['msg']}{got}"
 
 
-def read_rows(path: Path, columns: Mapping[str, pa.DataType], row: type[RowT]) -> tuple[RowT, ...]:
+def read_rows(
+    path: Path, columns: Mapping[str, pa.DataType], row: type[RowT], optional: Collection[str] = ()
+) -> tuple[RowT, ...]:
     """Read the named columns of a Parquet file as rows of a model; other columns are ignored.
+
+    The columns in `optional` may be missing; the model then needs a default.
 
     Raises InputError if the file is missing or damaged, a column is missing or of another type, or a value is not
     allowed.
     """
     try:
         with pq.ParquetFile(path) as file:
+            missing = {name for name in optional if name not in file.schema_arrow.names}
+            columns = {name: kind for name, kind in columns.items() if name not in missing}
             _check_columns(path, file.schema_arrow, columns)
             records = file.read(columns=list(columns)).to_pylist()
     except InputError:

@@ -51,6 +51,8 @@ class Camera(Settings):
     """Focal length over the diameter of the pupil."""
     principal_point_px: tuple[float, float] | None = None
     """Pixel (u, v) where the optical axis meets the sensor; the image's centre where not given."""
+    aspect_ratio: Annotated[float, Field(ge=0.5, le=2)] = 1.0
+    """fx / fy of K, for an image with another scale across than down. The mean of fx and fy is f_i in pixels."""
     skew_px: Annotated[float, Field(ge=-1e4, le=1e4)] = 0.0
     """Skew of the pixel axes, K[0, 1], px."""
     transmittance: Annotated[float, Field(gt=0, le=1)] = 0.9
@@ -149,10 +151,17 @@ class Camera(Settings):
         return self.image_distance_mm * 1000 / self.pixel_pitch_um
 
     @property
+    def focal_xy_px(self) -> tuple[float, float]:
+        """(fx, fy): the scale of the image across and down, with the mean `focal_px`."""
+        fy = 2 * self.focal_px / (1 + self.aspect_ratio)
+        return self.aspect_ratio * fy, fy
+
+    @property
     def matrix(self) -> NDArray[np.float64]:
         """K, shape (3, 3): [u, v, 1] ~ K p_cam."""
         u, v = self.center_px
-        return np.array([[self.focal_px, self.skew_px, u], [0.0, self.focal_px, v], [0.0, 0.0, 1.0]])
+        fx, fy = self.focal_xy_px
+        return np.array([[fx, self.skew_px, u], [0.0, fy, v], [0.0, 0.0, 1.0]])
 
     def view_angles_deg(self) -> tuple[float, float]:
         """Full angles of view across and down, for a sensor centred on the axis.
@@ -162,8 +171,9 @@ class Camera(Settings):
         half = np.array([-0.5, 0.5])
         zero = np.zeros(2)
         lens = self.lens_projection
-        x, _, zx = lens.unproject(half * self.width_px / self.focal_px, zero)
-        _, y, zy = lens.unproject(zero, half * self.height_px / self.focal_px)
+        fx, fy = self.focal_xy_px
+        x, _, zx = lens.unproject(half * self.width_px / fx, zero)
+        _, y, zy = lens.unproject(zero, half * self.height_px / fy)
         left, right = np.degrees(np.arctan2(x, zx))
         top, bottom = np.degrees(np.arctan2(y, zy))
         return float(right - left), float(bottom - top)

@@ -12,12 +12,14 @@ from vlcrender.config.toml_model import override, read_toml
 from vlcrender.errors import InputError
 
 FOLDER = Path(__file__).parent / "preset_files"
-KINDS = {"sensor": "sensors", "accelerometer": "accelerometers"}
+KINDS = {"sensor": "sensors", "accelerometer": "accelerometers", "belief": "beliefs"}
 """Folder of the presets, by table of a recipe."""
+NOT_OF_PRESETS = {"belief": ("devices", "maps", "stated_factor")}
+"""Keys of a recipe's table that its presets leave alone, and that stay where an assignment names another preset."""
 
 
 def presets(kind: str) -> tuple[str, ...]:
-    """Names of the presets of a kind, "sensors" or "accelerometers", sorted."""
+    """Names of the presets of a kind, "sensors", "accelerometers" or "beliefs", sorted."""
     return tuple(sorted(path.stem for path in (FOLDER / kind).glob("*.toml")))
 
 
@@ -44,7 +46,10 @@ def with_presets(tree: Mapping[str, Any], assignments: Iterable[str], source: st
             tree = _merged(_named(kind, key, table["preset"], source), own)
         for assignment in chosen[key]:
             name = override({}, [assignment])[key]["preset"]
-            tree = _merged({**tree, key: {}}, _named(kind, key, name, source))  # no key of another preset remains
+            table = tree.get(key)
+            stays = NOT_OF_PRESETS.get(key, ())
+            kept = {own: value for own, value in table.items() if own in stays} if isinstance(table, dict) else {}
+            tree = _merged({**tree, key: kept}, _named(kind, key, name, source))  # no key of another preset remains
     return override(tree, [a for a in given if not any(a in of_key for of_key in chosen.values())])
 
 
@@ -56,9 +61,9 @@ def _named(kind: str, key: str, name: object, source: str) -> dict[str, Any]:
 
 
 def _merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """Two trees merged to the depth of a recipe's first level of tables; keys of `over` override."""
+    """Two trees merged table by table, to any depth; keys of `over` override."""
     result = dict(base)
     for key, value in over.items():
         both = isinstance(value, dict) and isinstance(result.get(key), dict)
-        result[key] = {**result[key], **value} if both else value
+        result[key] = _merged(result[key], value) if both else value
     return result

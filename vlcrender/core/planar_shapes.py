@@ -1,4 +1,4 @@
-"""Shapes of LED faces in their own plane, and the exact area that each shares with a polygon."""
+"""Shapes of LED faces in their own plane, and the exact area and moments that each shares with a polygon."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -47,6 +47,10 @@ class Disc:
         """Area that the face shares with each polygon (n, vertices, 2) in its plane, (n,)."""
         return circle_polygon_area(quads, self.radius_m)
 
+    def shared_moments(self, quads: Array) -> Array:
+        """Integrals of 1, x, y and x^2 + y^2 over what the face shares with each polygon (n, vertices, 2), (4, n)."""
+        return circle_polygon_moments(quads, self.radius_m)
+
 
 @dataclass(frozen=True)
 class Rectangle:
@@ -94,6 +98,12 @@ class Rectangle:
         width, depth = self.size_m
         return rectangle_polygon_area(self._rotated(quads, -1), width / 2, depth / 2)
 
+    def shared_moments(self, quads: Array) -> Array:
+        """Integrals of 1, x, y and x^2 + y^2 over what the face shares with each polygon (n, vertices, 2), (4, n)."""
+        width, depth = self.size_m
+        area, x, y, second = rectangle_polygon_moments(self._rotated(quads, -1), width / 2, depth / 2)
+        return np.stack([area, *np.moveaxis(self._rotated(np.stack([x, y], axis=-1), 1), -1, 0), second])
+
     def _rotated(self, points: Array, sense: int) -> Array:
         if self.yaw_deg == 0:
             return points
@@ -108,6 +118,36 @@ def circle_polygon_area(polygons: Array, radius: float) -> Array:
     polygons: (n, vertices, 2), any orientation. Returns (n,), >= 0. Sum over the edges of the signed area that the disc
     shares with the triangle of the origin and the edge: a triangle where the edge is inside, a sector where outside.
     """
+    p, a, b, q, at_center = _crossings_of_circle(polygons, radius)
+    inside = _cross(a, b) / 2
+    outside = radius**2 / 2 * (_angle(p, a) + np.where(at_center, 0.0, _angle(b, q)))
+    area: Array = np.abs((inside + outside).sum(axis=1))
+    return area
+
+
+def circle_polygon_moments(polygons: Array, radius: float) -> Array:
+    """Integrals of 1, x, y and x^2 + y^2 over what the disc of this radius about the origin shares with each polygon.
+
+    polygons: (n, vertices, 2), any orientation. Returns (4, n). The same triangles and sectors as in
+    `circle_polygon_area`: a triangle of the origin, a and b has the first moment area (a + b) / 3 and the second
+    area (a.a + a.b + b.b) / 6; a sector between unit vectors e and f has radius^3 / 3 (f_y - e_y, e_x - f_x) and
+    radius^4 angle / 4.
+    """
+    p, a, b, q, at_center = _crossings_of_circle(polygons, radius)
+    angle = _angle(p, a) + np.where(at_center, 0.0, _angle(b, q))
+    turn = _unit(a) - _unit(p) + np.where(at_center[..., None], 0.0, _unit(q) - _unit(b))
+    moments = _triangle_moments(a, b)
+    moments[0] += radius**2 / 2 * angle
+    moments[1] += radius**3 / 3 * turn[..., 1]
+    moments[2] -= radius**3 / 3 * turn[..., 0]
+    moments[3] += radius**4 / 4 * angle
+    return _oriented(moments.sum(axis=-1))
+
+
+def _crossings_of_circle(polygons: Array, radius: float) -> tuple[Array, Array, Array, Array, NDArray[np.bool_]]:
+    """Of each edge from p to q: its vertices, the ends a and b of its part inside the circle about the origin, and
+    whether q is the centre to rounding. Where no part is inside, a = b = p.
+    """
     p = polygons
     q = np.roll(polygons, -1, axis=1)
     edge = q - p
@@ -121,12 +161,9 @@ def circle_polygon_area(polygons: Array, radius: float) -> Array:
     leave = np.where(meets, np.clip(t_mid + half, 0.0, 1.0), 0.0)
     a = p + enter[..., None] * edge
     b = p + leave[..., None] * edge
-    inside = _cross(a, b) / 2
     # b is q where q is inside, except for rounding, which near the centre may change its direction by any angle.
     at_center = (q**2).sum(-1) < (1e-3 * radius) ** 2
-    outside = radius**2 / 2 * (_angle(p, a) + np.where(at_center, 0.0, _angle(b, q)))
-    area: Array = np.abs((inside + outside).sum(axis=1))
-    return area
+    return p, a, b, q, at_center
 
 
 def rectangle_polygon_area(polygons: Array, half_x: float, half_y: float) -> Array:
@@ -136,6 +173,21 @@ def rectangle_polygon_area(polygons: Array, half_x: float, half_y: float) -> Arr
     point: points inside stay, points outside collapse onto the rectangle's sides and enclose no area. The moved polygon
     has additional vertices where an edge crosses the line of a side. The result is continuous where edges coincide.
     """
+    moved = _moved_into_rectangle(polygons, half_x, half_y)
+    area: Array = np.abs(_cross(moved, np.roll(moved, -1, axis=1)).sum(axis=1)) / 2
+    return area
+
+
+def rectangle_polygon_moments(polygons: Array, half_x: float, half_y: float) -> Array:
+    """Integrals of 1, x, y and x^2 + y^2 over what the rectangle shares with each polygon, (4, n).
+
+    Arguments as of `rectangle_polygon_area`.
+    """
+    moved = _moved_into_rectangle(polygons, half_x, half_y)
+    return _oriented(_triangle_moments(moved, np.roll(moved, -1, axis=1)).sum(axis=-1))
+
+
+def _moved_into_rectangle(polygons: Array, half_x: float, half_y: float) -> Array:
     limits = np.array([half_x, half_y])
     p = polygons
     edge = np.roll(polygons, -1, axis=1) - p
@@ -144,9 +196,25 @@ def rectangle_polygon_area(polygons: Array, half_x: float, half_y: float) -> Arr
     # an edge parallel to a side does not cross it
     crossings = np.clip(np.nan_to_num(crossings, nan=0.0, posinf=0.0, neginf=0.0), 0.0, 1.0)
     t = np.concatenate([np.zeros((*p.shape[:-1], 1)), np.sort(crossings, axis=-1)], axis=-1)
-    moved = np.clip(p[:, :, None] + t[..., None] * edge[:, :, None], -limits, limits).reshape(len(p), 5 * p.shape[1], 2)
-    area: Array = np.abs(_cross(moved, np.roll(moved, -1, axis=1)).sum(axis=1)) / 2
-    return area
+    return np.clip(p[:, :, None] + t[..., None] * edge[:, :, None], -limits, limits).reshape(len(p), 5 * p.shape[1], 2)
+
+
+def _triangle_moments(a: Array, b: Array) -> Array:
+    """Signed integrals of 1, x, y and x^2 + y^2 over triangles of the origin and the points a, b (..., 2), (4, ...)."""
+    area = _cross(a, b) / 2
+    second = area / 6 * ((a * a).sum(-1) + (a * b).sum(-1) + (b * b).sum(-1))
+    return np.stack([area, *(area / 3 * np.moveaxis(a + b, -1, 0)), second])
+
+
+def _oriented(moments: Array) -> Array:
+    """Signed moments (4, n) with the sign that makes the area positive."""
+    oriented: Array = moments * np.where(moments[0] < 0, -1.0, 1.0)
+    return oriented
+
+
+def _unit(points: Array) -> Array:
+    unit: Array = points / np.maximum(np.hypot(points[..., 0], points[..., 1]), np.finfo(float).tiny)[..., None]
+    return unit
 
 
 def _cross(a: Array, b: Array) -> Array:

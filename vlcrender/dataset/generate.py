@@ -24,20 +24,26 @@ from vlcrender.dataset.recipe import Plan, Recipe
 from vlcrender.dataset.schema import (
     DATA_VERSION,
     FORMAT_VERSION,
-    AccelerometerEntry,
     DatasetFile,
+    DeviceTruthRow,
     FrameRecord,
     FrameRow,
+    MapTruthRow,
     SensorEntry,
     TruthRow,
+    accelerometer_entry,
     camera_entry,
     led_map,
+    luminaire_entries,
+    map_datum_entry,
 )
 from vlcrender.dataset.tables import write_table
+from vlcrender.dataset.true_world import built_leds, device_of_pose, device_rows, map_rows, true_camera
 from vlcrender.dataset.verify import extra_folders, missing_files, verify
 from vlcrender.errors import InputError
 from vlcrender.light.lightmap import bake, room_mesh
 from vlcrender.rendering.renderer import check_inside, share_cores
+from vlcrender.scene.as_built import luminaires_of
 
 log = logging.getLogger(__name__)
 
@@ -53,7 +59,7 @@ def generate(
 
     Resumes an interrupted run of the same plan. `workers` is the number of processes; `scheduler` is the address of a
     dask scheduler whose workers share the folder. `progress` is called with each report. Raises InputError where the
-    folder holds anything else, and where a pose or the furniture of the plan is impossible.
+    folder holds anything else, and where a pose, the furniture, or a true camera or LED of the plan is impossible.
     """
     report = progress or (lambda report: None)
     try:
@@ -70,9 +76,13 @@ def generate(
         return False
     for pose_number in range(plan.recipe.poses.count):  # an impossible pose ends the run before the first frame
         for which in range(len(plan.recipe.cameras)):
-            _, during = poses_of(plan.recipe, plan.scene, pose_number, which)
+            mounted = true_camera(plan.recipe, which, device_of_pose(plan.recipe, pose_number))
+            _, during = poses_of(plan.recipe, plan.scene, pose_number, mounted)
             check_inside(plan.scene, during[0])
             check_inside(plan.scene, during[-1])
+    if plan.recipe.belief is not None:
+        for map_number in range(plan.recipe.belief.maps):  # an impossible LED, too
+            built_leds(plan.recipe, plan.scene, map_number)
     room_mesh(plan.scene)  # impossible furniture ends the run before anything is written
     _prepare(directory, provenance, plan.recipe)
     job = Job(
@@ -248,15 +258,26 @@ def _finish(plan: Plan, directory: Path, provenance: dict[str, Any], records: li
     recipe, scene = plan.recipe, plan.scene
     write_table(directory / "frames.parquet", [record.device for record in records], FrameRow)
     write_table(directory / "truth.parquet", [record.truth for record in records], TruthRow)
+    sigmas = luminaires = None
+    if recipe.belief is not None:
+        sigmas = recipe.belief.stated_sigmas(recipe.cameras, recipe.accelerometer)
+        luminaires = luminaires_of(scene.settings, scene.leds)
+        write_table(directory / "truth_devices.parquet", device_rows(recipe), DeviceTruthRow)
+        write_table(directory / "truth_map.parquet", map_rows(recipe, scene), MapTruthRow)
     dataset = DatasetFile(
         format="vlcrender-dataset",
         version=FORMAT_VERSION,
         name=recipe.name,
         frame_count=len(records),
-        cameras={mounted.name: camera_entry(mounted) for mounted in recipe.cameras},
+        cameras={
+            mounted.name: camera_entry(mounted, None if sigmas is None else sigmas.cameras[mounted.name])
+            for mounted in recipe.cameras
+        },
         sensor=SensorEntry(**recipe.sensor.acting()),
-        accelerometer=AccelerometerEntry(kind=recipe.accelerometer.kind, error_deg=recipe.accelerometer.error_deg),
-        led_map=led_map(scene.leds),
+        accelerometer=accelerometer_entry(recipe.accelerometer, sigmas),
+        led_map=led_map(scene.leds, luminaires, sigmas),
+        luminaires=() if luminaires is None or sigmas is None else luminaire_entries(luminaires, sigmas),
+        map_datum=None if sigmas is None else map_datum_entry(sigmas),
         room_m=scene.settings.room.size_m,
         provenance=provenance,
     )

@@ -15,6 +15,7 @@ from vlcrender.config.packaged import find_file
 from vlcrender.config.presets import with_presets
 from vlcrender.config.toml_model import Settings, check, read_toml
 from vlcrender.dataset.auto_exposure import Metering, NoiseLevelMetering
+from vlcrender.dataset.belief import Belief
 from vlcrender.dataset.motion import Motion
 from vlcrender.dataset.pose_sampling import AimedPoses, Poses
 from vlcrender.errors import InputError
@@ -69,6 +70,8 @@ class Recipe(Settings):
     """Motion of the rig during each exposure; at rest where not given."""
     rig: tuple[RigCamera, ...] = ()
     """Further cameras, mounted beside `main` and exposed at the same time."""
+    belief: Belief | None = None
+    """What the device does not know; where not given, the device knows all exactly and no uncertainty is stated."""
 
     @model_validator(mode="after")
     def _one_way_to_expose(self) -> Self:
@@ -113,6 +116,19 @@ class Recipe(Settings):
             raise ValueError(
                 f"regions.overscan = true: camera {bent[0]!r} has a distortion, undefined far beyond the sensor; "
                 "remove overscan or the distortion"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _overscan_needs_a_lens_without_distortion_errors(self) -> Self:
+        if self.belief is None or self.regions is None or not self.regions.overscan:
+            return self
+        table = self.belief.camera
+        perspective = any(c.camera.projection == "perspective" for c in self.cameras)
+        if perspective and (table.radial_corner_um or table.decentering_corner_um):
+            raise ValueError(
+                "regions.overscan = true: [belief.camera] gives lenses a distortion, undefined far beyond the sensor; "
+                "remove overscan, or set belief.camera.radial_corner_um and decentering_corner_um to 0"
             )
         return self
 

@@ -15,7 +15,10 @@ from pydantic import Field
 from vlcrender.camera.distortion import Distortion
 from vlcrender.camera.rig import Mounted
 from vlcrender.config.toml_model import Settings
+from vlcrender.dataset.belief import CAMERA_PARAMETERS, CameraSigmas, Sigmas
+from vlcrender.scene.as_built import Luminaires
 from vlcrender.scene.leds import Leds
+from vlcrender.sensor.accelerometer import Imu, TiltError
 
 FORMAT_VERSION: Final = 4
 """`version` of dataset.json."""
@@ -26,12 +29,33 @@ Triple = tuple[float, float, float]
 Matrix = tuple[Triple, Triple, Triple]
 Flat9 = tuple[float, float, float, float, float, float, float, float, float]
 """A 3 x 3 matrix, row by row."""
+Five = tuple[float, float, float, float, float]
+"""Distortion: k1, k2, k3, p1, p2."""
+Seven = tuple[float, float, float, float, float, float, float]
+"""One number for each of belief.CAMERA_PARAMETERS."""
 
 
 def flat9(matrix: NDArray[np.float64]) -> Flat9:
     """A 3 x 3 matrix, row by row."""
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = matrix.tolist()
     return xx, xy, xz, yx, yy, yz, zx, zy, zz
+
+
+def five(distortion: Distortion | None) -> Five | None:
+    """The coefficients of a distortion; None without one."""
+    if distortion is None:
+        return None
+    return distortion.k1, distortion.k2, distortion.k3, distortion.p1, distortion.p2
+
+
+def _triple(numbers: NDArray[np.float64]) -> Triple:
+    x, y, z = numbers.tolist()
+    return x, y, z
+
+
+def _seven(numbers: NDArray[np.float64]) -> Seven:
+    a, b, c, d, e, f, g = numbers.tolist()
+    return a, b, c, d, e, f, g
 
 
 class SpotRow(Settings):
@@ -49,6 +73,8 @@ class FrameRow(Settings):
     frame: int
     shot: int
     pose: int
+    device: int
+    """Frames of one device share the errors of a device."""
     file: str
     """Path below the dataset, with `/`."""
     sha256: str
@@ -79,6 +105,12 @@ class TruthRow(Settings):
 
     frame: int
     shot: int
+    map: int
+    """The map of the LEDs that the frame shows."""
+    K: Flat9
+    """True intrinsics of this frame."""
+    distortion: Five | None
+    """True distortion of this frame."""
     position_m: Triple
     """Projection centre of this frame's camera, world."""
     R_cam_world: Flat9
@@ -87,7 +119,36 @@ class TruthRow(Settings):
     yaw_deg: float
     leds: tuple[LedTruth, ...]
     bound_m2: Flat9 | None
-    """Cramér-Rao bound of the position."""
+    """Cramér-Rao bound of the position; hybrid with a belief."""
+    bound_exact_m2: Flat9 | None
+    """Cramér-Rao bound of the position for a device that is told the truth."""
+
+
+class DeviceTruthRow(Settings):
+    """A row of truth_devices.parquet: the true camera and accelerometer of one device."""
+
+    device: int
+    map: int
+    camera: str
+    K: Flat9
+    """True intrinsics without the errors of a shot."""
+    distortion: Five | None
+    R_cam_rig: Flat9
+    offset_m: Triple
+    tilt_error_deg: tuple[float, float] | None
+    """Constant errors of the accelerometer on tilt_x and tilt_y; None for an IMU."""
+
+
+class MapTruthRow(Settings):
+    """A row of truth_map.parquet: one LED of one map as built."""
+
+    map: int
+    led: int
+    position_m: Triple
+    size_m: float
+    """Radius of a disc, side of a square."""
+    gradient: tuple[float, float]
+    """Relative change of luminance from the centre to the rim along x and y."""
 
 
 class FrameRecord(Settings):
@@ -133,6 +194,16 @@ FRAMES_SCHEMA = arrow_schema(FrameRow)
 TRUTH_SCHEMA = arrow_schema(TruthRow)
 
 
+class CameraUncertainty(Settings):
+    """Standard deviations of a camera's errors, as dataset.json states them."""
+
+    parameters: tuple[str, ...]
+    device_sigma: Seven
+    shot_sigma: Seven
+    offset_sigma_m: float
+    rotation_sigma_deg: float
+
+
 class CameraEntry(Settings):
     """A camera in dataset.json."""
 
@@ -151,6 +222,7 @@ class CameraEntry(Settings):
     psf_kernel: tuple[tuple[float, ...], ...] | None
     R_cam_rig: Matrix
     offset_m: Triple
+    uncertainty: CameraUncertainty | None
 
 
 class SensorEntry(Settings):
@@ -176,6 +248,8 @@ class AccelerometerEntry(Settings):
 
     kind: Literal["tilt-error", "imu"]
     error_deg: float
+    device_error_deg: float | None
+    shot_error_deg: float | None
 
 
 class DiscEntry(Settings):
@@ -185,6 +259,10 @@ class DiscEntry(Settings):
     position_m: Triple
     shape: Literal["disc"]
     radius_m: float
+    luminaire: int | None
+    sigma_m: Triple | None
+    radius_sigma_m: float | None
+    gradient_sigma: float | None
 
 
 class SquareEntry(Settings):
@@ -194,9 +272,29 @@ class SquareEntry(Settings):
     position_m: Triple
     shape: Literal["square"]
     side_m: float
+    luminaire: int | None
+    sigma_m: Triple | None
+    side_sigma_m: float | None
+    gradient_sigma: float | None
 
 
 LedMapEntry = Annotated[DiscEntry | SquareEntry, Field(discriminator="shape")]
+
+
+class LuminaireEntry(Settings):
+    """A luminaire in dataset.json: a panel, or a single LED."""
+
+    id: int
+    position_m: Triple
+    sigma_m: Triple
+    sigma_rotation_deg: Triple
+
+
+class MapDatumEntry(Settings):
+    """Standard deviations of the map as a whole in dataset.json."""
+
+    sigma_m: Triple
+    scale_sigma_ppm: float
 
 
 class DatasetFile(Settings):
@@ -210,25 +308,78 @@ class DatasetFile(Settings):
     sensor: SensorEntry
     accelerometer: AccelerometerEntry
     led_map: tuple[LedMapEntry, ...]
+    luminaires: tuple[LuminaireEntry, ...]
+    map_datum: MapDatumEntry | None
     room_m: Triple
     provenance: dict[str, Any]
 
 
-def camera_entry(mounted: Mounted) -> CameraEntry:
-    """The entry of a camera on a rig."""
+def camera_entry(mounted: Mounted, sigmas: CameraSigmas | None = None) -> CameraEntry:
+    """The entry of a camera on a rig, with the standard deviations that its device is told."""
     arrays = {"K": mounted.camera.matrix, "R_cam_rig": mounted.rotation, "offset_m": mounted.offset_m}
     own = {"image_distance_mm": mounted.camera.image_distance_mm, **{key: a.tolist() for key, a in arrays.items()}}
     shared = mounted.camera.model_dump(include=set(CameraEntry.model_fields) - set(own))
-    return CameraEntry.model_validate({**shared, **own})
+    uncertainty = None
+    if sigmas is not None:
+        uncertainty = CameraUncertainty(
+            parameters=CAMERA_PARAMETERS,
+            device_sigma=_seven(sigmas.device),
+            shot_sigma=_seven(sigmas.shot),
+            offset_sigma_m=sigmas.offset_m,
+            rotation_sigma_deg=sigmas.rotation_deg,
+        )
+    return CameraEntry.model_validate({**shared, **own, "uncertainty": uncertainty})
 
 
-def led_map(leds: Leds) -> tuple[DiscEntry | SquareEntry, ...]:
-    """The entries of all LEDs, in the order of the scene."""
+def accelerometer_entry(accelerometer: TiltError | Imu, sigmas: Sigmas | None = None) -> AccelerometerEntry:
+    """The entry of an accelerometer, with the standard deviations that its device is told."""
+    kind, error_deg = accelerometer.kind, accelerometer.error_deg
+    if sigmas is None:
+        return AccelerometerEntry(kind=kind, error_deg=error_deg, device_error_deg=None, shot_error_deg=None)
+    device_deg, shot_deg = sigmas.accelerometer_device_deg, sigmas.accelerometer_shot_deg
+    return AccelerometerEntry(
+        kind=kind,
+        error_deg=float(np.hypot(device_deg, shot_deg)),
+        device_error_deg=device_deg,
+        shot_error_deg=shot_deg,
+    )
+
+
+def led_map(
+    leds: Leds, luminaires: Luminaires | None = None, sigmas: Sigmas | None = None
+) -> tuple[DiscEntry | SquareEntry, ...]:
+    """The entries of all LEDs, in the order of the scene, with the standard deviations that devices are told."""
     entries: list[DiscEntry | SquareEntry] = []
-    for led, center, half_width, square in zip(leds.ids, leds.centers_m, leds.half_widths_m, leds.squares, strict=True):
-        x, y, z = map(float, center)
+    for i, (led, center, square) in enumerate(zip(leds.ids, leds.centers_m, leds.squares, strict=True)):
+        size_m = float(leds.half_widths_m[i]) * (2 if square else 1)
+        size_sigma_m = None if sigmas is None else sigmas.led_size * size_m
+        shared: dict[str, Any] = {
+            "id": int(led),
+            "position_m": _triple(center),
+            "luminaire": None if luminaires is None else int(luminaires.of_led[i]),
+            "sigma_m": None if sigmas is None else _triple(sigmas.led_m),
+            "gradient_sigma": None if sigmas is None else sigmas.led_gradient,
+        }
         if square:
-            entries.append(SquareEntry(id=int(led), position_m=(x, y, z), shape="square", side_m=2 * float(half_width)))
+            entries.append(SquareEntry(**shared, shape="square", side_m=size_m, side_sigma_m=size_sigma_m))
         else:
-            entries.append(DiscEntry(id=int(led), position_m=(x, y, z), shape="disc", radius_m=float(half_width)))
+            entries.append(DiscEntry(**shared, shape="disc", radius_m=size_m, radius_sigma_m=size_sigma_m))
     return tuple(entries)
+
+
+def luminaire_entries(luminaires: Luminaires, sigmas: Sigmas) -> tuple[LuminaireEntry, ...]:
+    """The entries of all luminaires, with the standard deviations that devices are told."""
+    return tuple(
+        LuminaireEntry(
+            id=number,
+            position_m=_triple(center),
+            sigma_m=_triple(sigmas.luminaire_m),
+            sigma_rotation_deg=_triple(sigmas.luminaire_rotation_deg),
+        )
+        for number, center in enumerate(luminaires.centers_m)
+    )
+
+
+def map_datum_entry(sigmas: Sigmas) -> MapDatumEntry:
+    """The standard deviations of the map as a whole that devices are told."""
+    return MapDatumEntry(sigma_m=_triple(sigmas.datum_m), scale_sigma_ppm=sigmas.datum_scale_ppm)

@@ -23,6 +23,9 @@ from vlcrender.scene.loader import Scene
 EDGE_GRID = 8
 """Rays across a pixel where surfaces meet: the error is about 0.3 / 8^1.5 = 1.3 % of the step between them."""
 
+MAX_RATES = 8
+"""Rates whose values of the vertices are kept; the one made first is dropped first."""
+
 
 @dataclass(frozen=True)
 class BackgroundRegion:
@@ -53,6 +56,8 @@ class Background:
         camera = posed.camera
         if rates not in self._values:
             self._values[rates] = self.room.values(self._light, rates.led, rates.ambient)
+            while len(self._values) > MAX_RATES:
+                del self._values[next(iter(self._values))]
         to_world = _opaque(posed.rotation.T)
 
         def ray(u: Any, v: Any) -> Any:

@@ -12,6 +12,7 @@ from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.roi import LedRegions, Roi
 from vlcrender.rendering.expected_image import ExpectedImage, ExpectedRegion, LedPatch
 from vlcrender.rendering.renderer import Renderer
+from vlcrender.scene.leds import Leds
 from vlcrender.scene.loader import Scene
 from vlcrender.sensor.quantum_efficiency import COLOURS
 
@@ -39,6 +40,10 @@ class MosaicRenderer:
     def scene(self) -> Scene:
         """The scene that is rendered."""
         return self.of_colours[0].scene
+
+    def with_leds(self, leds: Leds) -> "MosaicRenderer":
+        """As `Renderer.with_leds`."""
+        return replace(self, of_colours=tuple(renderer.with_leds(leds) for renderer in self.of_colours))
 
     def expected_image(
         self, posed: PosedCamera, regions: LedRegions | None = None, during: Sequence[Pose] | None = None

@@ -12,9 +12,20 @@ unknowns i and j is
 exact for Poisson counts (var = mu); for a sensor with further noise it is the information in the mean, without the
 information in the variance, which goes as 1 / mu. The derivatives with respect to the pose are central differences of
 images whose edges are exact. The accelerometer adds 1 / sigma^2 to each of the two tilts.
+
+The hybrid bound (Y. Rockah and P. Schultheiss, Array shape calibration using sources in unknown locations, IEEE Trans.
+ASSP 35(3), 1987) lets lens and map err too, by the sigmas of `Uncertainty`: each such error is an unknown with a normal
+prior, which adds 1 / sigma^2 to its own information. In units of the sigmas all priors are rows of the identity; the
+bound is found by QR from the slopes themselves, never from their products, because these lose the pose where priors are
+wide. Every unknown moves an LED's image as a motion of the LED's face in its own plane would: a shift and a linear
+deformation (`FaceMotions`). So the pixels of an image tell six numbers, whose slopes follow from those by the camera's
+x and y; all else is geometry. Unknowns that cannot be told apart, such as the map's datum and the position, therefore
+remain so in the last digit, as they would not with slopes by pixels for each. Motions within a face that are not linear
+are left out: of a disc they show nothing, and of a small square next to nothing.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +34,18 @@ from vlcrender.camera.intrinsics import Pose
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.rig import Mounted
 from vlcrender.camera.roi import LedRegions, RegionImage, Roi, led_regions
+from vlcrender.core.planar_shapes import Disc
 from vlcrender.rendering.expected_image import LedPatch
+from vlcrender.rendering.led_coverage import intersections_with_plane
+from vlcrender.rendering.led_radiance import face_of_led
+from vlcrender.rendering.uncertainty import (
+    INTRINSICS,
+    MapLevers,
+    Uncertainty,
+    intrinsics_displacements_px,
+    tilt_covariance_rad2,
+)
+from vlcrender.scene.leds import Leds
 
 Array = NDArray[np.float64]
 
@@ -36,6 +58,14 @@ that are hardly determined depend on small differences between slopes. Images ar
 1e-7."""
 MAX_CONDITION = 1e12
 """Condition number of the information, in units of the steps, above which a direction holds only rounding errors."""
+PIXELS_AT_ONCE = 100_000
+"""Pixels whose slopes are reduced together: bounds the memory for an LED as large as the image."""
+FACE_NUMBERS = 6
+"""Numbers of a linear motion of an LED's face: `FaceMotions`."""
+FACE_STEP = 1e-6
+"""Step of the differences of these motions, m or radian: 0.01 px of 15 000 px; they are right to some 1e-9."""
+OWN = 6
+"""Errors of an LED's own: x, y, z, size, and two tilts of its face."""
 
 Render = Callable[[PosedCamera], Sequence[LedPatch]]
 
@@ -58,48 +88,373 @@ def position_bound_m2(
     LEDs, roughly. tilt_sigmas_deg: standard deviations of the accelerometer on tilt_x and tilt_y; 0 means that both
     tilts are known. overscan: whether LEDs count beyond the sensor.
     """
+    slopes = FrameSlopes.rendered(mounted, main, render, exposure_s, variance_e2, distance_m, overscan)
+    return None if slopes is None else slopes.exact_bound_m2(tilt_sigmas_deg)
 
-    def patches_at(pose: Pose) -> Sequence[LedPatch]:
-        return render(mounted.posed(pose))
 
-    at_pose = patches_at(main)
-    if not at_pose:
-        return None
-    camera = mounted.camera
-    # Steps of x, y, z in metres and tilt_x, tilt_y, yaw in radians; each moves images by about STEP_PX.
-    angle = STEP_PX / camera.focal_px
-    steps = (angle * distance_m,) * 3 + (angle,) * 3
-    pairs = [
-        tuple({patch.led_id: patch for patch in patches_at(_moved(main, i, sign * step))} for sign in (1, -1))
-        for i, step in enumerate(steps)
-    ]
-    information = np.zeros((6, 6))
-    with_margin = LedRegions(kind="leds", margin_px=MARGIN_PX, overscan=overscan)
-    for box in led_regions((patch.roi for patch in at_pose), camera, with_margin):
-        for roi, variance in variance_e2:
-            if roi.overlaps(box):
-                common = roi.intersection(box)
-                inside = [patch for patch in at_pose if common.overlaps(patch.roi)]
+@dataclass(frozen=True)
+class FrameSlopes:
+    """The LED images of a frame and their changes with the pose: what every bound of the frame derives from."""
+
+    mounted: Mounted
+    main: Pose
+    at_pose: Sequence[LedPatch]
+    pairs: Sequence[tuple[Mapping[int, LedPatch], Mapping[int, LedPatch]]]
+    """For each unknown of the pose, patches by LED id at a step to either side."""
+    steps: tuple[float, ...]
+    """Steps of x, y, z in metres and tilt_x, tilt_y, yaw in radians."""
+    exposure_s: float
+    variance_e2: Sequence[RegionImage]
+    overscan: bool
+
+    @classmethod
+    def rendered(
+        cls,
+        mounted: Mounted,
+        main: Pose,
+        render: Render,
+        exposure_s: float,
+        variance_e2: Sequence[RegionImage],
+        distance_m: float,
+        overscan: bool = False,
+        unknowns: int = 6,
+    ) -> "FrameSlopes | None":
+        """Render a frame's LEDs at the steps of its pose; arguments as in `position_bound_m2`. None without LEDs.
+
+        unknowns: render the first ones of the pose only; `spot_covariances_px2` needs 2, the bounds all 6.
+        """
+
+        def patches_at(pose: Pose) -> Sequence[LedPatch]:
+            return render(mounted.posed(pose))
+
+        at_pose = patches_at(main)
+        if not at_pose:
+            return None
+        # Each step moves images by about STEP_PX.
+        angle = STEP_PX / mounted.camera.focal_px
+        steps = (angle * distance_m,) * 3 + (angle,) * 3
+        pairs = []
+        for i, step in enumerate(steps[:unknowns]):
+            plus, minus = (
+                {patch.led_id: patch for patch in patches_at(moved(main, i, sign * step))} for sign in (1, -1)
+            )
+            pairs.append((plus, minus))
+        return cls(mounted, main, at_pose, pairs, steps, exposure_s, variance_e2, overscan)
+
+    def exact_bound_m2(self, tilt_sigmas_deg: tuple[float, float]) -> Array | None:
+        """Bound of the position, (3, 3), m2, where lens and map are known; None where it is not determined."""
+        information = np.zeros((6, 6))
+        for box in self._boxes():
+            for common, inside, weight in self._parts(box):
                 slopes = np.stack(
                     [
-                        (_image(common, plus, inside) - _image(common, minus, inside)) * exposure_s / (2 * step)
-                        for (plus, minus), step in zip(pairs, steps, strict=True)
+                        (_image(common, plus, inside) - _image(common, minus, inside)) * self.exposure_s / (2 * step)
+                        for (plus, minus), step in zip(self.pairs, self.steps, strict=True)
                     ]
                 )
-                now = {patch.led_id: patch for patch in inside}
-                nuisances = [_image(common, now, [patch]) * exposure_s for patch in inside]
+                nuisances = [self._light(common, patch) for patch in inside]
                 nuisances.append(np.ones((common.rows, common.columns)))
-                weight = 1 / variance[roi.slices(common)].astype(np.float64)
                 information += _marginal(slopes, np.stack(nuisances), weight)
-    ends = [
-        [mounted.posed(_moved(main, i, sign * step)).pose.position_m for sign in (1, -1)]
-        for i, step in enumerate(steps)
-    ]
-    lever = np.diff(ends, axis=1)[:, 0].T / (-2 * np.array(steps))
-    return _position_covariance(information, np.radians(tilt_sigmas_deg), steps, lever)
+        return _position_covariance(information, np.radians(tilt_sigmas_deg), self.steps, self.lever())
+
+    def hybrid_bound_m2(
+        self, tilt_sigmas_deg: tuple[float, float], leds: Leds, uncertainty: Uncertainty
+    ) -> Array | None:
+        """Hybrid bound of the position, (3, 3), m2, where lens, map and mounting err by `uncertainty`.
+
+        leds: all LEDs of the scene as told, to which `uncertainty` belongs. The exact bound where all its sigmas are 0.
+        None where the frame does not determine a position.
+        """
+        if uncertainty.is_zero:
+            return self.exact_bound_m2(tilt_sigmas_deg)
+        return self.bound_of_faces_m2(tilt_sigmas_deg, leds, uncertainty)
+
+    def bound_of_faces_m2(
+        self, tilt_sigmas_deg: tuple[float, float], leds: Leds, uncertainty: Uncertainty
+    ) -> Array | None:
+        """`hybrid_bound_m2` from the place and linear shape of each LED's image, for any `uncertainty`."""
+        index_of = {int(led_id): i for i, led_id in enumerate(leds.ids)}
+        indices = np.array(sorted({index_of[patch.led_id] for patch in self.at_pose}))
+        levers = MapLevers(uncertainty, leds, indices)
+        place = {int(i): number for number, i in enumerate(indices)}
+        nuisances = len(INTRINSICS) + levers.shared.shape[2]
+        # Unknowns in units of sigmas: lens, datum and scale, luminaires; then the pose in units of its steps.
+        rows = [np.eye(nuisances, nuisances + 6)]
+        for box in self._boxes():
+            factor, of_box = self._box_factor(box, leds, index_of, uncertainty)
+            if not of_box:
+                continue
+            motions = [face_motions(self.mounted, self.main, leds, i) for i in of_box]
+            own = np.zeros((FACE_NUMBERS * len(of_box), OWN * len(of_box)))
+            shared = []
+            for number, (i, motion) in enumerate(zip(of_box, motions, strict=True)):
+                sigmas = [
+                    *uncertainty.led_positions_m[i],
+                    uncertainty.led_sizes[i],
+                    *[uncertainty.led_faces_rad[i]] * 2,
+                ]
+                here = slice(FACE_NUMBERS * number, FACE_NUMBERS * (number + 1))
+                own[here, OWN * number : OWN * (number + 1)] = np.concatenate(
+                    [motion.position, motion.size, motion.tilts], axis=1
+                ) * np.array(sigmas)
+                shared.append(
+                    np.concatenate(
+                        [
+                            motion.lens * uncertainty.intrinsics,
+                            motion.position @ levers.shared[place[i]],
+                            motion.pose * np.array(self.steps),
+                        ],
+                        axis=1,
+                    )
+                )
+            with_own = np.concatenate([factor @ own, factor @ np.concatenate(shared)], axis=1)
+            priors = np.eye(own.shape[1], with_own.shape[1])
+            rows.append(_triangle(np.concatenate([priors, with_own]))[own.shape[1] :, own.shape[1] :])
+        tilts = tilt_covariance_rad2(self.mounted, self.main, tilt_sigmas_deg, uncertainty.mounting_rad)
+        free = [0, 1, 2, 5]
+        if tilts.any():
+            free = [0, 1, 2, 3, 4, 5]
+            prior = np.zeros((2, nuisances + 6))
+            prior[:, [nuisances + 3, nuisances + 4]] = np.linalg.inv(np.linalg.cholesky(tilts)) * self.steps[3]
+            rows.append(prior)
+        columns = [*range(nuisances), *(nuisances + i for i in free)]
+        triangle = _triangle(np.concatenate(rows)[:, columns])[nuisances:, nuisances:]
+        if len(triangle) < len(free) or not np.isfinite(triangle).all():
+            return None
+        if np.linalg.cond(triangle) ** 2 > MAX_CONDITION:
+            return None
+        spread = self.lever()[:, free] * np.array(self.steps)[free] @ np.linalg.inv(triangle)
+        bound: Array = spread @ spread.T
+        return bound
+
+    def spot_covariances_px2(self, leds: Leds) -> dict[int, Array]:
+        """Bound of the covariance (2, 2) of each LED image's position (u, v), px2, by the LED's index.
+
+        Unknown are the image's brightness and the background; size and shape of the image are known. LEDs whose pixels
+        do not determine a position, such as saturated ones, are left out. Of LEDs whose margins overlap, the others'
+        positions count as known.
+        """
+        index_of = {int(led_id): i for i, led_id in enumerate(leds.ids)}
+        information: dict[int, Array] = {}
+        for box in self._boxes():
+            for common, inside, weight in self._parts(box):
+                nuisances = [self._light(common, patch) for patch in inside]
+                nuisances.append(np.ones((common.rows, common.columns)))
+                for patch in inside:
+                    i = index_of[patch.led_id]
+                    by_position = np.stack([self._slope(common, unknown, patch) for unknown in range(2)])
+                    shifts = self.shift_slopes(common, leds, i, by_position)
+                    part = _marginal(shifts, np.stack(nuisances), weight)
+                    information[i] = information.get(i, np.zeros((2, 2))) + part
+        return {
+            i: np.asarray(np.linalg.inv(of_led), dtype=np.float64)
+            for i, of_led in information.items()
+            if np.isfinite(of_led).all() and np.linalg.cond(of_led) < MAX_CONDITION
+        }
+
+    def lever(self) -> Array:
+        """Jacobian of the camera's position to the unknowns of the pose of `main`, (3, 6)."""
+        ends = [
+            [self.mounted.posed(moved(self.main, i, sign * step)).pose.position_m for sign in (1, -1)]
+            for i, step in enumerate(self.steps)
+        ]
+        lever: Array = np.diff(ends, axis=1)[:, 0].T / (-2 * np.array(self.steps))
+        return lever
+
+    def _boxes(self) -> tuple[Roi, ...]:
+        """The pixels of each group of LEDs whose margins overlap."""
+        with_margin = LedRegions(kind="leds", margin_px=MARGIN_PX, overscan=self.overscan)
+        return led_regions((patch.roi for patch in self.at_pose), self.mounted.camera, with_margin)
+
+    def _parts(self, box: Roi) -> Iterator[tuple[Roi, list[LedPatch], Array]]:
+        """What the regions read out show of a box: pixels, LEDs in them, and 1 / variance of each pixel."""
+        for roi, variance in self.variance_e2:
+            if roi.overlaps(box):
+                common = roi.intersection(box)
+                inside = [patch for patch in self.at_pose if common.overlaps(patch.roi)]
+                yield common, inside, 1 / variance[roi.slices(common)].astype(np.float64)
+
+    def _light(self, roi: Roi, led: LedPatch) -> Array:
+        """Light of one LED in a region, electrons."""
+        return _image(roi, {led.led_id: led}, [led]) * self.exposure_s
+
+    def _slope(self, roi: Roi, unknown: int, led: LedPatch) -> Array:
+        """Slope of one LED's light in a region by an unknown of the pose, electrons per m or radian."""
+        plus, minus = self.pairs[unknown]
+        difference = _image(roi, plus, [led]) - _image(roi, minus, [led])
+        return difference * self.exposure_s / (2 * self.steps[unknown])
+
+    def _box_factor(
+        self, box: Roi, leds: Leds, index_of: Mapping[int, int], uncertainty: Uncertainty
+    ) -> tuple[Array, list[int]]:
+        """Information of a box as a factor F, such that its information matrix is F' F, and the indices of its k LEDs.
+
+        Columns of F, (at most 6 k, 6 k): the FACE_NUMBERS of each LED. Brightness, background and the gradients of
+        luminance are eliminated.
+        """
+        of_box = sorted({index_of[patch.led_id] for _, inside, _ in self._parts(box) for patch in inside})
+        k = len(of_box)
+        total = np.zeros((0, 2 * k + FACE_NUMBERS * k))
+        for common, inside, weight in self._parts(box):
+            total = np.concatenate([total, self._part_factor(common, inside, weight, leds, index_of, of_box)])
+        total[:, : 2 * k] *= np.repeat(uncertainty.led_gradients[of_box], 2)
+        priors = np.eye(2 * k, total.shape[1])
+        return _triangle(np.concatenate([priors, total]))[2 * k :, 2 * k :], of_box
+
+    def _part_factor(
+        self,
+        common: Roi,
+        inside: Sequence[LedPatch],
+        weight: Array,
+        leds: Leds,
+        index_of: Mapping[int, int],
+        of_box: Sequence[int],
+    ) -> Array:
+        """Factor of the information of some pixels about gradients (2 k) and faces (6 k), without other unknowns."""
+        k, free = len(of_box), len(inside) + 1
+        factor = np.zeros((0, free + 2 * k + FACE_NUMBERS * k))
+        rows_at_once = max(1, PIXELS_AT_ONCE // common.columns)
+        for start in range(0, common.rows, rows_at_once):
+            band = Roi(common.row + start, common.column, min(rows_at_once, common.rows - start), common.columns)
+            columns = np.zeros((factor.shape[1], band.rows, band.columns))
+            columns[len(inside)] = 1.0
+            gradients, faces = columns[free : free + 2 * k], columns[free + 2 * k :]
+            for number, patch in enumerate(inside):
+                columns[number] = self._light(band, patch)
+                i = index_of[patch.led_id]
+                led = of_box.index(i)
+                x, y, rim_x, rim_y = self._on_face(band, leds, i)
+                radius = leds.half_widths_m[i]
+                if leds.diffusers[i] is None:
+                    gradients[2 * led : 2 * led + 2] = columns[number] * np.clip(np.stack([x, y]) / radius, -1, 1)
+                by_shift = [-self._slope(band, unknown, patch) for unknown in range(2)]
+                faces[FACE_NUMBERS * led : FACE_NUMBERS * (led + 1)] = [
+                    slope * arm for arm in (1.0, rim_x, rim_y) for slope in by_shift
+                ]
+            rows = (columns * np.sqrt(weight[common.slices(band)])).reshape(len(columns), -1).T
+            factor = _triangle(np.concatenate([factor, rows]))
+        # The part that is orthogonal to brightness and background, as in `_marginal`.
+        basis, lengths, _ = np.linalg.svd(factor[:, :free], full_matrices=False)
+        basis = basis[:, lengths > 1e-9 * lengths.max()]
+        rest = factor[:, free:]
+        orthogonal: Array = rest - basis @ (basis.T @ rest)
+        return orthogonal
+
+    def _on_face(self, roi: Roi, leds: Leds, i: int) -> tuple[Array, Array, Array, Array]:
+        """Of each pixel's centre, the point (x, y) on an LED's plane and the point of the rim next to it, from the
+        face's centre, m.
+
+        An LED's light changes at the rim, however far the lens blurs the change.
+        """
+        face = face_of_led(leds, i)
+        x, y = intersections_with_plane(self.mounted.posed(self.main), face.center_m, *roi.centers_px())
+        if isinstance(face.shape, Disc):
+            scale = face.shape.radius_m / np.maximum(np.hypot(x, y), np.finfo(float).tiny)
+            return x, y, x * scale, y * scale
+        half_x, half_y = (side / 2 for side in face.shape.size_m)
+        inside_x, inside_y = np.clip(x, -half_x, half_x), np.clip(y, -half_y, half_y)
+        to_x = half_x - np.abs(inside_x) < half_y - np.abs(inside_y)
+        return (
+            x,
+            y,
+            np.where(to_x, np.copysign(half_x, x), inside_x),
+            np.where(to_x, inside_y, np.copysign(half_y, y)),
+        )
+
+    def shift_slopes(self, roi: Roi, leds: Leds, i: int, by_position: Array) -> Array:
+        """Slopes of one LED's light by a shift of its image along u and v, (2, rows, columns), electrons per pixel.
+
+        by_position: slopes by the camera's x and y, (2, rows, columns). A move of the camera by (dx, dy) shifts the
+        point of the LED's plane that a pixel sees by (dx, dy); a shift of the image by du shifts it by -du times the
+        derivative of the point by u.
+        """
+        posed = self.mounted.posed(self.main)
+        center_m = face_of_led(leds, i).center_m
+        u, v = roi.centers_px()
+        slopes = []
+        for du, dv in ((0.5, 0.0), (0.0, 0.5)):
+            x1, y1 = intersections_with_plane(posed, center_m, u + du, v + dv)
+            x0, y0 = intersections_with_plane(posed, center_m, u - du, v - dv)
+            slopes.append(-((x1 - x0) * by_position[0] + (y1 - y0) * by_position[1]))
+        return np.stack(slopes)
 
 
-def _moved(pose: Pose, unknown: int, by: float) -> Pose:
+@dataclass(frozen=True)
+class FaceMotions:
+    """How unknowns move and deform an LED's image, told as motions of its face in its own plane.
+
+    Each is (6, unknowns), the FACE_NUMBERS of the linear motion d(x, y) = (t_x, t_y) + E (x, y): t_x, t_y, m; then
+    E_xx, E_yx, E_xy, E_yy.
+    """
+
+    pose: Array
+    """By the pose of `main`: x, y, z, m; tilt_x, tilt_y, yaw, radians."""
+    lens: Array
+    """By the unknowns of the lens, in the units of INTRINSICS."""
+    position: Array
+    """By the LED's own x, y, z, m."""
+    size: Array
+    """By the logarithm of its radius or side, (6, 1)."""
+    tilts: Array
+    """By a tilt of its face about x and about y, radians, (6, 2)."""
+
+
+def face_motions(mounted: Mounted, main: Pose, leds: Leds, i: int) -> FaceMotions:
+    """The motions of one LED's face; those of a disc without its turn in its plane, which no image shows.
+
+    A point of the face whose image moves to another pixel position moves in the face's plane to the point that the
+    unmoved camera sees there. The linear motion is that of the centre and of four points of the rim.
+    """
+    posed = mounted.posed(main)
+    face = face_of_led(leds, i)
+    if isinstance(face.shape, Disc):
+        half_x = half_y = face.shape.radius_m
+    else:
+        half_x, half_y = (side / 2 for side in face.shape.size_m)
+    plane = np.array([[0.0, 0.0], [half_x, 0.0], [-half_x, 0.0], [0.0, half_y], [0.0, -half_y]])
+    points = np.column_stack([plane, np.zeros(5)]) + face.center_m
+    pixels = posed.project(points)
+
+    def motion(plus_px: Array, minus_px: Array, step: float) -> Array:
+        (x1, y1), (x0, y0) = (
+            intersections_with_plane(posed, face.center_m, px[:, 0], px[:, 1]) for px in (plus_px, minus_px)
+        )
+        d = np.column_stack([x1 - x0, y1 - y0]) / (2 * step)
+        by_x, by_y = (d[1] - d[2]) / (2 * half_x), (d[3] - d[4]) / (2 * half_y)
+        if isinstance(face.shape, Disc):
+            by_x[1] = by_y[0] = (by_x[1] + by_y[0]) / 2
+        return np.concatenate([d[0], by_x, by_y])
+
+    def by_points(change: Array) -> Array:
+        step = FACE_STEP
+        return motion(posed.project(points + step * change), posed.project(points - step * change), step)
+
+    def by_pose(unknown: int) -> Array:
+        plus, minus = (mounted.posed(moved(main, unknown, sign * FACE_STEP)).project(points) for sign in (1, -1))
+        return motion(plus, minus, FACE_STEP)
+
+    displaced = np.moveaxis(intrinsics_displacements_px(mounted.camera, pixels[:, 0], pixels[:, 1]), 1, 2)
+    scale = FACE_STEP * mounted.camera.focal_px / np.maximum(np.abs(displaced).max(axis=(1, 2)), 1.0)
+    lens = [motion(pixels + s * d, pixels - s * d, s) for s, d in zip(scale, displaced, strict=True)]
+    zero = np.zeros(5)
+    lifts = [np.column_stack([zero, zero, lift]) for lift in (plane[:, 1], -plane[:, 0])]
+    bare = float(leds.diffusers[i] is None)
+    return FaceMotions(
+        pose=np.stack([by_pose(unknown) for unknown in range(6)], axis=1),
+        lens=np.stack(lens, axis=1),
+        position=np.stack([by_points(np.tile(axis, (5, 1))) for axis in np.eye(3)], axis=1),
+        size=bare * np.array([[0.0, 0.0, 1.0, 0.0, 0.0, 1.0]]).T,
+        tilts=bare * np.stack([by_points(lift) for lift in lifts], axis=1),
+    )
+
+
+def _triangle(rows: Array) -> Array:
+    """R of the rows' QR decomposition: R' R = rows' rows, without forming the product."""
+    triangle: Array = np.asarray(np.linalg.qr(rows, mode="r"))
+    return triangle
+
+
+def moved(pose: Pose, unknown: int, by: float) -> Pose:
     """The pose with one of x, y, z (m), tilt_x, tilt_y, yaw (rad) changed."""
     x, y, z = pose.position_m
     numbers = [x, y, z, pose.tilt_x_deg, pose.tilt_y_deg, pose.yaw_deg]

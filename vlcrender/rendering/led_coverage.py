@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from vlcrender.camera.intrinsics import SENSOR_MARGIN
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.roi import Roi
+from vlcrender.core.face_profile import FaceProfile
 from vlcrender.core.planar_shapes import BEYOND_HORIZON_M, Disc, Rectangle, quadrilateral_area
 
 Array = NDArray[np.float64]
@@ -26,10 +27,11 @@ CELLS_AT_ONCE = 500_000
 
 @dataclass(frozen=True)
 class LedFace:
-    """A luminous horizontal face that faces down: centre (3,), world, m, and shape."""
+    """A luminous horizontal face that faces down: centre (3,), world, m, shape, and luminance profile unless even."""
 
     center_m: Array
     shape: Disc | Rectangle
+    profile: FaceProfile | None = None
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,8 @@ class LedCoverage:
     coverage: Array
     visible_fraction: float
     """Share of the area of the LED's whole image that is on the sensor."""
+    profile: Array | float = 1.0
+    """Luminance over the face's mean, averaged over the covered part of each pixel."""
 
 
 def coverage_of_led(posed: PosedCamera, face: LedFace, margin_px: int = 0) -> LedCoverage | None:
@@ -64,7 +68,7 @@ def coverage_of_led(posed: PosedCamera, face: LedFace, margin_px: int = 0) -> Le
     first, last = np.maximum(low, -margin), np.minimum(high, size + margin)
     if (last <= first).any():
         return None
-    coverage = _coverage(posed, face, first, last)
+    coverage, profile = _coverage(posed, face, first, last)
     if not coverage.any():
         return None
     column, row = (int(edge) for edge in first)
@@ -74,7 +78,7 @@ def coverage_of_led(posed: PosedCamera, face: LedFace, margin_px: int = 0) -> Le
             max(0, -row) : max(0, camera.height_px - row), max(0, -column) : max(0, camera.width_px - column)
         ]
         fraction = float(min(on_sensor.sum() / face.shape.image_area_px(outline), 1.0))
-    return LedCoverage(Roi(row, column, *coverage.shape), coverage, fraction)
+    return LedCoverage(Roi(row, column, *coverage.shape), coverage, fraction, profile)
 
 
 def candidate_leds(
@@ -103,8 +107,8 @@ def _outline_px(posed: PosedCamera, face: LedFace) -> Array | None:
     return pixels if np.isfinite(pixels).all() else None
 
 
-def _coverage(posed: PosedCamera, face: LedFace, first: Array, last: Array) -> Array:
-    """Coverage of the pixels from `first` to before `last`, both (column, row), computed in bands of rows."""
+def _coverage(posed: PosedCamera, face: LedFace, first: Array, last: Array) -> tuple[Array, Array | float]:
+    """Coverage and profile of the pixels from `first` to before `last`, both (column, row), in bands of rows."""
     columns, rows = last - first
     band = max(1, CELLS_AT_ONCE // int(columns))
     parts = []
@@ -112,19 +116,32 @@ def _coverage(posed: PosedCamera, face: LedFace, first: Array, last: Array) -> A
         v = np.arange(first[1] + start, first[1] + min(start + band, int(rows)) + 1, dtype=float)
         u = np.arange(first[0], last[0] + 1, dtype=float)
         parts.append(_coverage_of_band(posed, face, u, v))
-    return parts[0] if len(parts) == 1 else np.concatenate(parts)
+    if len(parts) == 1:
+        return parts[0]
+    profile = 1.0 if face.profile is None else np.concatenate([np.asarray(profile) for _, profile in parts])
+    return np.concatenate([coverage for coverage, _ in parts]), profile
 
 
-def _coverage_of_band(posed: PosedCamera, face: LedFace, u: Array, v: Array) -> Array:
+def _coverage_of_band(posed: PosedCamera, face: LedFace, u: Array, v: Array) -> tuple[Array, Array | float]:
     x, y = intersections_with_plane(posed, face.center_m, u[None, :], v[:, None])
     whole, mixed = face.shape.whole_and_mixed(x, y)
     coverage = whole.astype(float)
-    row, column = np.nonzero(mixed)
+    quads = _quads(x, y, mixed)
+    coverage[mixed] = np.clip(face.shape.shared_area(quads) / quadrilateral_area(quads), 0.0, 1.0)
+    if face.profile is None:
+        return coverage, 1.0
+    profile = np.ones(coverage.shape)
+    profile[mixed] = face.profile.mean_of(face.shape.shared_moments(quads), quads)
+    profile[whole] = face.profile.mean_over(_quads(x, y, whole))
+    return coverage, profile
+
+
+def _quads(x: Array, y: Array, cells: NDArray[np.bool_]) -> Array:
+    """Corners (n, 4, 2) of the cells that a mask (rows, columns) selects; x, y: (rows + 1, columns + 1)."""
+    row, column = np.nonzero(cells)
     rows = np.stack([row, row, row + 1, row + 1], axis=1)
     columns = np.stack([column, column + 1, column + 1, column], axis=1)
-    quads = np.stack([x[rows, columns], y[rows, columns]], axis=-1)
-    coverage[row, column] = np.clip(face.shape.shared_area(quads) / quadrilateral_area(quads), 0.0, 1.0)
-    return coverage
+    return np.stack([x[rows, columns], y[rows, columns]], axis=-1)
 
 
 def intersections_with_plane(posed: PosedCamera, center_m: Array, u: Array, v: Array) -> tuple[Array, Array]:

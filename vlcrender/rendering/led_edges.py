@@ -1,7 +1,9 @@
 """Coverage of parts of the pixels that an LED's edge crosses, for blurs narrower than a pixel.
 
-Only these pixels have to be split; in all others every part has the same coverage. A pixel is cut into quarters, and
-quarters that the edge crosses are cut again: the cost grows with the number of parts on the edge, not with all parts.
+Only these pixels have to be split; in all others every part has the same coverage. Of a face with a luminance profile
+all pixels are split, unless they are so many that the profile hardly changes within one. A pixel is cut into quarters,
+and quarters that the edge crosses are cut again: the cost grows with the number of parts on the edge, not with all
+parts.
 """
 
 from dataclasses import dataclass, replace
@@ -11,13 +13,18 @@ from numpy.typing import NDArray
 
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.roi import Roi
+from vlcrender.core.face_profile import FaceProfile
 from vlcrender.core.planar_shapes import quadrilateral_area
-from vlcrender.rendering.led_coverage import LedCoverage, LedFace
+from vlcrender.rendering.led_coverage import RIM_POINTS, LedCoverage, LedFace, intersections_with_plane
 
 Array = NDArray[np.float64]
 
 COVERAGE_TOLERANCE = 1e-9
 """Coverage within this tolerance of 0 or 1 counts as 0 or 1."""
+MAX_PROFILE_PARTS = 4_000_000
+"""Parts of all pixels of a face with a profile, beyond which only edge pixels are split: at 64 parts across a pixel the
+face has a radius of 18 px, at 16 parts 70 px. Without the split, a pixel of a face of 20 px with a gradient of 0.3 errs
+by up to 0.15 % of the luminance."""
 CORNERS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
 """Corners (u, v) of a part, in units of its side."""
 QUARTER_ROWS, QUARTER_COLUMNS = np.array([0, 0, 1, 1]), np.array([0, 1, 0, 1])
@@ -26,10 +33,10 @@ QUARTER_ROWS, QUARTER_COLUMNS = np.array([0, 0, 1, 1]), np.array([0, 1, 0, 1])
 
 @dataclass(frozen=True)
 class LedEdges:
-    """The pixels that an LED's edge crosses: rows and columns of the sensor, (k,).
+    """The pixels that an LED's edge crosses, and others that are split: rows and columns of the sensor, (k,).
 
-    `excess` (k, n, n): coverage of each part of each pixel minus the pixel's mean, or that times the light of full
-    coverage.
+    `excess` (k, n, n): coverage of each part of each pixel, times the face's luminance profile there, minus the pixel's
+    mean; or that times the light of full coverage.
     """
 
     rows: NDArray[np.int64]
@@ -47,7 +54,10 @@ def edges_of_led(posed: PosedCamera, face: LedFace, image: LedCoverage, split: i
 
     image: of `coverage_of_led` for the same camera and face.
     """
-    rows, columns = np.nonzero((image.coverage > COVERAGE_TOLERANCE) & (image.coverage < 1 - COVERAGE_TOLERANCE))
+    splits = image.coverage > COVERAGE_TOLERANCE
+    if face.profile is None or np.count_nonzero(splits) * split**2 > MAX_PROFILE_PARTS:
+        splits &= image.coverage < 1 - COVERAGE_TOLERANCE
+    rows, columns = np.nonzero(splits)
     parts = image.coverage[rows, columns][:, None, None]
     rows, columns = rows + image.roi.row, columns + image.roi.column
     corner_px = np.stack([columns, rows], axis=-1)
@@ -64,7 +74,20 @@ def edges_of_led(posed: PosedCamera, face: LedFace, image: LedCoverage, split: i
         parts[pixel, row, column] = coverage
         crossed = (coverage > COVERAGE_TOLERANCE) & (coverage < 1 - COVERAGE_TOLERANCE)
         pixel, row, column = pixel[crossed], row[crossed], column[crossed]
+    if face.profile is not None:
+        parts = parts * _profile_of_parts(posed, face, face.profile, corner_px, split)
     return LedEdges(rows, columns, parts - parts.mean(axis=(1, 2), keepdims=True))
+
+
+def _profile_of_parts(
+    posed: PosedCamera, face: LedFace, profile: FaceProfile, corner_px: NDArray[np.int64], split: int
+) -> Array:
+    """The face's luminance profile at the centres of all parts of the pixels with these corners (k, 2), (k, n, n)."""
+    centers = (np.arange(split) + 0.5) / split
+    u, v = (corner_px[:, axis, None, None] + at for axis, at in ((0, centers[None, :]), (1, centers[:, None])))
+    x, y = intersections_with_plane(posed, face.center_m, u, v)
+    half_m = np.abs(face.shape.rim(RIM_POINTS)).max(axis=0)
+    return np.maximum(profile.at(np.clip(x, -half_m[0], half_m[0]), np.clip(y, -half_m[1], half_m[1])), 0.0)
 
 
 def _coverage_of_quads(posed: PosedCamera, face: LedFace, quads_px: Array) -> Array:

@@ -42,7 +42,7 @@ Array = NDArray[np.float64]
 class LedImage:
     """Image of one LED at one pose, before blur: `coverage`, and relative illumination `weight`, in each pixel.
 
-    `pattern` is the luminance in each pixel over the LED's own along its normal. `edges`, for narrow blurs, are the
+    `pattern` is the luminance in each pixel over the LED's mean along its normal. `edges`, for narrow blurs, are the
     parts of edge pixels times weight and pattern; the occluded share of a pixel is the same in all its parts.
     """
 
@@ -72,7 +72,7 @@ def led_images(
         imaged.append((i, image))
     clear: Sequence[Array | float] = [1.0] * len(imaged)
     if occlusion.possible:
-        lit = [LitRegion(float(leds.centers_m[i, 2]), image.roi, image.coverage > 0) for i, image in imaged]
+        lit = [LitRegion(float(occlusion.heights_m[i]), image.roi, image.coverage > 0) for i, image in imaged]
         clear = occlusion.clear_shares(posed, lit)
     images = {}
     for (i, image), share in zip(imaged, clear, strict=True):
@@ -90,7 +90,7 @@ def led_images(
                 roi=image.roi,
                 coverage=coverage,
                 weight=weight,
-                pattern=pattern,
+                pattern=pattern * image.profile,
                 visible_fraction=clear_fraction * image.visible_fraction,
                 imaged_fraction=clear_fraction * (1.0 if overscan else image.visible_fraction),
                 edges=edges and edges.times(weight * pattern, image.roi),
@@ -105,14 +105,16 @@ def face_of_led(leds: Leds, i: int) -> LedFace:
         x0, y0, x1, y1 = diffuser.lit_m
         center: Array = np.array([(x0 + x1) / 2, (y0 + y1) / 2, leds.centers_m[i, 2]])
         return LedFace(center, Rectangle((x1 - x0, y1 - y0)))
-    return LedFace(leds.centers_m[i], Rectangle((2 * radius, 2 * radius)) if leds.squares[i] else Disc(radius))
+    shape = Rectangle((2 * radius, 2 * radius)) if leds.squares[i] else Disc(radius)
+    return LedFace(leds.centers_m[i], shape, leds.profile(i))
 
 
 def luminance_pattern(leds: Leds, i: int, posed: PosedCamera, roi: Roi) -> Array | float:
-    """Luminance in each pixel of a region over the luminance of the bare LED along its normal.
+    """Luminance in each pixel of a region over the mean luminance of the bare LED along its normal.
 
-    Bare LED: cos^(m - 1). Diffuser: the mean over the pixel, of 2 x 2 points (Gauss and Legendre) where the pixel is
-    wider on the diffuser than MAX_UNIFORM_SHARE of the LED's distance behind it.
+    Bare LED: cos^(m - 1), as if its face were even (`LedCoverage.profile` is the face's profile). Diffuser: the mean
+    over the pixel, of 2 x 2 points (Gauss and Legendre) where the pixel is wider on the diffuser than MAX_UNIFORM_SHARE
+    of the LED's distance behind it.
     """
     diffuser, order = leds.diffusers[i], float(leds.orders[i])
     if diffuser is not None:

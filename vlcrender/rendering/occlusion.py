@@ -44,6 +44,9 @@ class Occlusion:
     def __init__(self, scene: Scene, background: Background) -> None:
         """Prepare a scene; `background` holds its surfaces."""
         self._background = background
+        self.heights_m = scene.leds.centers_m[:, 2]
+        """Height of each LED's face, m, (n,): the plane that a ray has to reach. LEDs as built count as reached at the
+        height of the scene's, because the scene's panels, which they would enter, are not moved."""
         panels = scene.settings.panels
         undersides_m = [grid.first_center_m[2] for grid in panels]
         self.possible = (

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.core.backend import dr, mi
+from vlcrender.core.face_profile import FaceProfile
 from vlcrender.errors import InputError
 from vlcrender.light.mitsuba_room import BEHIND_M, glazing_bsdf, room_shape
 from vlcrender.scene.furniture import furniture_meshes
@@ -28,6 +29,8 @@ LED_STANDOFF_M = 1e-5
 """Distance of LEDs below the surface that they are mounted on, so that a ray meets the LED first."""
 DIFFUSER_PIXELS = 16
 """Pixels of a diffuser's bitmap, linear in between, along a distance equal to that of the LEDs behind it."""
+PROFILE_PIXELS = 256
+"""Pixels across the bitmap of an LED's luminance profile."""
 MAX_DEPTH = 24
 MAX_GLAZINGS = 4
 """Glazings that a ray may meet before the first diffuse surface."""
@@ -57,7 +60,7 @@ def reference_cd_m2(scene: Scene, posed: PosedCamera, samples_per_pixel: int, se
     all_light = mi.load_dict({"type": "path", "max_depth": MAX_DEPTH, "rr_depth": 8})
     ambient = _FirstSurface(scene.settings.ambient.illuminance_lux)
     pinhole = camera.lens_projection.keeps_lines_straight and camera.focus_distance_m is None
-    render = _by_sensor if pinhole and camera.skew_px == 0 else _by_rays
+    render = _by_sensor if pinhole and camera.skew_px == 0 and camera.aspect_ratio == 1 else _by_rays
     each = -(-samples_per_pixel // BATCHES)
     images = []
     for batch in range(BATCHES):
@@ -169,7 +172,7 @@ def scene_dict(scene: Scene, posed: PosedCamera) -> dict[str, object]:
             part = _shape("rectangle", _frame(corner, edge_u, edge_v), bsdf, 0.0)
             glow = _diffuser_cd_m2(scene, surface)
             if glow is not None:
-                part["emitter"] = {"type": "area", "radiance": {"type": "bitmap", "bitmap": glow, "raw": True}}
+                part["emitter"] = {"type": "area", "radiance": _glow(glow)}
             tree[f"surface{number}"] = part
             number += 1
     for i, mesh in enumerate(furniture_meshes(scene, 0)):
@@ -189,7 +192,12 @@ def scene_dict(scene: Scene, posed: PosedCamera) -> dict[str, object]:
         frame = np.diag([radius, -radius, -1.0, 1.0])  # faces down
         frame[:3, 3] = leds.centers_m[i] - [0, 0, LED_STANDOFF_M]
         shape = "rectangle" if leds.squares[i] else "disk"
-        tree[f"led{i}"] = _shape(shape, frame, _diffuse(face), leds.luminances_cd_m2[i])
+        part = _shape(shape, frame, _diffuse(face), leds.luminances_cd_m2[i])
+        profile = leds.profile(i)
+        if profile is not None:
+            glow = leds.luminances_cd_m2[i] * _profile_image(profile, radius, shape)
+            part["emitter"] = {"type": "area", "radiance": _glow(mi.Bitmap(glow[:, :, None].astype(np.float32)))}
+        tree[f"led{i}"] = part
     return tree
 
 
@@ -244,6 +252,25 @@ def _diffuser_cd_m2(scene: Scene, surface: Surface) -> "mi.Bitmap | None":
         within = (at[..., 0] >= x0) & (at[..., 0] <= x1) & (at[..., 1] >= y0) & (at[..., 1] <= y1)
         total += luminance * within * diffuser.luminance(at[..., 0], at[..., 1])
     return mi.Bitmap(total[:, :, None].astype(np.float32))
+
+
+def _profile_image(profile: FaceProfile, half_width_m: float, shape: str) -> Array:
+    """The profile at PROFILE_PIXELS^2 texture positions of a face that faces down, whose y axis is turned over.
+
+    Mitsuba's rectangle has (u, v) along x and y; its disc has u along the radius and v along the angle.
+    """
+    at = (np.arange(PROFILE_PIXELS) + 0.5) / PROFILE_PIXELS
+    if shape == "rectangle":
+        x, y = np.meshgrid(2 * at - 1, 2 * at - 1)
+    else:
+        radius, turns = np.meshgrid(at, at)
+        x, y = radius * np.cos(2 * np.pi * turns), radius * np.sin(2 * np.pi * turns)
+    return profile.at(half_width_m * x, -half_width_m * y)
+
+
+def _glow(bitmap: "mi.Bitmap") -> dict[str, object]:
+    """Radiance of an emitter, linear between the bitmap's pixels."""
+    return {"type": "bitmap", "bitmap": bitmap, "raw": True, "wrap_mode": "clamp"}
 
 
 def _bitmap(texture: Texture, corner: Array, edge_u: Array, edge_v: Array) -> dict[str, object]:

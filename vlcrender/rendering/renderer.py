@@ -8,8 +8,10 @@ The specular reflection of an LED in a glazing is a patch too (`specular_reflect
 by the kernel of its depth (`led_blur`).
 """
 
+import copy
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +30,7 @@ from vlcrender.rendering.led_blur import LedBlur, led_blur
 from vlcrender.rendering.led_radiance import LedImage, led_images
 from vlcrender.rendering.occlusion import Occlusion
 from vlcrender.rendering.specular_reflection import blurred, specular_reflections
+from vlcrender.scene.leds import Leds
 from vlcrender.scene.loader import Scene
 from vlcrender.sensor.radiometry import Detector, Silicon
 
@@ -52,6 +55,15 @@ class Renderer:
         self._light = light or bake(scene)
         self._background = Background(scene, self._light)
         self._occlusion = Occlusion(scene, self._background)
+
+    def with_leds(self, leds: Leds) -> "Renderer":
+        """A renderer of the same room in whose images the LEDs are `leds`, the scene's LEDs as built.
+
+        The room's light and all occluders remain the scene's. `leds` has as many LEDs, in the same order.
+        """
+        renderer = copy.copy(self)
+        renderer.scene = replace(self.scene, leds=leds)
+        return renderer
 
     def expected_image(
         self, posed: PosedCamera, regions: LedRegions | None = None, during: Sequence[Pose] | None = None

@@ -67,14 +67,14 @@ def specular_reflections(
         roi = image.roi
         if not any(region.overlaps(roi) for region in rois):
             continue
-        lit = LitRegion(float(leds.centers_m[i, 2]), roi, image.coverage > 0)
+        lit = LitRegion(float(occlusion.heights_m[i]), roi, image.coverage > 0)
         (clear,) = occlusion.clear_shares(posed, [lit], Mirror(number, mirrored.pose))
         u, v = roi.centers_px()
         x, y, z = mirrored.ray_world(u, v)
         normal_x, normal_y, normal_z = glazing.normal.tolist()
         cosine = np.abs(x * normal_x + y * normal_y + z * normal_z) / np.sqrt(x * x + y * y + z * z)
         weight = relative_illumination(camera, u, v) * glazing_reflectance(cosine, glazing.refractive_index, np.sqrt)
-        pattern = luminance_pattern(leds, i, mirrored, roi)
+        pattern = luminance_pattern(leds, i, mirrored, roi) * image.profile
         light = led_rate * leds.luminances_cd_m2[i] * image.coverage * clear * weight * pattern
         for region in rois:
             if region.overlaps(roi):

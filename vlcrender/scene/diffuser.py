@@ -9,7 +9,7 @@ light; and the LED's own size, which lowers E near the foot by about (radius / d
 The lit part ends at MIN_RELATIVE_LUMINANCE of the luminance at the foot, and at the border of the panel's opening.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +53,16 @@ class Diffuser:
         """(x0, y0, x1, y1) of the lit part: a square about the foot, cut at the border of the opening."""
         (x, y), radius, (x0, y0, x1, y1) = self.foot_m, self.lit_radius_m, self.opening_m
         return max(x0, x - radius), max(y0, y - radius), min(x1, x + radius), min(y1, y + radius)
+
+    def as_built(self, x_m: float, y_m: float, size: float) -> "Diffuser":
+        """LED and diffuser moved together along x and y, the LED's radius or side multiplied by `size`."""
+        (x, y), (x0, y0, x1, y1) = self.foot_m, self.opening_m
+        return replace(
+            self,
+            foot_m=(x + x_m, y + y_m),
+            opening_m=(x0 + x_m, y0 + y_m, x1 + x_m, y1 + y_m),
+            area_m2=self.area_m2 * size**2,
+        )
 
     def luminance(self, x_m: Array, y_m: Array) -> Array:
         """Luminance of the diffuser at (x, y) over that of the LED: T A cos^(m+3)(theta) / (pi d^2)."""

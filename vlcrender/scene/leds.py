@@ -1,10 +1,11 @@
-"""LEDs of a scene: identity, place, size, luminance, beam and diffuser of each."""
+"""LEDs of a scene: identity, place, size, luminance and its profile, beam and diffuser of each."""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vlcrender.core.face_profile import FaceProfile
 from vlcrender.core.random_keys import stream
 from vlcrender.errors import InputError
 from vlcrender.scene.diffuser import MIN_DISTANCE_RADII, Diffuser
@@ -23,13 +24,17 @@ class Leds:
     half_widths_m: NDArray[np.float64]
     """Radius of a disc, half the side of a square, (n,)."""
     luminances_cd_m2: NDArray[np.float64]
-    """Luminance along the normal, (n,)."""
+    """Luminance along the normal, mean over the face, (n,)."""
     orders: NDArray[np.float64]
     """Lambertian order m, (n,): luminance at an angle theta from the normal is luminance * cos^(m-1)(theta)."""
     squares: NDArray[np.bool_]
     """True for a square with sides along x and y, False for a disc, (n,)."""
     diffusers: tuple[Diffuser | None, ...]
     """The part of a diffuser that each LED lights, which a camera images in place of the LED's face. None: bare LED."""
+    face_gradients: NDArray[np.float64]
+    """Relative rise of luminance from each face's centre to its border along x and y, (n, 2); (0, 0): even."""
+    face_falloffs: NDArray[np.float64]
+    """Luminance at each face's rim over that at its centre, without the gradient, (n,); 1: even."""
 
     def __len__(self) -> int:
         """Number of LEDs."""
@@ -39,6 +44,13 @@ class Leds:
     def areas_m2(self) -> NDArray[np.float64]:
         """Area of each face, (n,)."""
         return np.where(self.squares, 4.0, np.pi) * self.half_widths_m**2
+
+    def profile(self, i: int) -> FaceProfile | None:
+        """Luminance over the face of LED number i, relative to the mean; None for an even face."""
+        gradient, falloff = self.face_gradients[i].tolist(), float(self.face_falloffs[i])
+        if gradient == [0.0, 0.0] and falloff == 1.0:
+            return None
+        return FaceProfile.of((gradient[0], gradient[1]), falloff, float(self.half_widths_m[i]), bool(self.squares[i]))
 
     @property
     def circumradii_m(self) -> NDArray[np.float64]:
@@ -67,6 +79,8 @@ def leds_of(settings: SceneSettings, source: str) -> Leds:
     luminances: list[float] = []
     half_powers: list[float] = []
     shapes: list[str] = []
+    gradients: list[tuple[float, float]] = []
+    falloffs: list[float] = []
     origins: list[str] = []
     panel_diffusers: list[tuple[PanelDiffuser, tuple[float, float, float, float]] | None] = []
     for index, entry in enumerate(settings.led):
@@ -76,6 +90,8 @@ def leds_of(settings: SceneSettings, source: str) -> Leds:
         luminances.append(entry.luminance_cd_m2)
         half_powers.append(entry.half_power_deg)
         shapes.append(entry.shape)
+        gradients.append(entry.face_gradient)
+        falloffs.append(entry.face_falloff)
         origins.append(f"led[{index}]")
         panel_diffusers.append(None)
     for index, grid in enumerate(settings.panels):
@@ -93,6 +109,8 @@ def leds_of(settings: SceneSettings, source: str) -> Leds:
         luminances += list(stream(array.luminance_seed, 0, "led-luminance").uniform(low, high, len(positions)))
         half_powers += [array.half_power_deg] * len(positions)
         shapes += [array.shape] * len(positions)
+        gradients += [array.face_gradient] * len(positions)
+        falloffs += [array.face_falloff] * len(positions)
         origins += [f"panels[{index}].leds"] * len(positions)
         for center in panel_centers_m(grid).tolist():
             diffuser = None if grid.diffuser is None else (grid.diffuser, panel_opening_m(grid, center[0], center[1]))
@@ -108,6 +126,8 @@ def leds_of(settings: SceneSettings, source: str) -> Leds:
         -np.log(2) / np.log(np.cos(np.radians(half_powers)))[order],
         np.array([shape == "square" for shape in shapes])[order],
         (None,) * len(ids),
+        np.array(gradients)[order],
+        np.array(falloffs)[order],
     )
     diffusers = [
         None

@@ -5,12 +5,14 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from vlcrender.config.toml_model import Settings, key_error
+from vlcrender.core.face_profile import lowest_share
 
 Length = Annotated[float, Field(gt=0, le=1000)]
 Reflectance = Annotated[float, Field(ge=0, le=1)]
 Luminance = Annotated[float, Field(gt=0, le=1e9)]
 Illuminance = Annotated[float, Field(ge=0, le=1e6)]
 HalfPower = Annotated[float, Field(gt=5, lt=89)]
+Gradient = Annotated[float, Field(ge=-1, le=1)]
 Count = Annotated[int, Field(ge=1, le=1000)]
 Identity = Annotated[int, Field(ge=0, lt=2**31)]
 Point = tuple[float, float, float]
@@ -74,7 +76,7 @@ class Ambient(Settings):
 
 
 class LedFace(Settings):
-    """Shape, size and beam of an LED's flat face: a disc has `radius_m`, a square has `side_m`."""
+    """Shape, size, beam and luminance profile of an LED's flat face: a disc has `radius_m`, a square has `side_m`."""
 
     shape: Literal["disc", "square"] = "disc"
     """`"disc"`, or `"square"` with sides along x and y."""
@@ -85,6 +87,13 @@ class LedFace(Settings):
     half_power_deg: HalfPower = 60.0
     """Angle from the normal at which luminous intensity is half of its maximum I_0, degrees: I = I_0 cos^m(angle) with
     m = -ln 2 / ln cos(half_power_deg). 60 is a Lambertian LED, m = 1."""
+    face_gradient: tuple[Gradient, Gradient] = (0.0, 0.0)
+    """Relative rise of luminance from the face's centre to its border along x and along y, each -1 to 1. The mean
+    luminance stays. Not behind a diffuser."""
+    face_falloff: Annotated[float, Field(ge=0, le=2)] = 1.0
+    """Luminance at the rim of a disc, or in the middle of a square's sides, over that at the face's centre, 0 to 2; it
+    falls with the square of the distance from the centre. The mean luminance stays. 1 is an even face. Not behind a
+    diffuser."""
 
     @model_validator(mode="after")
     def _size_key_fits_the_shape(self) -> Self:
@@ -101,6 +110,22 @@ class LedFace(Settings):
             if self.side_m is None:
                 raise key_error("side_m", "is missing")
         return self
+
+    @model_validator(mode="after")
+    def _no_point_of_the_face_is_darker_than_black(self) -> Self:
+        lowest = lowest_share(self.face_gradient, self.face_falloff, self.shape == "square")
+        if lowest < -1e-12:
+            raise key_error(
+                "face_gradient",
+                f"with face_falloff = {self.face_falloff:g}, luminance falls to {lowest:.3g} of its mean on the face; "
+                "at least 0 is allowed: take a smaller gradient, or a face_falloff closer to 1",
+            )
+        return self
+
+    @property
+    def even(self) -> bool:
+        """Whether the luminance is the same all over the face."""
+        return self.face_gradient == (0.0, 0.0) and self.face_falloff == 1.0
 
     @property
     def half_width_m(self) -> float:
@@ -184,6 +209,14 @@ class PanelGrid(Settings):
     """The diffuser before the LEDs of each panel; bare LEDs without this table."""
     leds: PanelLeds
     """The LEDs of each panel."""
+
+    @model_validator(mode="after")
+    def _faces_behind_a_diffuser_are_even(self) -> Self:
+        if self.diffuser is not None and not self.leds.even:
+            raise key_error(
+                "diffuser", "hides the LEDs' faces: remove it, or remove face_gradient and face_falloff from its LEDs"
+            )
+        return self
 
 
 class GlazingEntry(Settings):

@@ -118,6 +118,17 @@ class Imu(Settings):
         turned_deg = np.degrees(np.linalg.norm(across_m_s2) / STANDARD_GRAVITY_M_S2)
         return float(np.hypot(turned_deg, self.misalignment_deg))
 
+    @property
+    def shot_error_deg(self) -> float:
+        """The part of `error_deg` that is new in each reading: noise and rounding."""
+        across_m_s2 = (self.noise_m_s2 / np.sqrt(self.samples), self.lsb_m_s2 / np.sqrt(12))
+        return float(np.degrees(np.linalg.norm(across_m_s2) / STANDARD_GRAVITY_M_S2))
+
+    @property
+    def device_error_deg(self) -> float:
+        """The part of `error_deg` that stays with a device: offset, drift, cross-axis sensitivity and misalignment."""
+        return float(np.sqrt(max(self.error_deg**2 - self.shot_error_deg**2, 0.0)))
+
     def tilt_errors_deg(self, pose: Pose) -> tuple[float, float]:
         """Standard deviations over devices of the errors on tilt_x and tilt_y in a pose, to first order.
 
