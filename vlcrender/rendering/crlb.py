@@ -12,6 +12,8 @@ unknowns i and j is
 exact for Poisson counts (var = mu); for a sensor with further noise it is the information in the mean, without the
 information in the variance, which goes as 1 / mu. The derivatives with respect to the pose are central differences of
 images whose edges are exact. The accelerometer adds 1 / sigma^2 to each of the two tilts.
+The glare of a lens is known too: an LED's image includes its halo in the group of LEDs that it belongs to; halos of
+other groups are part of the background.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -38,6 +40,8 @@ MAX_CONDITION = 1e12
 """Condition number of the information, in units of the steps, above which a direction holds only rounding errors."""
 
 Render = Callable[[PosedCamera], Sequence[LedPatch]]
+HaloOf = Callable[[Sequence[LedPatch], Roi], Array]
+"""The halo of some patches in a region of the sensor, electrons a second."""
 
 
 def position_bound_m2(
@@ -49,6 +53,7 @@ def position_bound_m2(
     distance_m: float,
     tilt_sigmas_deg: tuple[float, float],
     overscan: bool = False,
+    halo_of: HaloOf | None = None,
 ) -> Array | None:
     """Bound of the covariance of a camera's position, (3, 3), m2, world; None where the frame does not determine it.
 
@@ -56,7 +61,7 @@ def position_bound_m2(
     the LEDs with the camera at poses near this, electrons a second. variance_e2: the regions read out, with the
     variance of each pixel, inf for pixels without information (saturated ones). distance_m: from the camera to the
     LEDs, roughly. tilt_sigmas_deg: standard deviations of the accelerometer on tilt_x and tilt_y; 0 means that both
-    tilts are known. overscan: whether LEDs count beyond the sensor.
+    tilts are known. overscan: whether LEDs count beyond the sensor. halo_of: halos of a lens with glare.
     """
 
     def patches_at(pose: Pose) -> Sequence[LedPatch]:
@@ -82,12 +87,14 @@ def position_bound_m2(
                 inside = [patch for patch in at_pose if common.overlaps(patch.roi)]
                 slopes = np.stack(
                     [
-                        (_image(common, plus, inside) - _image(common, minus, inside)) * exposure_s / (2 * step)
+                        (_image(common, plus, inside, halo_of) - _image(common, minus, inside, halo_of))
+                        * exposure_s
+                        / (2 * step)
                         for (plus, minus), step in zip(pairs, steps, strict=True)
                     ]
                 )
                 now = {patch.led_id: patch for patch in inside}
-                nuisances = [_image(common, now, [patch]) * exposure_s for patch in inside]
+                nuisances = [_image(common, now, [patch], halo_of) * exposure_s for patch in inside]
                 nuisances.append(np.ones((common.rows, common.columns)))
                 weight = 1 / variance[roi.slices(common)].astype(np.float64)
                 information += _marginal(slopes, np.stack(nuisances), weight)
@@ -107,12 +114,12 @@ def _moved(pose: Pose, unknown: int, by: float) -> Pose:
     return Pose((numbers[0], numbers[1], numbers[2]), *numbers[3:])
 
 
-def _image(roi: Roi, patches: Mapping[int, LedPatch], leds: Sequence[LedPatch]) -> Array:
+def _image(roi: Roi, patches: Mapping[int, LedPatch], leds: Sequence[LedPatch], halo_of: HaloOf | None = None) -> Array:
     """Light of some LEDs in a region, electrons a second: of those in `patches` (by id) that `leds` names."""
-    image = np.zeros((roi.rows, roi.columns))
-    for led in leds:
-        patch = patches.get(led.led_id)
-        if patch is not None and roi.overlaps(patch.roi):
+    found = [patches[led.led_id] for led in leds if led.led_id in patches]
+    image = np.zeros((roi.rows, roi.columns)) if halo_of is None else halo_of(found, roi)
+    for patch in found:
+        if roi.overlaps(patch.roi):
             both = roi.intersection(patch.roi)
             image[roi.slices(both)] += patch.electrons_per_s[patch.roi.slices(both)]
     return image
