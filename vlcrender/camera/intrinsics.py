@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pydantic import Field, ValidationError, ValidatorFunctionWrapHandler, WrapValidator, model_validator
 
 from vlcrender.camera.distortion import Distortion
+from vlcrender.camera.glare import Glare
 from vlcrender.camera.projection import Equidistant, FieldOfView, Perspective, Projection
 from vlcrender.config.toml_model import Settings
 
@@ -72,6 +73,8 @@ class Camera(Settings):
     """Measured point spread function: an odd number of rows, as many columns, sum 1; with psf = "measured" only."""
     vignetting_deg: Annotated[float, Field(gt=0, lt=90)] | None = None
     """Field angle at which a second stop hides the whole pupil, deg; no mechanical vignetting where not given."""
+    glare: Glare | None = None
+    """Veiling glare of the lens; none where not given."""
 
     @model_validator(mode="after")
     def _principal_point_is_near_the_image(self) -> Self:
@@ -104,6 +107,17 @@ class Camera(Settings):
         total = sum(map(sum, rows))
         if abs(total - 1) > 1e-6:
             raise ValueError(f"psf_kernel: adds up to {total:.9g}; it has to be 1 within 1e-6")
+        return self
+
+    @model_validator(mode="after")
+    def _glare_is_wider_than_a_blur(self) -> Self:
+        if self.glare is not None:
+            lowest_um = max(6, max(self.width_px, self.height_px) / 100) * self.pixel_pitch_um
+            if self.glare.radius_um < lowest_um:
+                raise ValueError(
+                    f"glare.radius_um = {self.glare.radius_um:g}: must be at least {lowest_um:g}, which is 6 pixels "
+                    "and 1 % of the sensor's longer side; a narrower blur is a psf"
+                )
         return self
 
     @model_validator(mode="after")

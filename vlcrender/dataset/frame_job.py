@@ -173,6 +173,7 @@ def _bounds_m2(
         [RegionImage(roi, variance_e2(recipe.sensor, image, exposure_s)) for roi, image in expected],
         float(np.median(np.linalg.norm(renderer.scene.leds.centers_m - at.position_m, axis=1))),
         recipe.regions is not None and recipe.regions.overscan,
+        renderer.halo_of(mounted.camera),
     )
     if slopes is None:
         return None, None

@@ -132,6 +132,16 @@ class Recipe(Settings):
             )
         return self
 
+    @model_validator(mode="after")
+    def _overscan_needs_a_lens_without_glare(self) -> Self:
+        glaring = [c.name for c in self.cameras if c.camera.glare is not None]
+        if self.regions is not None and self.regions.overscan and glaring:
+            raise ValueError(
+                f"regions.overscan = true: camera {glaring[0]!r} has glare, which is computed on the sensor only; "
+                "remove overscan or [camera.glare]"
+            )
+        return self
+
     @property
     def cameras(self) -> tuple[Mounted, ...]:
         """All cameras, `main` first."""

@@ -1,16 +1,17 @@
 """Mosaics of colour filters: each pixel sees the scene through its own filter."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vlcrender.camera.intrinsics import Pose
+from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.roi import LedRegions, Roi
-from vlcrender.rendering.expected_image import ExpectedImage, ExpectedRegion, LedPatch
+from vlcrender.rendering.expected_image import ExpectedImage, ExpectedRegion, Halo, Image, LedPatch
 from vlcrender.rendering.renderer import Renderer
 from vlcrender.scene.leds import Leds
 from vlcrender.scene.loader import Scene
@@ -24,6 +25,25 @@ def colour_of_pixels(mosaic: str, roi: Roi) -> NDArray[np.intp]:
     columns = np.arange(roi.column, roi.end_column) % 2
     pixels: NDArray[np.intp] = tile[rows[:, None], columns]
     return pixels
+
+
+def select_colours(images: Sequence[NDArray[Any]], mosaic: str, roi: Roi) -> NDArray[Any]:
+    """For each pixel of a region, the image of the pixel's colour. `images`: (rows, columns), for each of COLOURS."""
+    colours = colour_of_pixels(mosaic, roi)[None]
+    selected: NDArray[Any] = np.take_along_axis(np.stack(images), colours, axis=0)[0]
+    return selected
+
+
+@dataclass(frozen=True)
+class MosaicHalo:
+    """The halos under each of COLOURS, of which each pixel takes one."""
+
+    of_colours: tuple[Halo, ...]
+    mosaic: str
+
+    def electrons_per_s(self, roi: Roi, gains: Mapping[int, float] | None = None) -> Image:
+        """As `expected_image.Halo`."""
+        return select_colours([halo.electrons_per_s(roi, gains) for halo in self.of_colours], self.mosaic, roi)
 
 
 @dataclass(frozen=True)
@@ -58,6 +78,30 @@ class MosaicRenderer:
         """As `Renderer.led_patches`."""
         return self._patches([r.led_patches(posed, regions, blurred_at) for r in self.of_colours])
 
+    def halo_of(self, camera: Camera) -> Callable[[Sequence[LedPatch], Roi], NDArray[np.float64]] | None:
+        """As `Renderer.halo_of`, of patches under the mosaic: each colour's light is that of its pixels, times 4 or 2.
+
+        The halo is too wide to tell that from the light that all pixels have under the colour's filter.
+        """
+        of_colour = self.of_colours[0].halo_of(camera)
+        return None if of_colour is None else partial(self._mosaic_halo, of_colour)
+
+    def _mosaic_halo(
+        self, of_colour: Callable[[Sequence[LedPatch], Roi], NDArray[np.float64]], patches: Sequence[LedPatch], roi: Roi
+    ) -> NDArray[np.float64]:
+        colours = colour_of_pixels(self.mosaic, Roi(0, 0, 2, 2))
+        halos = []
+        for colour in range(len(COLOURS)):
+            factor = colours.size / np.count_nonzero(colours == colour)
+            light = [
+                replace(
+                    p, electrons_per_s=p.electrons_per_s * factor * (colour_of_pixels(self.mosaic, p.roi) == colour)
+                )
+                for p in patches
+            ]
+            halos.append(of_colour(light, roi))
+        return select_colours(halos, self.mosaic, roi)
+
     def _region(self, of_colours: Sequence[ExpectedRegion]) -> ExpectedRegion:
         roi = of_colours[0].roi
         return ExpectedRegion(
@@ -69,7 +113,12 @@ class MosaicRenderer:
                 for colour, region in enumerate(of_colours)
                 for r in region.reflections
             ),
+            self._halo([region.halo for region in of_colours]),
         )
+
+    def _halo(self, of_colours: Sequence[Halo | None]) -> MosaicHalo | None:
+        halos = tuple(halo for halo in of_colours if halo is not None)
+        return MosaicHalo(halos, self.mosaic) if halos else None
 
     def _patches(self, of_colours: Sequence[Sequence[LedPatch]]) -> tuple[LedPatch, ...]:
         return tuple(
@@ -79,6 +128,4 @@ class MosaicRenderer:
 
     def _select(self, images: Sequence[NDArray[Any]], roi: Roi) -> NDArray[Any]:
         """For each pixel of a region, the image of the pixel's colour."""
-        colours = colour_of_pixels(self.mosaic, roi)[None]
-        selected: NDArray[Any] = np.take_along_axis(np.stack(images), colours, axis=0)[0]
-        return selected
+        return select_colours(images, self.mosaic, roi)

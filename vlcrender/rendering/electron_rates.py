@@ -18,11 +18,12 @@ class ElectronRates:
 
     @classmethod
     def of(cls, scene: Scene, camera: Camera, detector: Detector) -> "ElectronRates":
-        """Rates of a scene's two spectra on the detector of a camera."""
+        """Rates of a scene's two spectra on the detector of a camera, of the light that glare does not scatter."""
         settings = scene.settings
+        sharp = 1.0 if camera.glare is None else 1.0 - camera.glare.share
         return cls(
-            led=electron_rate_per_cd_m2(camera, settings.led_spectrum, detector),
-            ambient=electron_rate_per_cd_m2(camera, settings.ambient.spectrum, detector),
+            led=electron_rate_per_cd_m2(camera, settings.led_spectrum, detector) * sharp,
+            ambient=electron_rate_per_cd_m2(camera, settings.ambient.spectrum, detector) * sharp,
         )
 
 

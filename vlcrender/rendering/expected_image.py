@@ -1,7 +1,8 @@
-"""Expected images as parts, a background and one patch of light for each LED, so that any exposure is their sum."""
+"""Expected images as parts, a background, a patch of light for each LED and a halo: any exposure is their sum."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,14 +48,24 @@ class SpecularReflection:
         return Roi(self.row, self.column, *self.electrons_per_s.shape)
 
 
+class Halo(Protocol):
+    """Light that the lens scatters all over the sensor (veiling glare)."""
+
+    def electrons_per_s(self, roi: Roi, gains: Mapping[int, float] | None = None) -> Image:
+        """The scattered light in a region, (rows, columns). `gains`: of LEDs by id; 1 where not given."""
+
+
 @dataclass(frozen=True)
 class ExpectedRegion:
-    """Expected image of a region: `background_e_per_s` (rows, columns), and a patch of each LED that lights a pixel."""
+    """Expected image of a region: `background_e_per_s` (rows, columns), a patch of each LED that lights a pixel, and
+    the halo of a lens with glare.
+    """
 
     roi: Roi
     background_e_per_s: Image
     patches: tuple[LedPatch, ...]
     reflections: tuple[SpecularReflection, ...] = ()
+    halo: Halo | None = None
 
     def expected_electrons(self, exposure_s: float, gains: Mapping[int, float] | None = None) -> Image:
         """Mean electrons of an exposure, (rows, columns). `gains`: of LEDs by id; 1 where not given."""
@@ -63,6 +74,8 @@ class ExpectedRegion:
         for light in lights:
             gain = 1.0 if gains is None else gains.get(light.led_id, 1.0)
             image[self.roi.slices(light.roi)] += light.electrons_per_s * np.float32(gain * exposure_s)
+        if self.halo is not None:
+            image += self.halo.electrons_per_s(self.roi, gains) * np.float32(exposure_s)
         return image
 
 

@@ -5,13 +5,14 @@ The room behind the LEDs comes from `background`. LEDs lie on top, each a region
 background. Its own light is a patch, so that image = background + sum over LEDs of gain * patch, for any exposure and
 modulation. The patch of an LED behind a diffuser is the light on the diffuser, which itself is a surface of the room.
 The specular reflection of an LED in a glazing is a patch too (`specular_reflection`). At last the lens blurs each patch
-by the kernel of its depth (`led_blur`).
+by the kernel of its depth (`led_blur`), and scatters a share of all light into a halo (`halo`).
 """
 
 import copy
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,7 @@ from vlcrender.light.lightmap import Lightmap, bake
 from vlcrender.rendering.background import Background, BackgroundRegion
 from vlcrender.rendering.electron_rates import ElectronRates
 from vlcrender.rendering.expected_image import ExpectedImage, ExpectedRegion, Image, LedPatch, SpecularReflection
+from vlcrender.rendering.halo import GlareHalo, glare_halo, halo_of_sources
 from vlcrender.rendering.led_blur import LedBlur, led_blur
 from vlcrender.rendering.led_radiance import LedImage, led_images
 from vlcrender.rendering.occlusion import Occlusion
@@ -36,6 +38,8 @@ from vlcrender.sensor.radiometry import Detector, Silicon
 
 MAX_SENSORS = 16
 """All regions of a frame together hold at most this many times the sensor's pixels."""
+
+OVERSCAN_WITH_GLARE = "regions.overscan = true: glare is computed on the sensor only; remove overscan or camera.glare"
 
 Array = NDArray[np.float64]
 LedImages = Mapping[int, LedImage]
@@ -72,8 +76,10 @@ class Renderer:
 
         during: for a moving camera, poses spread evenly over the exposure. The image is the mean over them, and the
         centres of the LEDs are given for `posed`. Raises InputError where the camera is not inside the room, or where
-        the regions hold more than MAX_SENSORS times the sensor's pixels.
+        the regions hold more than MAX_SENSORS times the sensor's pixels, and for a lens with glare with overscan.
         """
+        if posed.camera.glare is not None and regions is not None and regions.overscan:
+            raise InputError(OVERSCAN_WITH_GLARE)
         poses = [posed] if during is None else [posed.at(pose) for pose in during]
         for each in poses:
             check_inside(self.scene, each.pose)
@@ -85,6 +91,7 @@ class Renderer:
         _check_size(rois, camera)
         backgrounds, reflections = self._rooms(poses, rois, images, blurs)
         patches = self._patches(posed, images, patch_rois, blurs)
+        halo = self._halo(posed, patches)
         return ExpectedImage(
             tuple(
                 ExpectedRegion(
@@ -92,6 +99,7 @@ class Renderer:
                     background,
                     tuple(p for p in patches if roi.contains(p.roi)),
                     tuple(r for r in reflections if roi.contains(r.roi)),
+                    halo,
                 )
                 for roi, background in zip(rois, backgrounds, strict=True)
             )
@@ -111,6 +119,13 @@ class Renderer:
         patch_rois = _patch_rois(posed.camera, images, blurs, regions)
         return self._patches(posed, images, patch_rois, blurs, np.float64)
 
+    def halo_of(self, camera: Camera) -> Callable[[Sequence[LedPatch], Roi], Array] | None:
+        """The function from patches of `led_patches` to their halo in a region of the sensor, electrons a second.
+
+        None for a lens without glare.
+        """
+        return None if camera.glare is None else partial(halo_of_sources, camera, camera.glare)
+
     def background_cd_m2(self, posed: PosedCamera) -> Image:
         """Luminance of the room times relative illumination, mean over each pixel, (height, width); sharp, no LEDs."""
         (region,) = self._background.regions(posed, (Roi.of_sensor(posed.camera),), ElectronRates(1.0, 1.0))
@@ -118,6 +133,18 @@ class Renderer:
 
     def _rates(self, camera: Camera) -> ElectronRates:
         return ElectronRates.of(self.scene, camera, self.detector)
+
+    def _halo(self, posed: PosedCamera, patches: Sequence[LedPatch]) -> GlareHalo | None:
+        """The halo of all that the sensor sees, regions or not; of room and reflections as at mid-exposure."""
+        if posed.camera.glare is None:
+            return None
+        rates, sensor = self._rates(posed.camera), Roi.of_sensor(posed.camera)
+        reflections = [
+            reflection
+            for number in range(len(self.scene.glazings))
+            for reflection in specular_reflections(self.scene, self._occlusion, posed, number, [sensor], rates.led)
+        ]
+        return glare_halo(posed, self._background, rates, [*patches, *reflections])
 
     def _rooms(
         self, poses: Sequence[PosedCamera], rois: Sequence[Roi], images: Sequence[LedImages], blurs: LedBlur

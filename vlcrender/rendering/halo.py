@@ -1,0 +1,188 @@
+"""Halo of a lens's veiling glare, on a grid of nodes a sixth of its radius apart.
+
+The halo is the light of the whole sensor, scattered by `camera.glare`. Light is put onto the nodes, convolved with the
+glare spread function there, and interpolated between them. Both steps use the weights of cubic convolution (Catmull and
+Rom), which reproduce quadratics: moments of light up to the second are exact. With nodes r_0 / 6 apart the error of a
+point's halo is below 0.5 % of its largest value (tested). The light of each LED is kept apart, since its brightness may
+change; the light of the room behind is sampled by one ray for 4 x 4 parts of the area of a node.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import signal, sparse
+
+from vlcrender.camera.glare import Glare
+from vlcrender.camera.intrinsics import Camera
+from vlcrender.camera.posed_camera import PosedCamera
+from vlcrender.camera.roi import Roi
+from vlcrender.core.backend import dr, exact_math, mi
+from vlcrender.rendering.background import Background
+from vlcrender.rendering.electron_rates import ElectronRates
+from vlcrender.rendering.expected_image import Image
+
+NODES_PER_RADIUS = 6
+"""Nodes along the halo's radius."""
+RAYS_PER_NODE = 4
+"""Rays across and down the area of a node."""
+BORDER_NODES = 2
+"""Nodes beyond the sensor's border, between which the outermost pixels lie too."""
+
+Array = NDArray[np.float64]
+
+
+class SourceOfLight(Protocol):
+    """An LED's patch, or its specular reflection."""
+
+    @property
+    def led_id(self) -> int:
+        """Identity of the LED."""
+
+    @property
+    def roi(self) -> Roi:
+        """The pixels that it lights."""
+
+    @property
+    def electrons_per_s(self) -> NDArray[np.floating]:
+        """Its light in each of them."""
+
+
+@dataclass(frozen=True)
+class HaloGrid:
+    """Nodes over a sensor: node (i, j) is at the pixel position v = (i - BORDER_NODES) step, u = (j - ...) step."""
+
+    step_px: int
+    sensor: Roi
+
+    @classmethod
+    def of(cls, camera: Camera, glare: Glare) -> "HaloGrid":
+        """The grid of a camera's glare."""
+        step = max(1, int(glare.radius_um / camera.pixel_pitch_um / NODES_PER_RADIUS))
+        return cls(step, Roi.of_sensor(camera))
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Nodes down and across."""
+        rows, columns = (
+            -(-size // self.step_px) + 1 + 2 * BORDER_NODES for size in (self.sensor.rows, self.sensor.columns)
+        )
+        return rows, columns
+
+    def weights(self, positions_px: Array, axis: int) -> "sparse.csr_array":
+        """Weights (n, nodes) of the nodes along an axis (0: down) in the value at each position v or u, on the sensor.
+
+        The transpose puts light at the positions onto the nodes.
+        """
+        at = positions_px / self.step_px + BORDER_NODES
+        first = np.floor(at).astype(int)
+        t = at - first
+        taps = np.stack(
+            [
+                ((2 - t) * t - 1) * t / 2,
+                ((3 * t - 5) * t * t + 2) / 2,
+                ((4 - 3 * t) * t + 1) * t / 2,
+                (t - 1) * t * t / 2,
+            ],
+            axis=1,
+        )
+        nodes = first[:, None] + np.arange(-1, 3)
+        starts = np.arange(0, 4 * len(at) + 1, 4)
+        return sparse.csr_array((taps.ravel(), nodes.ravel(), starts), shape=(len(at), self.shape[axis]))
+
+    def gathered(self, light: NDArray[np.floating], rows_px: Array, columns_px: Array) -> Array:
+        """Light (rows, columns) at positions v and u, put onto the nodes (nodes down, nodes across)."""
+        down = self.weights(rows_px, 0).T @ light.astype(np.float64)
+        return np.ascontiguousarray((self.weights(columns_px, 1).T @ down.T).T)
+
+    def spread(self, light: Array, glare: Glare, pixel_pitch_um: float) -> Array:
+        """The halo at the nodes, electrons a pixel, of light on the nodes."""
+        down, across = (np.arange(1 - size, size, dtype=np.float64) * self.step_px for size in self.shape)
+        kernel = glare.share * glare.spread_per_px2(np.hypot(down[:, None], across), pixel_pitch_um)
+        return np.maximum(signal.fftconvolve(kernel, light, mode="valid"), 0.0)
+
+    def values(self, at_nodes: Array, roi: Roi) -> Array:
+        """Values at the centres of the pixels of a region of the sensor, (rows, columns)."""
+        u, v = roi.centers_px()
+        down = self.weights(v[:, 0], 0) @ at_nodes
+        return np.ascontiguousarray((self.weights(u[0], 1) @ down.T).T)
+
+
+@dataclass(frozen=True, eq=False)
+class GlareHalo:
+    """The halo of one image: light on the nodes, electrons a second, of the room and of each LED by its id."""
+
+    grid: HaloGrid
+    glare: Glare
+    pixel_pitch_um: float
+    room: Array
+    leds: tuple[tuple[int, Array], ...]
+
+    def electrons_per_s(self, roi: Roi, gains: Mapping[int, float] | None = None) -> Image:
+        """The halo in a region of the sensor, (rows, columns). `gains`: of LEDs by id; 1 where not given."""
+        at_nodes = self._unmodulated if gains is None else self._at_nodes(gains)
+        return self.grid.values(at_nodes, roi).astype(np.float32)
+
+    @cached_property
+    def _unmodulated(self) -> Array:
+        return self._at_nodes({})
+
+    def _at_nodes(self, gains: Mapping[int, float]) -> Array:
+        light = self.room.copy()
+        for led_id, of_led in self.leds:
+            light += gains.get(led_id, 1.0) * of_led
+        return self.grid.spread(light, self.glare, self.pixel_pitch_um)
+
+
+def halo_of_sources(camera: Camera, glare: Glare, sources: Sequence[SourceOfLight], roi: Roi) -> Array:
+    """The halo, in a region of the sensor, of light of which `glare.share` is scattered already, (rows, columns)."""
+    grid = HaloGrid.of(camera, glare)
+    light = np.zeros(grid.shape)
+    for source in sources:
+        u, v = source.roi.centers_px()
+        light += grid.gathered(source.electrons_per_s, v[:, 0], u[0]) / (1 - glare.share)
+    return grid.values(grid.spread(light, glare, camera.pixel_pitch_um), roi)
+
+
+def glare_halo(
+    posed: PosedCamera, background: Background, rates: ElectronRates, sources: Sequence[SourceOfLight]
+) -> GlareHalo | None:
+    """The halo of a view; None for a lens without glare.
+
+    background: the room, seen from this pose; rates: of light that is not scattered; sources: the light of the LEDs
+    that it images on the sensor, less the share that is scattered. LEDs' faces, which hide a little of the room, are
+    left out of its light.
+    """
+    camera, glare = posed.camera, posed.camera.glare
+    if glare is None:
+        return None
+    grid = HaloGrid.of(camera, glare)
+    sharp = 1 / (1 - glare.share)
+    cell = max(1, grid.step_px // RAYS_PER_NODE)
+    rows, columns = (np.arange(0, size, cell) for size in (camera.height_px, camera.width_px))
+    heights, widths = (
+        np.minimum(starts + cell, size) - starts
+        for starts, size in ((rows, camera.height_px), (columns, camera.width_px))
+    )
+    v, u = rows + heights / 2, columns + widths / 2
+    with exact_math():
+        across, down = np.meshgrid(u.astype(np.float32), v.astype(np.float32))
+        hit = background.trace(posed, mi.Float(across.ravel()), mi.Float(down.ravel()), rates, float(cell))
+        dr.eval(hit.value)
+        room = hit.value.numpy().reshape(len(v), len(u)).astype(np.float64)
+    leds: dict[int, Array] = {}
+    for source in sources:
+        roi = source.roi
+        u_px, v_px = roi.centers_px()
+        light = sharp * grid.gathered(source.electrons_per_s, v_px[:, 0], u_px[0])
+        leds[source.led_id] = leds[source.led_id] + light if source.led_id in leds else light
+    return GlareHalo(
+        grid,
+        glare,
+        camera.pixel_pitch_um,
+        sharp * grid.gathered(room * np.outer(heights, widths), v, u),
+        tuple(leds.items()),
+    )
