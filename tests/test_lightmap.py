@@ -15,6 +15,7 @@ from platformdirs import user_cache_dir
 
 from vlcrender.config.toml_model import check, read_toml
 from vlcrender.core.warn_once import warn_once
+from vlcrender.errors import InputError
 from vlcrender.light import bake_cache, lightmap
 from vlcrender.light.bake_cache import BakedIlluminance
 from vlcrender.light.lightmap import bake, led_illuminance_lux, path_traced_lux, room_mesh
@@ -27,6 +28,7 @@ from vlcrender.scene.schema import SceneSettings
 from vlcrender.scene.sources import point_sources
 
 TABLE1 = read_toml(ROOT / "scenes/table1.toml")
+FACES = ("floor", "ceiling", "walls")
 
 
 def scene_of(folder: Path | None = None, **changes: object) -> Scene:
@@ -100,15 +102,19 @@ def test_all_light_of_the_leds_falls_on_the_room(half_power_deg: float) -> None:
     assert (lux * mesh.areas_m2()).sum() == pytest.approx(flux, rel=5e-3)
 
 
-@pytest.mark.parametrize("albedo", [0.0, 0.5, 0.8])
+@pytest.mark.parametrize("albedo", [0.0, 0.5, 0.8, 0.95, pytest.param(0.99, marks=pytest.mark.slow)])
 def test_white_furnace(albedo: float) -> None:
-    """With equal emission and albedo on all surfaces, luminance is emission / (1 - albedo) everywhere."""
+    """A flux that falls evenly on a closed room of one reflectance: E = flux rho / (S (1 - rho)), reflected part alone.
+
+    The surfaces emit what they reflect of the flux at once: luminance is rho flux / (pi S), here 1 cd/m2 (of a black
+    room, whose surfaces emit by themselves, too).
+    """
     scene = scene_of(led=[lamp()])
     mesh = mesh_of_surfaces(scene.surfaces, 1.0)
     mesh = dataclasses.replace(mesh, albedo=np.full(len(mesh.vertices_m), albedo))
     glowing = mitsuba_scene(mesh, np.ones(len(mesh.vertices_m)), (), daylight=False)
     lux, sigma = path_traced_lux(glowing, mesh.probes_m, mesh.normals, 2048, lambda share: None)
-    expected = np.pi / (1 - albedo)
+    expected = np.pi / (1 - albedo)  # flux rho / S = pi
     n = len(lux)
     # The standard errors come from 8 batches: z follows Student's t with 7 degrees of freedom, variance 7/5.
     z = (lux - expected) / np.maximum(sigma, 1e-5 * expected)
@@ -116,19 +122,45 @@ def test_white_furnace(albedo: float) -> None:
     # The standard errors are neither too small nor too large. Fourth moment of t: 3 * 7^2 / ((7 - 2) (7 - 4)) = 9.8.
     # Without reflections every path has the same luminance, and no error.
     assert albedo == 0 or abs((z**2).mean() - 7 / 5) < 5 * np.sqrt((9.8 - (7 / 5) ** 2) / n)
-    assert lux.mean() == pytest.approx(expected, rel=5e-3)
+    # The sum over a path of up to infinitely many bounces, each survived with probability rho after the first ones, is
+    # at most geometric: its standard deviation is below its mean. All 2048 n paths are independent.
+    assert lux.mean() == pytest.approx(expected, rel=5 / np.sqrt(2048 * n) + 1e-5)
 
 
 @pytest.mark.slow
-def test_energy_balance(tmp_path: Path) -> None:
-    """The surfaces absorb the flux that the LEDs emit."""
-    scene = scene_of(led=[lamp(position_m=[3.5, 3.5, 3.0])], bake={"texel_m": 0.2, "paths": 512})
+@pytest.mark.parametrize("reflectance", [None, 0.5, 0.95, 0.99])
+def test_energy_balance(tmp_path: Path, reflectance: float | None) -> None:
+    """The surfaces absorb the flux that the LEDs emit; None stands for the reflectances of Table 1's room."""
+    finish = {"floor": 0.2, "ceiling": 0.8, "walls": 0.5} if reflectance is None else dict.fromkeys(FACES, reflectance)
+    room = {"size_m": [7.0, 7.0, 3.5], "reflectance": finish}
+    scene = scene_of(led=[lamp(position_m=[3.5, 3.5, 3.0])], room=room, bake={"texel_m": 0.2, "paths": 64})
     light = bake(scene, tmp_path)
     count = len(light.mesh.vertices_m)
     absorbed = ((1 - light.mesh.albedo) * light.led_lux[:count] * light.mesh.areas_m2()).sum()
     flux = np.pi * 10000 * np.pi * 0.01**2
-    # the quadrature's half per cent, as for direct light; Monte Carlo adds 512 * 2000 paths: 0.1 %
+    # the quadrature's half per cent, as for direct light; Monte Carlo adds 64 * 5000 paths: 0.18 %
     assert absorbed == pytest.approx(flux, rel=0.01)
+
+
+def test_a_room_that_absorbs_no_light_is_refused(tmp_path: Path) -> None:
+    """Paths in a room of reflectance 1 all round never end. A little absorption, or furniture, is enough."""
+
+    def room(floor: float) -> dict[str, object]:
+        return {"size_m": [7.0, 7.0, 3.5], "reflectance": {"floor": floor, "ceiling": 1.0, "walls": 1.0}}
+
+    message = r"reflectance: all surfaces together absorb 0\.000% of the light on them; at least 0\.1% is needed"
+    with pytest.raises(InputError, match=rf"^test: {message}"):
+        scene_of(led=[lamp()], room=room(1.0))
+    scene_of(led=[lamp()], room=room(0.99))  # absorbs 0.01 * 49 of 196 m2: 0.25 %
+    glazing = {"wall": "x=0", "corner_m": [2.5, 1.0], "size_m": [2.0, 1.5], "luminance_cd_m2": 0.0}
+    scene_of(led=[lamp()], room=room(1.0), glazing=[glazing])
+    (tmp_path / "table.obj").write_text("v 3 3 1\nv 4 3 1\nv 4 4 1\nv 3 4 1\nf 1 2 3 4\n")
+    bake_settings = {"texel_m": 5.0, "paths": 8}
+    with pytest.raises(InputError, match=rf"^scene 'table1': {message}"):
+        furniture = [{"file": "table.obj", "reflectance": 1.0}]
+        bake(scene_of(tmp_path, led=[lamp()], room=room(1.0), furniture=furniture, bake=bake_settings), tmp_path)
+    grey = [{"file": "table.obj", "reflectance": 0.5}]  # absorbs 0.5 of 197 m2
+    bake(scene_of(tmp_path, led=[lamp()], room=room(1.0), furniture=grey, bake=bake_settings), tmp_path)
 
 
 @pytest.mark.slow

@@ -27,17 +27,15 @@ from vlcrender.scene.furniture import furniture_meshes
 from vlcrender.scene.loader import Scene
 from vlcrender.scene.mesh import Mesh, join, mesh_of_surfaces
 from vlcrender.scene.sources import Sources, point_sources
-from vlcrender.scene.surfaces import Glazing
+from vlcrender.scene.surfaces import Glazing, check_absorptance
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
-CACHE_VERSION = 4
+CACHE_VERSION = 5
 """Raised with every change of the program that changes bakes of the same scene."""
 BATCHES = 8
 """Independent estimates of a path-traced illuminance; their scatter gives the standard error."""
-MAX_DEPTH = 64
-"""Longest path, in bounces; Russian roulette ends nearly all paths long before."""
 ROULETTE_DEPTH = 4
 """Bounces before Russian roulette begins."""
 MAX_RAYS = 4_000_000
@@ -82,9 +80,13 @@ def bake(scene: Scene, cache: Path | None = None, progress: Progress = lambda st
     """The lightmap of a scene, from the cache or computed and put there.
 
     cache: folder of the cache, `cache_folder()` for None. progress: called with (stage, share done) during a
-    computation. Raises InputError for furniture that cannot be used; a cache that cannot be written is no error.
+    computation. Raises InputError for furniture that cannot be used, and for a room whose surfaces absorb less than
+    MIN_ABSORPTANCE of the light that falls on them; a cache that cannot be written is no error.
     """
     mesh = room_mesh(scene)
+    glazing_m2 = sum(glazing.area_m2 for glazing in scene.glazings)
+    areas_m2 = mesh.areas_m2()
+    check_absorptance(areas_m2 @ (1 - mesh.albedo) + glazing_m2, areas_m2.sum() + glazing_m2, f"scene {scene.name!r}")
     albedo = np.concatenate([mesh.albedo, np.full(len(scene.leds), scene.settings.led_reflectance)])
     folder, key = cache or cache_folder(), _key(scene, mesh)
     baked = load(key, len(albedo), folder)
@@ -210,6 +212,9 @@ def _path_luminance(glowing: Any, sampler: Any, ray: Any) -> Any:
     """Luminance along rays: emission of all surfaces on a path, weighted by the reflectances before each.
 
     Paths are drawn by the surfaces' BSDFs alone: all surfaces emit, so that sampling of emitters would gain nothing.
+    Russian roulette alone ends them. It is unbiased: a surviving path is divided by its probability, which is its
+    weight, so that its weight is 1 again. With a smaller probability, such as 0.95, the weights would grow along a path
+    and the variance would be infinite in rooms of reflectance above sqrt(0.95).
     """
     luminance = mi.Float(0.0)
     weight: Any = mi.Float(1.0)
@@ -222,10 +227,9 @@ def _path_luminance(glowing: Any, sampler: Any, ray: Any) -> Any:
         weight *= mi.unpolarized_spectrum(value)[0]
         ray = si.spawn_ray(si.to_world(sample.wo))
         depth += 1
-        # Russian roulette of weak paths. It is unbiased: surviving paths are divided by their probability.
-        keep = dr.select(depth > ROULETTE_DEPTH, dr.minimum(weight, 0.95), 1.0)
-        active &= (sampler.next_1d(active) < keep) & (weight > 0) & (depth < MAX_DEPTH)
-        weight /= dr.maximum(keep, 1e-6)
+        keep = dr.select(depth > ROULETTE_DEPTH, dr.minimum(weight, 1.0), 1.0)
+        active &= sampler.next_1d(active) < keep
+        weight = dr.select(active, weight / keep, 0.0)
     return luminance
 
 

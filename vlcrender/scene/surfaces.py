@@ -15,6 +15,8 @@ from vlcrender.scene.texture import Texture, read_reflectances
 
 TOUCH_M = 1e-9
 """Rounding allowance for solids that touch."""
+MIN_ABSORPTANCE = 1e-3
+"""Smallest mean absorptance of a room. Its light paths have 1 / absorptance bounces on average."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,12 @@ class Surface:
     """(a0, b0, a1, b1) of rectangles that are cut out: panels on a ceiling, glazing in a wall."""
     texture: Texture | None = None
 
+    @property
+    def area_m2(self) -> float:
+        """Area without the holes."""
+        share = 1.0 - sum((a1 - a0) * (b1 - b0) for a0, b0, a1, b1 in self.holes)
+        return share * float(np.linalg.norm(np.cross(self.edge_u_m, self.edge_v_m)))
+
 
 @dataclass(frozen=True)
 class Glazing:
@@ -51,6 +59,11 @@ class Glazing:
         """The four corners in order around the rectangle, (4, 3)."""
         shares = ((0, 0), (1, 0), (1, 1), (0, 1))
         return np.stack([self.corner_m + a * self.edge_u_m + b * self.edge_v_m for a, b in shares])
+
+    @property
+    def area_m2(self) -> float:
+        """Area."""
+        return float(np.linalg.norm(np.cross(self.edge_u_m, self.edge_v_m)))
 
     @property
     def normal(self) -> NDArray[np.float64]:
@@ -72,6 +85,20 @@ class Glazing:
             share = (from_corner * edge).sum(axis=-1) / float(edge @ edge)
             inside &= (share >= 0) & (share <= 1)
         return inside
+
+
+def check_absorptance(absorbing_m2: float, total_m2: float, source: str) -> None:
+    """Refuse a room in which light is reflected for ever, or nearly so.
+
+    absorbing_m2: sum of area * (1 - reflectance) of all surfaces; glazing counts as absorbing. total_m2: their area.
+    Raises InputError that starts with `source` where the mean absorptance is below MIN_ABSORPTANCE.
+    """
+    absorptance = absorbing_m2 / total_m2
+    if absorptance < MIN_ABSORPTANCE:
+        raise InputError(
+            f"{source}: reflectance: all surfaces together absorb {max(absorptance, 0.0):.3%} of the light on them; at "
+            f"least {MIN_ABSORPTANCE:.1%} is needed: lower a reflectance, or add glazing"
+        )
 
 
 def panel_centers_m(grid: PanelGrid) -> NDArray[np.float64]:
