@@ -156,11 +156,13 @@ def test_a_room_that_absorbs_no_light_is_refused(tmp_path: Path) -> None:
     scene_of(led=[lamp()], room=room(1.0), glazing=[glazing])
     (tmp_path / "table.obj").write_text("v 3 3 1\nv 4 3 1\nv 4 4 1\nv 3 4 1\nf 1 2 3 4\n")
     bake_settings = {"texel_m": 5.0, "paths": 8}
+    white, grey = (
+        scene_of(tmp_path, led=[lamp()], room=room(1.0), furniture=[piece], bake=bake_settings)
+        for piece in ({"file": "table.obj", "reflectance": reflectance} for reflectance in (1.0, 0.5))
+    )
     with pytest.raises(InputError, match=rf"^scene 'table1': {message}"):
-        furniture = [{"file": "table.obj", "reflectance": 1.0}]
-        bake(scene_of(tmp_path, led=[lamp()], room=room(1.0), furniture=furniture, bake=bake_settings), tmp_path)
-    grey = [{"file": "table.obj", "reflectance": 0.5}]  # absorbs 0.5 of 197 m2
-    bake(scene_of(tmp_path, led=[lamp()], room=room(1.0), furniture=grey, bake=bake_settings), tmp_path)
+        bake(white, tmp_path)
+    bake(grey, tmp_path)  # absorbs 0.5 of 197 m2
 
 
 @pytest.mark.slow

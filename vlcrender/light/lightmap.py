@@ -32,7 +32,7 @@ from vlcrender.scene.surfaces import Glazing, check_absorptance
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
-CACHE_VERSION = 5
+CACHE_VERSION = 6
 """Raised with every change of the program that changes bakes of the same scene."""
 BATCHES = 8
 """Independent estimates of a path-traced illuminance; their scatter gives the standard error."""
@@ -86,7 +86,8 @@ def bake(scene: Scene, cache: Path | None = None, progress: Progress = lambda st
     mesh = room_mesh(scene)
     glazing_m2 = sum(glazing.area_m2 for glazing in scene.glazings)
     areas_m2 = mesh.areas_m2()
-    check_absorptance(areas_m2 @ (1 - mesh.albedo) + glazing_m2, areas_m2.sum() + glazing_m2, f"scene {scene.name!r}")
+    absorbing_m2 = float(areas_m2 @ (1 - mesh.albedo)) + glazing_m2
+    check_absorptance(absorbing_m2, float(areas_m2.sum()) + glazing_m2, f"scene {scene.name!r}")
     albedo = np.concatenate([mesh.albedo, np.full(len(scene.leds), scene.settings.led_reflectance)])
     folder, key = cache or cache_folder(), _key(scene, mesh)
     baked = load(key, len(albedo), folder)

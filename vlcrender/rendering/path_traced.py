@@ -178,7 +178,7 @@ def scene_dict(scene: Scene, posed: PosedCamera) -> dict[str, object]:
         tree[f"furniture{i}"] = room_shape(mesh, np.zeros(len(mesh.vertices_m)))
     for i, glazing in enumerate(scene.glazings):
         frame = _frame(glazing.corner_m, glazing.edge_u_m, glazing.edge_v_m)
-        tree[f"glazing{i}"] = _shape("rectangle", frame, glazing_bsdf(glazing), 0.0)
+        tree[f"glazing{i}"] = _shape("rectangle", frame, glazing_bsdf(glazing.refractive_index), 0.0)
         behind = frame.copy()
         behind[:3, 3] -= BEHIND_M * frame[:3, 2]
         behind[:3, :2] *= 1 + BEHIND_M
@@ -266,7 +266,7 @@ def _diffuse(reflectance: float) -> dict[str, object]:
     return {"type": "diffuse", "reflectance": reflectance}
 
 
-def _shape(shape: str, frame: Array, bsdf: dict[str, object], luminance_cd_m2: float) -> dict[str, Any]:
+def _shape(shape: str, frame: Array, bsdf: dict[str, object] | mi.BSDF, luminance_cd_m2: float) -> dict[str, Any]:
     tree = {"type": shape, "to_world": mi.ScalarTransform4f(frame.tolist()), "bsdf": bsdf}
     if luminance_cd_m2 > 0:
         tree["emitter"] = {"type": "area", "radiance": float(luminance_cd_m2)}
