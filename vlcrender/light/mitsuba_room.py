@@ -63,7 +63,8 @@ class GlazingBsdf(mi.BSDF):
     def __init__(self, props: "mi.Properties") -> None:
         """Mitsuba's interface."""
         super().__init__(props)
-        self._index = float(props["index"])
+        index: Any = props["index"]
+        self._index = float(index)
         both = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide
         self.m_components = [mi.BSDFFlags.DeltaReflection | both, mi.BSDFFlags.Null | both]
         self.m_flags = self.m_components[0] | self.m_components[1]
