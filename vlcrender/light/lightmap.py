@@ -32,7 +32,7 @@ from vlcrender.scene.surfaces import Glazing, check_absorptance
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
-CACHE_VERSION = 6
+CACHE_VERSION = 7
 """Raised with every change of the program that changes bakes of the same scene."""
 BATCHES = 8
 """Independent estimates of a path-traced illuminance; their scatter gives the standard error."""
@@ -72,8 +72,9 @@ def room_mesh(scene: Scene) -> Mesh:
 
     Raises InputError for furniture that cannot be used.
     """
-    rectangles = mesh_of_surfaces(scene.surfaces, scene.settings.bake.texel_m)
-    return join([rectangles, *furniture_meshes(scene, len(scene.surfaces))])
+    furniture = furniture_meshes(scene, len(scene.surfaces))
+    texel_m, leds_m = scene.settings.bake.texel_m, scene.leds.centers_m
+    return join([mesh_of_surfaces(scene.surfaces, texel_m, furniture, leds_m), *furniture])
 
 
 def bake(scene: Scene, cache: Path | None = None, progress: Progress = lambda stage, share: None) -> Lightmap:
@@ -242,21 +243,38 @@ def _compute(scene: Scene, mesh: Mesh, progress: Progress) -> BakedIlluminance:
     leds = scene.leds
     points = np.concatenate([mesh.probes_m, leds.centers_m])
     normals = np.concatenate([mesh.normals, np.tile([0.0, 0.0, -1.0], (len(leds), 1))])
+    return illuminance_at(scene, mesh, points, normals, scene.settings.bake.paths, progress)
+
+
+def illuminance_at(
+    scene: Scene,
+    mesh: Mesh,
+    points_m: Array,
+    normals: Array,
+    paths: int,
+    progress: Progress = lambda stage, share: None,
+) -> BakedIlluminance:
+    """Illuminance at surface points (n, 3) with unit normals (n, 3), not interpolated.
+
+    mesh: `room_mesh(scene)`. paths: light paths traced from each point. The first points are the mesh's probes in a
+    bake; other points tell what its interpolation leaves out.
+    """
     dark = np.zeros(len(mesh.vertices_m))
     progress("direct light of LEDs", 0.0)
     blockers = mitsuba_scene(mesh, dark, (), daylight=False)
-    direct = led_illuminance_lux(blockers, points, normals, point_sources(leds), scene.glazings)
+    sources = point_sources(scene.leds)
+    vertices = led_illuminance_lux(blockers, mesh.probes_m, mesh.normals, sources, scene.glazings)
+    direct = led_illuminance_lux(blockers, points_m, normals, sources, scene.glazings)
     progress("direct light of LEDs", 1.0)
-    paths = scene.settings.bake.paths
-    lit = mitsuba_scene(mesh, mesh.albedo * direct[: len(dark)] / np.pi, scene.glazings, daylight=False)
+    lit = mitsuba_scene(mesh, mesh.albedo * vertices / np.pi, scene.glazings, daylight=False)
     bounced, sigma = path_traced_lux(
-        lit, points, normals, paths, lambda share: progress("reflected light of LEDs", share)
+        lit, points_m, normals, paths, lambda share: progress("reflected light of LEDs", share)
     )
-    daylight = np.zeros(len(points))
+    daylight = np.zeros(len(points_m))
     if any(glazing.luminance_cd_m2 > 0 for glazing in scene.glazings):
         outside = mitsuba_scene(mesh, dark, scene.glazings, daylight=True)
         daylight, more = path_traced_lux(
-            outside, points, normals, paths, lambda share: progress("daylight through glazing", share)
+            outside, points_m, normals, paths, lambda share: progress("daylight through glazing", share)
         )
         sigma = np.hypot(sigma, more)
     return BakedIlluminance(direct + bounced, daylight, sigma)

@@ -35,6 +35,10 @@ class Surface:
     holes: tuple[tuple[float, float, float, float], ...] = ()
     """(a0, b0, a1, b1) of rectangles that are cut out: panels on a ceiling, glazing in a wall."""
     texture: Texture | None = None
+    enclosed: bool = False
+    """Whether other surfaces stand at all four sides, as walls do around a floor."""
+    solids: tuple[tuple[float, float, float, float], ...] = ()
+    """(a0, b0, a1, b1) of rectangles on which solids stand: panels on a ceiling."""
 
     @property
     def area_m2(self) -> float:
@@ -128,9 +132,10 @@ def room_surfaces(
     x, y, z = (np.diag(room.size_m)[i] for i in range(3))
     finishes = {name: _finish(room, name, folder, source) for name in ("floor", "ceiling", "walls")}
     floor, ceiling = (_texture(finishes[name], corner, x, y) for name, corner in (("floor", o), ("ceiling", z)))
+    on_ceiling = _panels_on_ceiling(room, panels)
     surfaces = [
-        Surface("floor", o, x, y, finishes["floor"].reflectance, texture=floor),
-        Surface("ceiling", z, y, x, finishes["ceiling"].reflectance, _panels_on_ceiling(room, panels), ceiling),
+        Surface("floor", o, x, y, finishes["floor"].reflectance, texture=floor, enclosed=True),
+        Surface("ceiling", z, y, x, finishes["ceiling"].reflectance, on_ceiling, ceiling, True, on_ceiling),
     ]
     for name, (corner, edge_u, edge_v) in _walls(room).items():
         holes = tuple(
@@ -140,7 +145,8 @@ def room_surfaces(
         )
         along = y if name.startswith("x") else x
         texture = _texture(finishes["walls"], corner + z, along, -z)
-        surfaces.append(Surface(f"wall {name}", corner, edge_u, edge_v, finishes["walls"].reflectance, holes, texture))
+        reflectance = finishes["walls"].reflectance
+        surfaces.append(Surface(f"wall {name}", corner, edge_u, edge_v, reflectance, holes, texture, enclosed=True))
     return surfaces
 
 
@@ -278,7 +284,8 @@ def panel_surfaces(grid: PanelGrid, room_m: NDArray[np.float64], where: str) -> 
         name = f"panel {number}"
         x0, y0, x1, y1 = panel_opening_m(grid, float(center[0]), float(center[1]))
         under, across, along = np.array([x0, y0, low[2]]), np.array([x1 - x0, 0, 0]), np.array([0, y1 - y0, 0])
-        surfaces.append(Surface(f"{name} underside", under, along, across, grid.reflectance))
+        framed = grid.frame is not None
+        surfaces.append(Surface(f"{name} underside", under, along, across, grid.reflectance, enclosed=framed))
         surfaces += _sides(f"{name} side", low, size, grid.reflectance)
         if grid.frame is not None:
             surfaces += _frame_surfaces(f"{name} frame", low, size, grid.frame)
