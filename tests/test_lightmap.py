@@ -15,9 +15,10 @@ from platformdirs import user_cache_dir
 
 from vlcrender.config.toml_model import check, read_toml
 from vlcrender.core.warn_once import warn_once
+from vlcrender.errors import InputError
 from vlcrender.light import bake_cache, lightmap
 from vlcrender.light.bake_cache import BakedIlluminance
-from vlcrender.light.lightmap import bake, led_illuminance_lux, path_traced_lux, room_mesh
+from vlcrender.light.lightmap import bake, illuminance_at, led_illuminance_lux, path_traced_lux, room_mesh
 from vlcrender.light.mitsuba_room import mitsuba_scene
 from vlcrender.scene.fresnel import glazing_reflectance
 from vlcrender.scene.leds import Leds
@@ -25,8 +26,10 @@ from vlcrender.scene.loader import Scene, build_scene, load_scene
 from vlcrender.scene.mesh import Mesh, join, mesh_of_surfaces
 from vlcrender.scene.schema import SceneSettings
 from vlcrender.scene.sources import point_sources
+from vlcrender.scene.surfaces import panel_centers_m
 
 TABLE1 = read_toml(ROOT / "scenes/table1.toml")
+FACES = ("floor", "ceiling", "walls")
 
 
 def scene_of(folder: Path | None = None, **changes: object) -> Scene:
@@ -100,15 +103,19 @@ def test_all_light_of_the_leds_falls_on_the_room(half_power_deg: float) -> None:
     assert (lux * mesh.areas_m2()).sum() == pytest.approx(flux, rel=5e-3)
 
 
-@pytest.mark.parametrize("albedo", [0.0, 0.5, 0.8])
+@pytest.mark.parametrize("albedo", [0.0, 0.5, 0.8, 0.95, pytest.param(0.99, marks=pytest.mark.slow)])
 def test_white_furnace(albedo: float) -> None:
-    """With equal emission and albedo on all surfaces, luminance is emission / (1 - albedo) everywhere."""
+    """A flux that falls evenly on a closed room of one reflectance: E = flux rho / (S (1 - rho)), reflected part alone.
+
+    The surfaces emit what they reflect of the flux at once: luminance is rho flux / (pi S), here 1 cd/m2 (of a black
+    room, whose surfaces emit by themselves, too).
+    """
     scene = scene_of(led=[lamp()])
     mesh = mesh_of_surfaces(scene.surfaces, 1.0)
     mesh = dataclasses.replace(mesh, albedo=np.full(len(mesh.vertices_m), albedo))
     glowing = mitsuba_scene(mesh, np.ones(len(mesh.vertices_m)), (), daylight=False)
     lux, sigma = path_traced_lux(glowing, mesh.probes_m, mesh.normals, 2048, lambda share: None)
-    expected = np.pi / (1 - albedo)
+    expected = np.pi / (1 - albedo)  # flux rho / S = pi
     n = len(lux)
     # The standard errors come from 8 batches: z follows Student's t with 7 degrees of freedom, variance 7/5.
     z = (lux - expected) / np.maximum(sigma, 1e-5 * expected)
@@ -116,19 +123,47 @@ def test_white_furnace(albedo: float) -> None:
     # The standard errors are neither too small nor too large. Fourth moment of t: 3 * 7^2 / ((7 - 2) (7 - 4)) = 9.8.
     # Without reflections every path has the same luminance, and no error.
     assert albedo == 0 or abs((z**2).mean() - 7 / 5) < 5 * np.sqrt((9.8 - (7 / 5) ** 2) / n)
-    assert lux.mean() == pytest.approx(expected, rel=5e-3)
+    # The sum over a path of up to infinitely many bounces, each survived with probability rho after the first ones, is
+    # at most geometric: its standard deviation is below its mean. All 2048 n paths are independent.
+    assert lux.mean() == pytest.approx(expected, rel=5 / np.sqrt(2048 * n) + 1e-5)
 
 
 @pytest.mark.slow
-def test_energy_balance(tmp_path: Path) -> None:
-    """The surfaces absorb the flux that the LEDs emit."""
-    scene = scene_of(led=[lamp(position_m=[3.5, 3.5, 3.0])], bake={"texel_m": 0.2, "paths": 512})
+@pytest.mark.parametrize("reflectance", [None, 0.5, 0.95, 0.99])
+def test_energy_balance(tmp_path: Path, reflectance: float | None) -> None:
+    """The surfaces absorb the flux that the LEDs emit; None stands for the reflectances of Table 1's room."""
+    finish = {"floor": 0.2, "ceiling": 0.8, "walls": 0.5} if reflectance is None else dict.fromkeys(FACES, reflectance)
+    room = {"size_m": [7.0, 7.0, 3.5], "reflectance": finish}
+    scene = scene_of(led=[lamp(position_m=[3.5, 3.5, 3.0])], room=room, bake={"texel_m": 0.2, "paths": 64})
     light = bake(scene, tmp_path)
     count = len(light.mesh.vertices_m)
     absorbed = ((1 - light.mesh.albedo) * light.led_lux[:count] * light.mesh.areas_m2()).sum()
     flux = np.pi * 10000 * np.pi * 0.01**2
-    # the quadrature's half per cent, as for direct light; Monte Carlo adds 512 * 2000 paths: 0.1 %
+    # the quadrature's half per cent, as for direct light; Monte Carlo adds 64 * 5000 paths: 0.18 %
     assert absorbed == pytest.approx(flux, rel=0.01)
+
+
+def test_a_room_that_absorbs_no_light_is_refused(tmp_path: Path) -> None:
+    """Paths in a room of reflectance 1 all round never end. A little absorption, or furniture, is enough."""
+
+    def room(floor: float) -> dict[str, object]:
+        return {"size_m": [7.0, 7.0, 3.5], "reflectance": {"floor": floor, "ceiling": 1.0, "walls": 1.0}}
+
+    message = r"reflectance: all surfaces together absorb 0\.000% of the light on them; at least 0\.1% is needed"
+    with pytest.raises(InputError, match=rf"^test: {message}"):
+        scene_of(led=[lamp()], room=room(1.0))
+    scene_of(led=[lamp()], room=room(0.99))  # absorbs 0.01 * 49 of 196 m2: 0.25 %
+    glazing = {"wall": "x=0", "corner_m": [2.5, 1.0], "size_m": [2.0, 1.5], "luminance_cd_m2": 0.0}
+    scene_of(led=[lamp()], room=room(1.0), glazing=[glazing])
+    (tmp_path / "table.obj").write_text("v 3 3 1\nv 4 3 1\nv 4 4 1\nv 3 4 1\nf 1 2 3 4\n")
+    bake_settings = {"texel_m": 5.0, "paths": 8}
+    white, grey = (
+        scene_of(tmp_path, led=[lamp()], room=room(1.0), furniture=[piece], bake=bake_settings)
+        for piece in ({"file": "table.obj", "reflectance": reflectance} for reflectance in (1.0, 0.5))
+    )
+    with pytest.raises(InputError, match=rf"^scene 'table1': {message}"):
+        bake(white, tmp_path)
+    bake(grey, tmp_path)  # absorbs 0.5 of 197 m2
 
 
 @pytest.mark.slow
@@ -321,6 +356,65 @@ def test_the_mesh_has_holes_under_panels(office: Scene) -> None:
     area = mesh.areas_m2().sum()
     # floor, walls, ceiling, and the panels' sides; their undersides fill the holes they cut into the ceiling
     assert area == pytest.approx(2 * 49 + 4 * 24.5 + 49 * 4 * 0.6 * 0.05)
+
+
+@pytest.mark.parametrize("texel_m", [0.06, 0.25, 1.0])
+def test_probes_are_on_the_lit_side_of_panels_and_walls(office: Scene, texel_m: float) -> None:
+    """A probe inside a panel is dark, and darkens the ceiling around the panel's corner."""
+    mesh = mesh_of_surfaces(office.surfaces[:2], texel_m, leds_m=office.leds.centers_m)
+    assert ((mesh.probes_m[:, :2] > 0) & (mesh.probes_m[:, :2] < 7)).all()
+    x, y, _ = mesh.probes_m[mesh.normals[:, 2] < 0].T
+    for cx, cy, _ in panel_centers_m(office.settings.panels[0]):
+        assert not ((np.abs(x - cx) < 0.3) & (np.abs(y - cy) < 0.3)).any()
+
+
+def test_texels_are_fine_at_contacts_and_coarse_elsewhere(tmp_path: Path, office: Scene) -> None:
+    """A fifth of a texel beside walls and panels, a quarter around furniture's feet, never more than a texel."""
+
+    def steps(scene: Scene, name: str, axis: int) -> tuple[np.ndarray, np.ndarray]:
+        """Positions between the vertices of a surface along x, y or z, and the distances of the vertices."""
+        mesh = room_mesh(scene)
+        (number,) = (i for i, surface in enumerate(scene.surfaces) if surface.name == name)
+        cuts = np.unique(mesh.vertices_m[mesh.faces[mesh.owners == number]][..., axis].round(9))
+        return (cuts[1:] + cuts[:-1]) / 2, np.diff(cuts)
+
+    at, step = steps(office, "ceiling", 0)
+    assert step.max() <= 0.25 + 1e-9
+    beside = [np.abs(at - x).argmin() for x in (0.0, 0.2 - 1e-6, 0.8 + 1e-6, 1.2 - 1e-6)]
+    assert step[beside].max() < 0.2 * 0.25
+    assert step[(at > 3.2) & (at < 3.8)].min() > 0.19  # over a panel: 0.6 m
+    (tmp_path / "box.obj").write_text(
+        "v 2 2 0\nv 3 2 0\nv 3 3 0\nv 2 3 0\nv 2 2 1\nf 1 2 5\nf 2 3 5\nf 3 4 5\nf 4 1 5\n"
+    )
+    at, step = steps(scene_of(tmp_path, led=[lamp()], furniture=[{"file": "box.obj"}]), "floor", 1)
+    assert step[(at > 2.05) & (at < 2.95)].max() < 0.25 / 4 + 1e-9
+    assert step.max() > 0.24
+
+
+@pytest.mark.slow
+def test_interpolated_light_between_panels_is_the_light_there(office: Scene) -> None:
+    """Light of LEDs on the ceiling between panels and between panels and walls, traced to random points.
+
+    There it falls from the middle of a gap to a panel's side by 15 % over 5 cm, and towards a wall by 25 %.
+    """
+    light = bake(office)
+    rng = np.random.default_rng(1)
+    number = [surface.name for surface in office.surfaces].index("ceiling")
+    faces = light.mesh.faces[light.mesh.owners == number]
+    corners = light.mesh.vertices_m[faces]
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    picked = rng.choice(len(faces), 1000, p=areas / areas.sum())
+    shares = rng.dirichlet((1.0, 1.0, 1.0), len(picked))  # even over a triangle
+    points = np.einsum("ni,nij->nj", shares, corners[picked])
+    true = illuminance_at(office, light.mesh, points, np.tile([0.0, 0.0, -1.0], (len(points), 1)), 1024)
+    interpolated = (shares * light.led_lux[faces[picked]]).sum(axis=1)
+    by_the_wall = ((points[:, :2] < 0.2) | (points[:, :2] > 6.8)).any(axis=1)
+    for here in (by_the_wall, ~by_the_wall):
+        weights = np.bincount(faces[picked[here]].ravel(), shares[here].ravel(), minlength=len(light.sigma_lux))
+        noise = np.sqrt(((weights * light.sigma_lux) ** 2).sum() + (true.sigma_lux[here] ** 2).sum()) / here.sum()
+        mean = true.led_lux[here].mean()
+        # the issue's 1 %, and noise; each sigma comes from 8 batches, but the sums of hundreds are Gaussian
+        assert abs((interpolated - true.led_lux)[here].mean()) < 0.01 * mean + 5 * noise
 
 
 def test_joined_meshes_keep_their_faces() -> None:

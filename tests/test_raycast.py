@@ -13,8 +13,9 @@ from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.vignetting import relative_illumination
 from vlcrender.config.toml_model import check, read_toml
-from vlcrender.core.backend import mi
+from vlcrender.core.backend import dr, mi
 from vlcrender.light.lightmap import Lightmap, room_mesh
+from vlcrender.light.mitsuba_room import glazing_bsdf
 from vlcrender.light.raycast import Room
 from vlcrender.rendering.expected_image import LedPatch
 from vlcrender.rendering.renderer import Renderer
@@ -44,10 +45,31 @@ def test_glazing_reflects_by_fresnels_equations() -> None:
     # grazing: everything; no glass: nothing
     assert glazing_reflectance(1e-9, 1.52, np.sqrt) == pytest.approx(1.0, abs=1e-6)
     assert glazing_reflectance(0.5, 1.0, np.sqrt) == pytest.approx(0.0, abs=1e-12)
-    # at Brewster's angle atan(n) p-light passes: F = s^2 / 2 with s = cos(2 theta_B)
+    # at Brewster's angle atan(n) all p-light passes: half of 2 F / (1 + F) with F = s^2 = cos^2(2 theta_B)
     brewster = np.arctan(1.52)
-    face = np.cos(2 * brewster) ** 2 / 2
-    assert glazing_reflectance(np.cos(brewster), 1.52, np.sqrt) == pytest.approx(2 * face / (1 + face), rel=1e-9)
+    face = np.cos(2 * brewster) ** 2
+    assert glazing_reflectance(np.cos(brewster), 1.52, np.sqrt) == pytest.approx(face / (1 + face), rel=1e-9)
+    # at 60 deg a face reflects 18.344 % of s-light, 0.153 % of p-light; 2 F / (1 + F) of each: 31.001 % and 0.305 %
+    assert 1 - glazing_reflectance(0.5, 1.52, np.sqrt) == pytest.approx(0.84347, abs=1e-5)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 60.0, 80.0])
+def test_glazing_of_the_path_tracers_reflects_by_the_formula(degrees: float) -> None:
+    """Shares of rays that are reflected and transmitted by the BSDF of both path tracers, bake and reference."""
+    count, cosine = 400_000, float(np.cos(np.radians(degrees)))
+    bsdf = glazing_bsdf(1.52)
+    si = dr.zeros(mi.SurfaceInteraction3f, count)
+    si.wi = mi.Vector3f(float(np.sin(np.radians(degrees))), 0.0, cosine)
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(1, count)
+    sample, weight = bsdf.sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d())
+    assert np.all(np.array(weight) == 1)
+    assert np.allclose(np.array(sample.wo.x), -si.wi.x.numpy(), rtol=0, atol=1e-7)
+    up = sample.wo.z.numpy() > 0
+    assert np.allclose(np.abs(sample.wo.z.numpy()), cosine, rtol=0, atol=1e-7)
+    assert np.array_equal(up, mi.has_flag(sample.sampled_type, mi.BSDFFlags.DeltaReflection).numpy())
+    share = glazing_reflectance(cosine, 1.52, np.sqrt)
+    assert abs(up.mean() - share) < 5 * np.sqrt(share * (1 - share) / count)  # binomial
 
 
 def test_a_specular_reflection_is_at_the_image_of_the_mirrored_led() -> None:

@@ -27,17 +27,15 @@ from vlcrender.scene.furniture import furniture_meshes
 from vlcrender.scene.loader import Scene
 from vlcrender.scene.mesh import Mesh, join, mesh_of_surfaces
 from vlcrender.scene.sources import Sources, point_sources
-from vlcrender.scene.surfaces import Glazing
+from vlcrender.scene.surfaces import Glazing, check_absorptance
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
-CACHE_VERSION = 4
+CACHE_VERSION = 7
 """Raised with every change of the program that changes bakes of the same scene."""
 BATCHES = 8
 """Independent estimates of a path-traced illuminance; their scatter gives the standard error."""
-MAX_DEPTH = 64
-"""Longest path, in bounces; Russian roulette ends nearly all paths long before."""
 ROULETTE_DEPTH = 4
 """Bounces before Russian roulette begins."""
 MAX_RAYS = 4_000_000
@@ -74,17 +72,23 @@ def room_mesh(scene: Scene) -> Mesh:
 
     Raises InputError for furniture that cannot be used.
     """
-    rectangles = mesh_of_surfaces(scene.surfaces, scene.settings.bake.texel_m)
-    return join([rectangles, *furniture_meshes(scene, len(scene.surfaces))])
+    furniture = furniture_meshes(scene, len(scene.surfaces))
+    texel_m, leds_m = scene.settings.bake.texel_m, scene.leds.centers_m
+    return join([mesh_of_surfaces(scene.surfaces, texel_m, furniture, leds_m), *furniture])
 
 
 def bake(scene: Scene, cache: Path | None = None, progress: Progress = lambda stage, share: None) -> Lightmap:
     """The lightmap of a scene, from the cache or computed and put there.
 
     cache: folder of the cache, `cache_folder()` for None. progress: called with (stage, share done) during a
-    computation. Raises InputError for furniture that cannot be used; a cache that cannot be written is no error.
+    computation. Raises InputError for furniture that cannot be used, and for a room whose surfaces absorb less than
+    MIN_ABSORPTANCE of the light that falls on them; a cache that cannot be written is no error.
     """
     mesh = room_mesh(scene)
+    glazing_m2 = sum(glazing.area_m2 for glazing in scene.glazings)
+    areas_m2 = mesh.areas_m2()
+    absorbing_m2 = float(areas_m2 @ (1 - mesh.albedo)) + glazing_m2
+    check_absorptance(absorbing_m2, float(areas_m2.sum()) + glazing_m2, f"scene {scene.name!r}")
     albedo = np.concatenate([mesh.albedo, np.full(len(scene.leds), scene.settings.led_reflectance)])
     folder, key = cache or cache_folder(), _key(scene, mesh)
     baked = load(key, len(albedo), folder)
@@ -210,6 +214,9 @@ def _path_luminance(glowing: Any, sampler: Any, ray: Any) -> Any:
     """Luminance along rays: emission of all surfaces on a path, weighted by the reflectances before each.
 
     Paths are drawn by the surfaces' BSDFs alone: all surfaces emit, so that sampling of emitters would gain nothing.
+    Russian roulette alone ends them. It is unbiased: a surviving path is divided by its probability, which is its
+    weight, so that its weight is 1 again. With a smaller probability, such as 0.95, the weights would grow along a path
+    and the variance would be infinite in rooms of reflectance above sqrt(0.95).
     """
     luminance = mi.Float(0.0)
     weight: Any = mi.Float(1.0)
@@ -222,10 +229,9 @@ def _path_luminance(glowing: Any, sampler: Any, ray: Any) -> Any:
         weight *= mi.unpolarized_spectrum(value)[0]
         ray = si.spawn_ray(si.to_world(sample.wo))
         depth += 1
-        # Russian roulette of weak paths. It is unbiased: surviving paths are divided by their probability.
-        keep = dr.select(depth > ROULETTE_DEPTH, dr.minimum(weight, 0.95), 1.0)
-        active &= (sampler.next_1d(active) < keep) & (weight > 0) & (depth < MAX_DEPTH)
-        weight /= dr.maximum(keep, 1e-6)
+        keep = dr.select(depth > ROULETTE_DEPTH, dr.minimum(weight, 1.0), 1.0)
+        active &= sampler.next_1d(active) < keep
+        weight = dr.select(active, weight / keep, 0.0)
     return luminance
 
 
@@ -237,21 +243,38 @@ def _compute(scene: Scene, mesh: Mesh, progress: Progress) -> BakedIlluminance:
     leds = scene.leds
     points = np.concatenate([mesh.probes_m, leds.centers_m])
     normals = np.concatenate([mesh.normals, np.tile([0.0, 0.0, -1.0], (len(leds), 1))])
+    return illuminance_at(scene, mesh, points, normals, scene.settings.bake.paths, progress)
+
+
+def illuminance_at(
+    scene: Scene,
+    mesh: Mesh,
+    points_m: Array,
+    normals: Array,
+    paths: int,
+    progress: Progress = lambda stage, share: None,
+) -> BakedIlluminance:
+    """Illuminance at surface points (n, 3) with unit normals (n, 3), not interpolated.
+
+    mesh: `room_mesh(scene)`. paths: light paths traced from each point. The first points are the mesh's probes in a
+    bake; other points tell what its interpolation leaves out.
+    """
     dark = np.zeros(len(mesh.vertices_m))
     progress("direct light of LEDs", 0.0)
     blockers = mitsuba_scene(mesh, dark, (), daylight=False)
-    direct = led_illuminance_lux(blockers, points, normals, point_sources(leds), scene.glazings)
+    sources = point_sources(scene.leds)
+    vertices = led_illuminance_lux(blockers, mesh.probes_m, mesh.normals, sources, scene.glazings)
+    direct = led_illuminance_lux(blockers, points_m, normals, sources, scene.glazings)
     progress("direct light of LEDs", 1.0)
-    paths = scene.settings.bake.paths
-    lit = mitsuba_scene(mesh, mesh.albedo * direct[: len(dark)] / np.pi, scene.glazings, daylight=False)
+    lit = mitsuba_scene(mesh, mesh.albedo * vertices / np.pi, scene.glazings, daylight=False)
     bounced, sigma = path_traced_lux(
-        lit, points, normals, paths, lambda share: progress("reflected light of LEDs", share)
+        lit, points_m, normals, paths, lambda share: progress("reflected light of LEDs", share)
     )
-    daylight = np.zeros(len(points))
+    daylight = np.zeros(len(points_m))
     if any(glazing.luminance_cd_m2 > 0 for glazing in scene.glazings):
         outside = mitsuba_scene(mesh, dark, scene.glazings, daylight=True)
         daylight, more = path_traced_lux(
-            outside, points, normals, paths, lambda share: progress("daylight through glazing", share)
+            outside, points_m, normals, paths, lambda share: progress("daylight through glazing", share)
         )
         sigma = np.hypot(sigma, more)
     return BakedIlluminance(direct + bounced, daylight, sigma)

@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vlcrender.core.backend import mi
+from vlcrender.core.backend import dr, mi
+from vlcrender.scene.fresnel import glazing_reflectance
 from vlcrender.scene.mesh import Mesh
 from vlcrender.scene.surfaces import Glazing
 
@@ -42,7 +43,7 @@ def room_shape(mesh: Mesh, glow_cd_m2: Array) -> "mi.Mesh":
 
 def glazing_shape(glazing: Glazing) -> "mi.Mesh":
     """Glazing as a Mitsuba shape of thin glass."""
-    return _shape(glazing.name, glazing.corners_m, GLAZING_FACES, glazing_bsdf(glazing), np.zeros(4))
+    return _shape(glazing.name, glazing.corners_m, GLAZING_FACES, glazing_bsdf(glazing.refractive_index), np.zeros(4))
 
 
 def outside_shape(glazing: Glazing) -> "mi.Mesh":
@@ -53,16 +54,59 @@ def outside_shape(glazing: Glazing) -> "mi.Mesh":
     return _shape(f"outside {glazing.name}", corners, GLAZING_FACES, black, np.full(4, glazing.luminance_cd_m2))
 
 
-def glazing_bsdf(glazing: Glazing) -> dict[str, object]:
-    """Mitsuba's BSDF of thin glass: Fresnel reflection at both faces, transmission of the rest."""
-    return {"type": "thindielectric", "int_ior": glazing.refractive_index, "ext_ior": 1.0}
+class GlazingBsdf(mi.BSDF):
+    """Thin glass of the property `index`: it reflects the share of `glazing_reflectance`, transmits the rest unbent.
+
+    Mitsuba's own "thindielectric" averages the polarisations before it sums the reflections between the faces.
+    """
+
+    def __init__(self, props: "mi.Properties") -> None:
+        """Mitsuba's interface."""
+        super().__init__(props)
+        index: Any = props["index"]
+        self._index = float(index)
+        both = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide
+        self.m_components = [mi.BSDFFlags.DeltaReflection | both, mi.BSDFFlags.Null | both]
+        self.m_flags = self.m_components[0] | self.m_components[1]
+
+    def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> Any:
+        """Mitsuba's interface: (sample, weight); the weight is 1."""
+        share = glazing_reflectance(dr.abs(mi.Frame3f.cos_theta(si.wi)), self._index, dr.sqrt)
+        reflected = mi.Bool(active) & (sample1 <= share)
+        sample: Any = dr.zeros(mi.BSDFSample3f)
+        sample.wo = dr.select(reflected, mi.reflect(si.wi), -si.wi)
+        sample.pdf = dr.select(reflected, share, 1 - share)
+        sample.eta = mi.Float(1.0)
+        sample.sampled_component = dr.select(reflected, mi.UInt32(0), mi.UInt32(1))
+        of_reflection, of_transmission = mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.Null
+        sample.sampled_type = dr.select(reflected, mi.UInt32(+of_reflection), mi.UInt32(+of_transmission))
+        return sample, dr.select(mi.Bool(active), mi.Spectrum(1.0), mi.Spectrum(0.0))
+
+    def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+        """Mitsuba's interface: 0, since no direction but those of `sample` has light."""
+        return mi.Spectrum(0.0)
+
+    def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+        """Mitsuba's interface: 0, see `eval`."""
+        return mi.Float(0.0)
+
+    def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+        """Mitsuba's interface: `eval` and `pdf`."""
+        return mi.Spectrum(0.0), mi.Float(0.0)
+
+
+def glazing_bsdf(refractive_index: float) -> GlazingBsdf:
+    """Mitsuba's BSDF of thin glass."""
+    properties = mi.Properties()
+    properties["index"] = refractive_index
+    return GlazingBsdf(properties)
 
 
 def _shape(
-    name: str, vertices_m: Array, faces: NDArray[np.int64], bsdf: Mapping[str, object], glow_cd_m2: Array
+    name: str, vertices_m: Array, faces: NDArray[np.int64], bsdf: Mapping[str, object] | mi.BSDF, glow_cd_m2: Array
 ) -> "mi.Mesh":
     properties = mi.Properties()
-    properties["bsdf"] = mi.load_dict(dict(bsdf))
+    properties["bsdf"] = mi.load_dict(dict(bsdf)) if isinstance(bsdf, Mapping) else bsdf
     shape = mi.Mesh(name, len(vertices_m), len(faces), props=properties)
     parameters = mi.traverse(shape)
     parameters["vertex_positions"] = vertices_m.astype(np.float32).ravel()

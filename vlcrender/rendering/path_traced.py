@@ -31,7 +31,9 @@ DIFFUSER_PIXELS = 16
 """Pixels of a diffuser's bitmap, linear in between, along a distance equal to that of the LEDs behind it."""
 PROFILE_PIXELS = 256
 """Pixels across the bitmap of an LED's luminance profile."""
-MAX_DEPTH = 24
+ROULETTE_DEPTH = 8
+"""Bounces before Russian roulette begins, which alone ends paths. Mitsuba's keeps at most 95 % of them at a bounce: the
+variance is infinite, and the mean without bias, where reflectances are above sqrt(0.95) = 0.97 all round."""
 MAX_GLAZINGS = 4
 """Glazings that a ray may meet before the first diffuse surface."""
 
@@ -60,7 +62,7 @@ def reference_cd_m2(scene: Scene, posed: PosedCamera, samples_per_pixel: int, se
     if not np.allclose(scene.leds.orders[bare], 1.0):
         raise InputError("half_power_deg: the reference renderer's LEDs are Lambertian; it has to be 60")
     loaded = mi.load_dict(scene_dict(scene, posed), optimize=False)
-    all_light = mi.load_dict({"type": "path", "max_depth": MAX_DEPTH, "rr_depth": 8})
+    all_light = mi.load_dict({"type": "path", "max_depth": -1, "rr_depth": ROULETTE_DEPTH})
     ambient = _FirstSurface(scene.settings.ambient.illuminance_lux)
     pinhole = camera.lens_projection.keeps_lines_straight and camera.focus_distance_m is None
     render = _by_sensor if pinhole and camera.skew_px == 0 and camera.aspect_ratio == 1 else _by_rays
@@ -182,7 +184,7 @@ def scene_dict(scene: Scene, posed: PosedCamera) -> dict[str, object]:
         tree[f"furniture{i}"] = room_shape(mesh, np.zeros(len(mesh.vertices_m)))
     for i, glazing in enumerate(scene.glazings):
         frame = _frame(glazing.corner_m, glazing.edge_u_m, glazing.edge_v_m)
-        tree[f"glazing{i}"] = _shape("rectangle", frame, glazing_bsdf(glazing), 0.0)
+        tree[f"glazing{i}"] = _shape("rectangle", frame, glazing_bsdf(glazing.refractive_index), 0.0)
         behind = frame.copy()
         behind[:3, 3] -= BEHIND_M * frame[:3, 2]
         behind[:3, :2] *= 1 + BEHIND_M
@@ -294,7 +296,7 @@ def _diffuse(reflectance: float) -> dict[str, object]:
     return {"type": "diffuse", "reflectance": reflectance}
 
 
-def _shape(shape: str, frame: Array, bsdf: dict[str, object], luminance_cd_m2: float) -> dict[str, Any]:
+def _shape(shape: str, frame: Array, bsdf: dict[str, object] | mi.BSDF, luminance_cd_m2: float) -> dict[str, Any]:
     tree = {"type": shape, "to_world": mi.ScalarTransform4f(frame.tolist()), "bsdf": bsdf}
     if luminance_cd_m2 > 0:
         tree["emitter"] = {"type": "area", "radiance": float(luminance_cd_m2)}

@@ -13,7 +13,7 @@ from vlcrender.config.toml_model import check, read_toml
 from vlcrender.errors import InputError
 from vlcrender.scene.leds import Leds, leds_of
 from vlcrender.scene.schema import SceneSettings
-from vlcrender.scene.surfaces import Glazing, Surface, glazings_of, panel_surfaces, room_surfaces
+from vlcrender.scene.surfaces import Glazing, Surface, check_absorptance, glazings_of, panel_surfaces, room_surfaces
 
 
 @dataclass(frozen=True)
@@ -50,8 +50,8 @@ def load_scene(path: Path) -> Scene:
 def build_scene(settings: SceneSettings, source: str, folder: Path = Path()) -> Scene:
     """The scene of checked settings. Files of furniture and textures are looked up in `folder`.
 
-    Raises InputError that starts with `source` for geometry outside the room, for overlaps, for missing files and for
-    textures that cannot be read.
+    Raises InputError that starts with `source` for geometry outside the room, for overlaps, for missing files, for
+    textures that cannot be read and for surfaces that absorb no light. Furniture is read, and checked, by a bake.
     """
     leds = leds_of(settings, source)
     glazings = glazings_of(settings, source)
@@ -61,4 +61,8 @@ def build_scene(settings: SceneSettings, source: str, folder: Path = Path()) -> 
     for index, piece in enumerate(settings.furniture):
         if not (folder / piece.file).is_file():
             raise InputError(f"{source}: furniture[{index}].file = {piece.file!r}: no such file in the scene's folder")
+    if not settings.furniture:
+        glazing_m2 = sum(glazing.area_m2 for glazing in glazings)
+        absorbing_m2 = sum((1 - surface.reflectance) * surface.area_m2 for surface in surfaces) + glazing_m2
+        check_absorptance(absorbing_m2, sum(surface.area_m2 for surface in surfaces) + glazing_m2, source)
     return Scene(settings, tuple(surfaces), glazings, leds, folder)

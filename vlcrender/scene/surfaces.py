@@ -15,6 +15,8 @@ from vlcrender.scene.texture import Texture, read_reflectances
 
 TOUCH_M = 1e-9
 """Rounding allowance for solids that touch."""
+MIN_ABSORPTANCE = 1e-3
+"""Smallest mean absorptance of a room. Its light paths have 1 / absorptance bounces on average."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,16 @@ class Surface:
     holes: tuple[tuple[float, float, float, float], ...] = ()
     """(a0, b0, a1, b1) of rectangles that are cut out: panels on a ceiling, glazing in a wall."""
     texture: Texture | None = None
+    enclosed: bool = False
+    """Whether other surfaces stand at all four sides, as walls do around a floor."""
+    solids: tuple[tuple[float, float, float, float], ...] = ()
+    """(a0, b0, a1, b1) of rectangles on which solids stand: panels on a ceiling."""
+
+    @property
+    def area_m2(self) -> float:
+        """Area without the holes."""
+        share = 1.0 - sum((a1 - a0) * (b1 - b0) for a0, b0, a1, b1 in self.holes)
+        return share * float(np.linalg.norm(np.cross(self.edge_u_m, self.edge_v_m)))
 
 
 @dataclass(frozen=True)
@@ -51,6 +63,11 @@ class Glazing:
         """The four corners in order around the rectangle, (4, 3)."""
         shares = ((0, 0), (1, 0), (1, 1), (0, 1))
         return np.stack([self.corner_m + a * self.edge_u_m + b * self.edge_v_m for a, b in shares])
+
+    @property
+    def area_m2(self) -> float:
+        """Area."""
+        return float(np.linalg.norm(np.cross(self.edge_u_m, self.edge_v_m)))
 
     @property
     def normal(self) -> NDArray[np.float64]:
@@ -72,6 +89,20 @@ class Glazing:
             share = (from_corner * edge).sum(axis=-1) / float(edge @ edge)
             inside &= (share >= 0) & (share <= 1)
         return inside
+
+
+def check_absorptance(absorbing_m2: float, total_m2: float, source: str) -> None:
+    """Refuse a room in which light is reflected for ever, or nearly so.
+
+    absorbing_m2: sum of area * (1 - reflectance) of all surfaces; glazing counts as absorbing. total_m2: their area.
+    Raises InputError that starts with `source` where the mean absorptance is below MIN_ABSORPTANCE.
+    """
+    absorptance = absorbing_m2 / total_m2
+    if absorptance < MIN_ABSORPTANCE:
+        raise InputError(
+            f"{source}: reflectance: all surfaces together absorb {max(absorptance, 0.0):.3%} of the light on them; at "
+            f"least {MIN_ABSORPTANCE:.1%} is needed: lower a reflectance, or add glazing"
+        )
 
 
 def panel_centers_m(grid: PanelGrid) -> NDArray[np.float64]:
@@ -101,9 +132,10 @@ def room_surfaces(
     x, y, z = (np.diag(room.size_m)[i] for i in range(3))
     finishes = {name: _finish(room, name, folder, source) for name in ("floor", "ceiling", "walls")}
     floor, ceiling = (_texture(finishes[name], corner, x, y) for name, corner in (("floor", o), ("ceiling", z)))
+    on_ceiling = _panels_on_ceiling(room, panels)
     surfaces = [
-        Surface("floor", o, x, y, finishes["floor"].reflectance, texture=floor),
-        Surface("ceiling", z, y, x, finishes["ceiling"].reflectance, _panels_on_ceiling(room, panels), ceiling),
+        Surface("floor", o, x, y, finishes["floor"].reflectance, texture=floor, enclosed=True),
+        Surface("ceiling", z, y, x, finishes["ceiling"].reflectance, on_ceiling, ceiling, True, on_ceiling),
     ]
     for name, (corner, edge_u, edge_v) in _walls(room).items():
         holes = tuple(
@@ -113,7 +145,8 @@ def room_surfaces(
         )
         along = y if name.startswith("x") else x
         texture = _texture(finishes["walls"], corner + z, along, -z)
-        surfaces.append(Surface(f"wall {name}", corner, edge_u, edge_v, finishes["walls"].reflectance, holes, texture))
+        reflectance = finishes["walls"].reflectance
+        surfaces.append(Surface(f"wall {name}", corner, edge_u, edge_v, reflectance, holes, texture, enclosed=True))
     return surfaces
 
 
@@ -251,7 +284,8 @@ def panel_surfaces(grid: PanelGrid, room_m: NDArray[np.float64], where: str) -> 
         name = f"panel {number}"
         x0, y0, x1, y1 = panel_opening_m(grid, float(center[0]), float(center[1]))
         under, across, along = np.array([x0, y0, low[2]]), np.array([x1 - x0, 0, 0]), np.array([0, y1 - y0, 0])
-        surfaces.append(Surface(f"{name} underside", under, along, across, grid.reflectance))
+        framed = grid.frame is not None
+        surfaces.append(Surface(f"{name} underside", under, along, across, grid.reflectance, enclosed=framed))
         surfaces += _sides(f"{name} side", low, size, grid.reflectance)
         if grid.frame is not None:
             surfaces += _frame_surfaces(f"{name} frame", low, size, grid.frame)
