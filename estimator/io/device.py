@@ -36,13 +36,23 @@ def to_pixels(image: Floats, K: Floats) -> Floats:
 
 
 class Distortion(Row):
-    """Brown-Conrady coefficients in OpenCV's convention, for normalized image coordinates."""
+    """Brown-Conrady coefficients in OpenCV's convention, for normalized image coordinates.
+
+    Other keys are refused: without a coefficient of the calibration, undistorted pixels would be wrong.
+    """
 
     k1: Number
     k2: Number
     k3: Number
     p1: Number
     p2: Number
+
+    @model_validator(mode="before")
+    @classmethod
+    def _no_other_coefficients(cls, entry: Any) -> Any:
+        if isinstance(entry, Mapping) and (unknown := [key for key in entry if key not in cls.model_fields]):
+            raise ValueError(f"unknown key {unknown[0]!r}; allowed: {', '.join(cls.model_fields)}")
+        return entry
 
 
 class Camera(Row):
