@@ -152,8 +152,12 @@ class Sensor(Row):
 
         Offsets of whole rows and columns are left out: subtracting a spot's local background removes most of them.
         """
-        rounding = self.gain_e_per_dn**2 / 12 if self.noise == "full" or self.gain_e_per_dn != 1 else 0.0
-        return self.dsnu_e**2 + self.read_noise_e**2 + (self.adc_noise_dn * self.gain_e_per_dn) ** 2 + rounding
+        adc_noise_e = self.adc_noise_dn * self.gain_e_per_dn
+        return self.dsnu_e**2 + self.read_noise_e**2 + adc_noise_e**2 + self.rounding_e2()
+
+    def rounding_e2(self) -> float:
+        """Variance of the ADC's rounding, electrons squared; 0 where whole electrons are counted."""
+        return self.gain_e_per_dn**2 / 12 if self.noise == "full" or self.gain_e_per_dn != 1 else 0.0
 
 
 class Led(Row):
