@@ -31,7 +31,8 @@ def find_correspondences(
     decoded_px = np.array([(spot.u_px, spot.v_px) for spot in frame.spots]).reshape(-1, 2)
     any_square = any(frame.leds[spot.led].shape == "square" for spot in frame.spots)
     sensor_px = frame.camera.width_px * frame.camera.height_px
-    gate = gate_px(frame.camera.width_px)
+    # A denoiser may move light by its radius: Algorithm 1 as printed does by half of it.
+    gate = gate_px(frame.camera.width_px) + denoise_radius_px
     spots = detect(readouts, sensor_px, denoise_radius_px, decoded_px, any_square, gate, lens_blur(frame.camera))
     return list(identify(spots, frame.spots, frame.leds, gate))
 
