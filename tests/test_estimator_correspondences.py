@@ -11,6 +11,7 @@ from test_estimator_maximum_likelihood import frame_of
 from estimator.io.device import DecodedSpot, DeviceFrame, Led, Part, SquareLed
 from estimator.spots.correspondences import centroids_px, find_correspondences, led_positions_m
 from estimator.spots.detect import Readout, detect
+from estimator.spots.sampling import sampling_variance_px2
 
 TARGET = (3.5, 3.6, 3.5)
 LEDS = np.array(TARGET) + [[-0.04, 0.0, 0.0], [0.05, 0.02, 0.0]]
@@ -35,20 +36,20 @@ def full_noise(frame: DeviceFrame) -> DeviceFrame:
 
 
 @pytest.mark.parametrize(
-    ("changed", "floor_e2", "prnu", "any_square"),
+    ("changed", "noise", "any_square"),
     [
-        pytest.param(lambda frame: frame, 0.0, 0.0, False, id="shot noise"),
+        pytest.param(lambda frame: frame, (0.0, 0.0, 0.0), False, id="shot noise"),
         # 20^2 + 15^2 and rounding.
-        pytest.param(full_noise, 625.0 + 1 / 12, 0.02, False, id="full noise"),
-        pytest.param(squares, 0.0, 0.0, True, id="squares"),
+        pytest.param(full_noise, (625.0 + 1 / 12, 0.02, 1 / 12), False, id="full noise"),
+        pytest.param(squares, (0.0, 0.0, 0.0), True, id="squares"),
     ],
 )
 def test_detection_is_told_the_sensor_s_noise_and_the_leds_shape(
-    changed: Callable[[DeviceFrame], DeviceFrame], floor_e2: float, prnu: float, any_square: bool
+    changed: Callable[[DeviceFrame], DeviceFrame], noise: tuple[float, float, float], any_square: bool
 ) -> None:
     frame = changed(rendered())
     image = frame.parts[0].image_dn.astype(np.float32)
-    readout = Readout(0, 0, image, image, np.zeros(image.shape, bool), floor_e2=floor_e2, prnu=prnu)
+    readout = Readout(0, 0, image, image, np.zeros(image.shape, bool), *noise)
     expected = {round(spot.u_px): spot for spot in detect([readout], image.size, 0, any_square=any_square)}
     found = find_correspondences(frame)
     assert [one.led.id for one in found] == [10, 11]
@@ -60,12 +61,18 @@ def test_detection_is_told_the_sensor_s_noise_and_the_leds_shape(
 
 
 def test_a_denoised_image_is_measured_and_the_raw_one_weighs_it() -> None:
-    """Doubled light has the same centroid; its covariance is by the raw electrons, over four times the flux squared."""
+    """Doubled light has the same centroid; its covariance is by the raw electrons, over four times the flux squared.
+
+    The variance that the correction for sampling leaves is in both: it is less than without a correction, at a half
+    extent of 5 px.
+    """
+    rest_px2 = sampling_variance_px2(np.array([5.0]), square=False)[0]
     frame = rendered()
     plain, doubled = find_correspondences(frame), find_correspondences(frame, lambda image: 2 * image)
     np.testing.assert_allclose(centroids_px(doubled), centroids_px(plain), atol=1e-6)
     for one, other in zip(plain, doubled, strict=True):
-        np.testing.assert_allclose(4 * other.spot.covariance_px2, one.spot.covariance_px2, rtol=1e-6)
+        np.testing.assert_allclose(4 * other.spot.covariance_px2, one.spot.covariance_px2, rtol=1e-6, atol=4 * rest_px2)
+        assert 4 * rest_px2 < 0.5 * one.spot.covariance_px2[0, 0]
 
 
 def test_leds_are_found_beside_brighter_lights() -> None:

@@ -135,6 +135,10 @@ WRONG_VALUES: list[tuple[str, Callable[[dict[str, Any]], object]]] = [
         "cameras.main.distortion.p2",
         lambda c: c["cameras"]["main"].update(distortion={"k1": 0, "k2": 0, "k3": 0, "p1": 0}),
     ),
+    (
+        "cameras.main.distortion: Value error, unknown key 'k4'; allowed: k1, k2, k3, p1, p2",
+        lambda c: c["cameras"]["main"].update(distortion={**LENS, "k4": 0.1}),
+    ),
     ("distortion", lambda c: c["cameras"]["main"].update(projection="equidistant", distortion=LENS)),
     ("cameras.main.image_distance_mm", lambda c: c["cameras"]["main"].update(image_distance_mm=0)),
     ("sensor.noise", lambda c: c["sensor"].update(noise="loud")),

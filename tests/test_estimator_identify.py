@@ -6,7 +6,7 @@ import pytest
 from estimator.errors import EstimationFailure
 from estimator.io.device import DecodedSpot, DiscLed
 from estimator.spots.detect import Spot
-from estimator.spots.identify import GATE_PX, identify
+from estimator.spots.identify import gate_px, identify
 
 LEDS = {k: DiscLed(id=k, position_m=(0.1 * k, 0.0, 3.0), radius_m=0.01) for k in range(10)}
 
@@ -19,8 +19,12 @@ def claim(led: int, u_px: float, v_px: float) -> DecodedSpot:
     return DecodedSpot(led=led, u_px=u_px, v_px=v_px)
 
 
-def matches(spots: list[Spot], decoded: list[DecodedSpot]) -> dict[int, float]:
-    return {correspondence.led.id: correspondence.spot.u_px for correspondence in identify(spots, decoded, LEDS)}
+GATE_PX = gate_px(4000)
+
+
+def matches(spots: list[Spot], decoded: list[DecodedSpot], width_px: int = 4000) -> dict[int, float]:
+    found = identify(spots, decoded, LEDS, gate_px(width_px))
+    return {correspondence.led.id: correspondence.spot.u_px for correspondence in found}
 
 
 def test_each_identity_gets_the_spot_next_to_it() -> None:
@@ -56,17 +60,35 @@ def test_a_spot_at_the_border_keeps_its_identity_to_itself() -> None:
 
 
 def test_no_match_is_a_named_failure() -> None:
-    with pytest.raises(EstimationFailure, match="identify: no whole spot"):
+    with pytest.raises(EstimationFailure, match=r"no whole spot .*: 1 without a spot within 40 px$"):
         matches([spot(100, 50)], [claim(1, 200, 50)])
+    with pytest.raises(EstimationFailure, match=r"identity: 2 near two spots, or two identities near one spot$"):
+        matches([spot(100, 50)], [claim(1, 101, 50), claim(2, 102, 50)])
+    cut = [spot(100, 50), spot(300, 50, touches_border=True)]
+    with pytest.raises(EstimationFailure, match=r"1 without a spot within 40 px; 1 with a spot cut by the border of"):
+        matches(cut, [claim(1, 200, 50), claim(2, 300, 50)])
     with pytest.raises(EstimationFailure, match="identify: no identity was decoded"):
         matches([spot(100, 50)], [])
 
 
 @pytest.mark.parametrize(("distance_px", "is_matched"), [(39.9, True), (40.1, False)])
 def test_the_gate_is_four_standard_deviations_of_a_decoded_pixel(distance_px: float, is_matched: bool) -> None:
-    """10 px along each axis: the distance is beyond r with exp(-r^2 / 200), one identity of 3000 beyond 40 px."""
+    """10 px along each axis: the distance is beyond r with exp(-r^2 / 200), one identity of 3000 beyond 40 px. The
+    allowance for the centroid, 4 x 0.25 px in quadrature, adds 0.01 px."""
     found = matches([spot(100, 50), spot(300, 50)], [claim(1, 100, 50 + distance_px), claim(3, 300, 50)])
     assert (1 in found) == is_matched
+
+
+@pytest.mark.parametrize("width_px", [80, 400, 4000, 8000])
+def test_the_gate_scales_with_the_width(width_px: int) -> None:
+    """Decoded pixels of 10 px at a width of 4000 and in proportion: of a two-dimensional normal error a share of
+    exp(-8) is beyond four standard deviations, 1 of 3000. 10 000 draws leave 3.4 +- 1.8 of them outside, and the
+    allowance for the centroid fewer: more than 12 would be 5 sigma. A spot beyond the gate is another LED's.
+    """
+    errors_px = np.random.default_rng(width_px).normal(0, 10 * width_px / 4000, (10_000, 2))
+    assert (np.hypot(*errors_px.T) > gate_px(width_px)).sum() <= 12
+    far = claim(1, 50, 50 + 1.01 * gate_px(width_px))
+    assert matches([spot(50, 50), spot(500, 50)], [far, claim(2, 500, 50)], width_px) == {2: 500}
 
 
 @pytest.mark.parametrize(("second_px", "is_matched"), [(19.8, False), (20.2, True)])

@@ -62,10 +62,33 @@ def test_wide_pairs_count_by_the_square_of_their_separation() -> None:
     np.testing.assert_allclose((ranges[0] - 4) / error, -16 * 0.0625 / 1.0625, rtol=1e-4)
 
 
-def test_leds_at_unequal_heights_are_refused() -> None:
-    leds = np.array([[0.0, 0, 4], [3.0, 0, 4.002]])
-    with pytest.raises(EstimationFailure, match=r"ranging: .*common height"):
-        led_ranges(np.array([[0, 0], [75.0, 0]]), SQUARE_K, leds, law_of_sines)
+@pytest.mark.parametrize("spread_m", [0.001, 0.01, 0.3])
+def test_leds_at_unequal_heights_have_exact_ranges(spread_m: float) -> None:
+    """From exact pixels: 1e-16 of 1600 px over a separation of 20 px and more, twice, and some for the quadratic."""
+    leds = grid(4, 3, 0.15, (2, 3, 3.1)) + np.random.default_rng(3).uniform(0, 1, (12, 3)) * [0, 0, spread_m]
+    camera = np.array([1.8, 3.3, 0.4])
+    ranges = led_ranges(level_pixels(leds, camera, SQUARE_K), SQUARE_K, leds, law_of_sines)
+    np.testing.assert_allclose(ranges, np.linalg.norm(leds - camera, axis=1), rtol=1e-10)
+
+
+def test_a_triangle_of_unequal_heights_by_hand() -> None:
+    """A straight above at 4 m, B at 3 m to the side and 6 m high: ranges 4 and sqrt(45), whatever the yaw."""
+    leds = np.array([[0.0, 0, 4], [3.0, 0, 6]])
+    for pixels in ([[0, 0], [50.0, 0]], [[0, 0], [0, -50.0]]):
+        np.testing.assert_allclose(
+            led_ranges(np.array(pixels), SQUARE_K, leds, law_of_sines), [4, np.sqrt(45)], rtol=1e-12
+        )
+
+
+def test_a_pair_that_no_depth_fits_is_left_out() -> None:
+    """C is 1 m above B and seen 30 px beside it: 0.3 at unit depth. From 4 m below B the horizontal offset of an LED in
+    that direction is at least 1.2 m, and C's is 0.1 m. The other two pairs give the ranges of all three LEDs.
+    """
+    leds = np.array([[0.0, 0, 4], [3.0, 0, 4], [3.1, 0, 5]])
+    pixels = np.array([[0, 0], [75.0, 0], [105.0, 0]])
+    ranges = led_ranges(pixels, SQUARE_K, leds, law_of_sines)
+    assert np.isfinite(ranges).all()
+    np.testing.assert_allclose(ranges[1], 5.0, rtol=1e-12)
 
 
 def test_one_led_is_refused() -> None:

@@ -50,11 +50,38 @@ def test_ranges_too_short_are_refused() -> None:
         position_from_ranges(TRIANGLE, np.array([1.0, 1.0, 1.0]))
 
 
-def test_leds_at_different_heights_are_refused_where_z_comes_from_the_spheres() -> None:
-    leds = TABLE_1 + np.array([[0, 0, 0.0], [0, 0, 0.002], [0, 0, 0], [0, 0, 0]])
-    for method in (position_from_ranges, position_by_shifted_leds):
-        with pytest.raises(EstimationFailure, match="position: the LEDs are not at a common height"):
-            method(leds, ranges_from(leds, np.array([0.6, 1.4, 0.0])))
+@pytest.mark.parametrize("spread_m", [0.001, 0.01, 0.3])
+@pytest.mark.parametrize("position", [(2.6, 1.4, 0.0), (2.0, 3.0, 1.0), (4.1, 0.5, 1.5)])
+def test_leds_at_unequal_heights_give_the_exact_position(spread_m: float, position: tuple[float, float, float]) -> None:
+    """The turns end at a change of h below 1e-10 m; each halves the error at least, and x and y change by it or less
+    times the slope of the LEDs' plane, some 0.3 m over 0.5 m here.
+    """
+    leds = grid(5, 4, 0.14, (3, 2, 2.7)) + np.random.default_rng(5).uniform(0, 1, (20, 3)) * [0, 0, spread_m]
+    found = position_from_ranges(leds, ranges_from(leds, np.array(position)))
+    np.testing.assert_allclose(found, position, atol=1e-9)
+
+
+def test_a_sloped_ceiling_by_hand() -> None:
+    """LEDs 3, 3 and 4 m above the camera: 12, 13 and 0 m to the side."""
+    leds = np.array([[12.0, 0, 4], [-12.0, 0, 4], [0, 4.0, 4 + 1.0]])
+    ranges = np.sqrt([144.0 + 9, 144.0 + 9, 16.0 + 16])
+    np.testing.assert_allclose(position_from_ranges(leds, ranges), [0, 0, 1], atol=1e-9)
+
+
+def test_heights_that_do_not_converge_are_refused_by_name() -> None:
+    """A plane of LEDs steeper than 45 deg: each turn multiplies the error by more than one."""
+    leds = np.array([[0.0, 0, 3], [1.0, 0, 3], [0, 0.5, 6], [1.0, 0.5, 6]])
+    with pytest.raises(EstimationFailure, match=r"position: the (LEDs' heights differ too much|ranges are too short)"):
+        position_from_ranges(leds, ranges_from(leds, np.array([0.4, 0.1, 0.0])))
+
+
+def test_shifted_leds_take_unequal_heights() -> None:
+    """Heights spread over 0.5 m, far more than the shifts e_i of up to 0.01 m: these change d^2 by up to 2 h e_i, and
+    the position by 0.02 h / 0.5 m of the spread and some more for the pattern's noise: below 0.3 m at h = 2.3 m.
+    """
+    leds = grid(5, 4, 0.5, (3, 2, 2.7)) + np.random.default_rng(5).uniform(0, 0.5, (20, 3)) * [0, 0, 1]
+    found = position_by_shifted_leds(leds, ranges_from(leds, np.array([2.6, 1.4, 0.4])))
+    assert np.linalg.norm(found - [2.6, 1.4, 0.4]) < 0.3
 
 
 @pytest.mark.parametrize("leds", [TABLE_1, TRIANGLE, grid(5, 4, 0.14, (3, 2, 2.7))], ids=["table 1", "three", "grid"])

@@ -34,18 +34,26 @@ def test_pixel_positions_scale_with_the_pixels() -> None:
 
 
 def test_keys_in_pixels_are_scaled_and_the_light_follows_the_mode() -> None:
-    regions = ('regions={ kind = "leds", margin_px = 30 }', "poses.border_px=20")
+    regions = ('regions={ kind = "leds", margin_px = 80 }', "poses.border_px=20")
     full = recipe(*regions)
     binned, same = (recipe(*regions, scale=10, mode=mode) for mode in ("binned", "same-photons"))
     for small in (binned, same):
         assert small.regions is not None
-        assert small.regions.margin_px == 3.0
+        assert small.regions.margin_px == 8.0
         assert small.poses.border_px == 2.0  # type: ignore[union-attr]
         assert small.camera.pixel_pitch_um == 60.0
         assert small.camera.f_number == full.camera.f_number
     assert (binned.exposure_s, binned.sensor.full_well_e, binned.sensor.gain_e_per_dn) == (full.exposure_s, 600000, 100)
     assert same.exposure_s == pytest.approx(full.exposure_s / 100)
     assert same.sensor == full.sensor
+
+
+@pytest.mark.parametrize(("margin_px", "expected_px"), [(80.0, 8.0), (60.0, 6.0), (20.0, 6.0), (6.0, 6.0), (3.0, 3.0)])
+def test_a_scaled_region_keeps_a_margin_for_the_background(margin_px: float, expected_px: float) -> None:
+    """A tenth of the margin, but at least 6 px, or the recipe's own where that is smaller."""
+    small = recipe(f'regions={{ kind = "leds", margin_px = {margin_px} }}', scale=10)
+    assert small.regions is not None
+    assert small.regions.margin_px == expected_px
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ConfigDict, Field, Strict, ValidationError, field_validator, model_validator
+from pydantic import Field, Strict, ValidationError, field_validator, model_validator
 
 from estimator.errors import InputError
 from estimator.io.records import NotNegative, NotNegativeTriple, Number, Positive, Row, Triple, first_problem
@@ -39,16 +39,21 @@ def to_pixels(image: Floats, K: Floats) -> Floats:
 class Distortion(Row):
     """Brown-Conrady coefficients in OpenCV's convention, for normalized image coordinates.
 
-    Other keys are refused: a coefficient that this model lacks must not be dropped silently.
+    Other keys are refused: without a coefficient of the calibration, undistorted pixels would be wrong.
     """
-
-    model_config = ConfigDict(extra="forbid")
 
     k1: Number
     k2: Number
     k3: Number
     p1: Number
     p2: Number
+
+    @model_validator(mode="before")
+    @classmethod
+    def _no_other_coefficients(cls, entry: Any) -> Any:
+        if isinstance(entry, Mapping) and (unknown := [key for key in entry if key not in cls.model_fields]):
+            raise ValueError(f"unknown key {unknown[0]!r}; allowed: {', '.join(cls.model_fields)}")
+        return entry
 
 
 IntrinsicName = Literal["focal", "aspect", "cx_px", "cy_px", "k1", "p1", "p2"]
@@ -198,8 +203,12 @@ class Sensor(Row):
 
         Offsets of whole rows and columns are left out: subtracting a spot's local background removes most of them.
         """
-        rounding = self.gain_e_per_dn**2 / 12 if self.noise == "full" or self.gain_e_per_dn != 1 else 0.0
-        return self.dsnu_e**2 + self.read_noise_e**2 + (self.adc_noise_dn * self.gain_e_per_dn) ** 2 + rounding
+        adc_noise_e = self.adc_noise_dn * self.gain_e_per_dn
+        return self.dsnu_e**2 + self.read_noise_e**2 + adc_noise_e**2 + self.rounding_e2()
+
+    def rounding_e2(self) -> float:
+        """Variance of the ADC's rounding, electrons squared; 0 where whole electrons are counted."""
+        return self.gain_e_per_dn**2 / 12 if self.noise == "full" or self.gain_e_per_dn != 1 else 0.0
 
 
 class Luminaire(Row):

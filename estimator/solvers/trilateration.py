@@ -5,7 +5,6 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from estimator.errors import EstimationFailure
-from estimator.solvers.ranging import COMMON_HEIGHT_M
 
 Floats = NDArray[np.float64]
 
@@ -14,44 +13,57 @@ MIN_PATTERN_WIDTH = 0.01
 # Shift of LEDs along z, Rahman's "small value", whose size is not published. Well above the rounding of a range.
 SHIFT_M = 0.01
 MIN_FOR_ORIENTATION = 4
+# Each round multiplies the error by the square of the slope of the LEDs' plane, or less.
+MAX_ROUNDS = 100
+# Well above the rounding of squared ranges over the height, and far below any centroid's error.
+CONVERGED_M = 1e-10
 
 
 def position_from_ranges(leds_m: Floats, ranges_m: Floats) -> Floats:
-    """Position of the camera, (3,) world metres, from LEDs (n, 3) at one height above it and distances (n,) to them.
+    """Position of the camera below LEDs (n, 3), (3,) world metres, from distances (n,) to them.
 
-    Huynh & Yoo 2016, Eq. 4: differences of the spheres are linear in x and y and do not contain z. x and y follow by
-    least squares, z from the spheres: `z = z_L - sqrt(mean(d^2 - rho^2))`.
-    Raises EstimationFailure for fewer than three LEDs, LEDs on one line or at different heights, and a negative mean.
+    Huynh & Yoo 2016, Eq. 4: differences of the spheres are linear in x and y and do not contain z if the LEDs are at
+    one height. x and y follow by least squares, z from the spheres: `z = z_L - sqrt(mean(d^2 - rho^2))`. At unequal
+    heights, with LEDs at z_L + e, a sphere is that of an LED at z_L with the squared range d^2 - 2 h e - e^2, where
+    h = z_L - z: x, y and h are then computed in turns.
+    Raises EstimationFailure for fewer than three LEDs, LEDs on one line in x and y, a negative mean, and LEDs whose
+    heights differ so much that the turns do not converge.
     """
-    _check_ceiling(leds_m, needed=3)
-    planar = leds_m[:, :2]
-    centre = planar.mean(axis=0)
-    offsets = planar - centre
-    # With a and p measured from the LEDs' centre, |a|^2 - d^2 = 2 a . p - (|p|^2 + h^2). The last term is the same for
-    # all LEDs and so orthogonal to the offsets a, which sum to zero: it does not change the least-squares solution.
-    right = (offsets**2).sum(axis=1) - ranges_m**2
-    solution, *_ = np.linalg.lstsq(2 * offsets, right, rcond=None)
-    height_m2 = float((ranges_m**2 - ((offsets - solution) ** 2).sum(axis=1)).mean())
-    if height_m2 < 0:
-        raise EstimationFailure("position", "the ranges are too short to reach the LEDs from below")
-    return np.array([*(centre + solution), leds_m[:, 2].mean() - np.sqrt(height_m2)])
+    check_pattern(leds_m, needed=3, flat=True)
+    planar, heights_m = leds_m[:, :2], leds_m[:, 2]
+    centre, ceiling_m = planar.mean(axis=0), heights_m.mean()
+    offsets, above_m = planar - centre, heights_m - ceiling_m
+    height_m = 0.0
+    for _ in range(MAX_ROUNDS):
+        ranges2 = ranges_m**2 - above_m * (2 * height_m + above_m)
+        # With a and p measured from the LEDs' centre, |a|^2 - d^2 = 2 a . p - (|p|^2 + h^2). The last term is the same
+        # for all LEDs and so orthogonal to the offsets a, which sum to zero: it does not change the solution.
+        solution, *_ = np.linalg.lstsq(2 * offsets, (offsets**2).sum(axis=1) - ranges2, rcond=None)
+        height_m2 = float((ranges2 - ((offsets - solution) ** 2).sum(axis=1)).mean())
+        if height_m2 < 0:
+            raise EstimationFailure("position", "the ranges are too short to reach the LEDs from below")
+        before_m, height_m = height_m, float(np.sqrt(height_m2))
+        if not above_m.any() or abs(height_m - before_m) < CONVERGED_M:
+            return np.array([*(centre + solution), ceiling_m - height_m])
+    raise EstimationFailure("position", "the LEDs' heights differ too much for Eq. 4")
 
 
 def position_by_shifted_leds(leds_m: Floats, ranges_m: Floats) -> Floats:
     """Position by Eq. 4 with LEDs shifted slightly along z so that the system has a z column, (3,) world metres.
 
     The method of Rahman, Haque & Kim 2011, which Huynh & Yoo 2016 adopt (section 2.1). It does not determine the
-    height. The ranges are those to the true LEDs, at height h, while the spheres are centred on LEDs at h + e_i. The
-    differences of the spheres are then solved by `(x, y, h)` for any camera height, up to terms of the size of the e_i:
-    z comes out at the ceiling. Noise in d^2 enters z divided by 2 e_i, and from there x and y.
+    height of a camera below LEDs at one height h. The ranges are those to the true LEDs, while the spheres are centred
+    on LEDs at h + e_i. The differences of the spheres are then solved by `(x, y, h)` for any camera height, up to terms
+    of the size of the e_i: z comes out at the ceiling. Noise in d^2 enters z divided by 2 e_i, and from there x and y.
+    LEDs at unequal heights have a z column without the shifts, which are added all the same.
 
     Not published, chosen here: the shifts, `SHIFT_M (k / (n - 1))^2` for the k-th of n LEDs. They must not be linear in
     x and y, or the columns would stay linearly dependent; alternating signs are, on a square of four. The differences
     are those from the mean of the spheres, solved by least squares. The "vector estimation" that follows is not
     described.
-    Raises EstimationFailure for fewer than four LEDs, LEDs on one line, and LEDs of different heights.
+    Raises EstimationFailure for fewer than four LEDs, and LEDs on one line.
     """
-    _check_ceiling(leds_m, needed=4)
+    check_pattern(leds_m, needed=4, flat=True)
     shifted = leds_m.copy()
     shifted[:, 2] += SHIFT_M * (np.arange(len(leds_m)) / (len(leds_m) - 1)) ** 2
     centre = shifted.mean(axis=0)
@@ -89,13 +101,6 @@ def check_pattern(leds_m: Floats, needed: int, flat: bool) -> None:
         raise EstimationFailure("position", f"LEDs identified: {len(leds_m)}, needed: {needed}")
     if on_one_line(leds_m[:, :2] if flat else leds_m):
         raise EstimationFailure("position", "the LEDs are on one line")
-
-
-def _check_ceiling(leds_m: Floats, needed: int) -> None:
-    """Raise EstimationFailure for LEDs that Eq. 4 cannot use; without its z column it needs a common height."""
-    check_pattern(leds_m, needed, flat=True)
-    if np.ptp(leds_m[:, 2]) > COMMON_HEIGHT_M:
-        raise EstimationFailure("position", "the LEDs are not at a common height")
 
 
 def on_one_line(points_m: Floats) -> bool:

@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from estimator.io.device import DeviceFrame
 from estimator.spots.detect import Readout, detect
-from estimator.spots.identify import Correspondence, identify
+from estimator.spots.identify import Correspondence, gate_px, identify
+from estimator.spots.sampling import lens_blur
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -21,17 +22,19 @@ def find_correspondences(
     `denoise` maps an image of electrons to a denoised one; each of its pixels depends on a square of
     2 `denoise_radius_px` + 1. Raises EstimationFailure if no LED is detected or identified.
     """
-    readouts = []
+    readouts, sensor = [], frame.sensor
     for part in frame.parts:
         raw = frame.electrons(part)
         image = raw if denoise is None else denoise(raw)
-        noise = {"floor_e2": frame.sensor.floor_e2(), "prnu": frame.sensor.prnu}
-        readouts.append(Readout(part.row, part.column, image, raw, frame.clipped(part), **noise))
+        noise = sensor.floor_e2(), sensor.prnu, sensor.rounding_e2()
+        readouts.append(Readout(part.row, part.column, image, raw, frame.clipped(part), *noise))
     decoded_px = np.array([(spot.u_px, spot.v_px) for spot in frame.spots]).reshape(-1, 2)
     any_square = any(frame.leds[spot.led].shape == "square" for spot in frame.spots)
     sensor_px = frame.camera.width_px * frame.camera.height_px
-    spots = detect(readouts, sensor_px, denoise_radius_px, decoded_px, any_square)
-    return list(identify(spots, frame.spots, frame.leds))
+    # A denoiser may move light by its radius: Algorithm 1 as printed does by half of it.
+    gate = gate_px(frame.camera.width_px) + denoise_radius_px
+    spots = detect(readouts, sensor_px, denoise_radius_px, decoded_px, any_square, gate, lens_blur(frame.camera))
+    return list(identify(spots, frame.spots, frame.leds, gate))
 
 
 def led_positions_m(correspondences: Sequence[Correspondence]) -> Floats:

@@ -1,11 +1,13 @@
 """Detection: LED images with centroids to a hundredth of a pixel, and the centroids' covariances.
 
 Blobs are found in a lightly smoothed copy with one low threshold. The part of a blob above half of its own level gives
-an ellipse. The centroid is computed over that ellipse padded by a margin, so that it contains all light of the LED
-image, blurred or not, and the background around it cancels.
+an ellipse. The ellipse of a small LED image, which the smoothing widens, is replaced by that of its light's second
+moments. The centroid is computed over the ellipse padded by a margin, so that it contains all light of the LED image,
+blurred or not, and the background around it cancels. What the sampling by pixels adds is subtracted
+(`estimator.spots.sampling`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -13,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.errors import EstimationFailure
+from estimator.spots.sampling import PIXEL_VARIANCE, SHARP, LensBlur, sampling_error, sampling_variance_px2
 
 Pixels = NDArray[np.float64]
 
@@ -21,8 +24,6 @@ SMOOTHING_PX = 5
 # Share of the brightest level: above ceiling and walls at 1/100 of an LED, below an LED at a quarter of it.
 THRESHOLD_OF_BRIGHTEST = 0.05
 THRESHOLD_SIGMA = 6.0
-# Distance of an LED image from its decoded pixel, whose standard deviation is about 10 px.
-NEAR_PX = 40.0
 # One bright pixel covers 25 when smoothed; smaller blobs are noise near the threshold.
 MIN_BLOB_PX = 16
 # More than any scene has LEDs: further blobs are noise in an image without an LED.
@@ -38,6 +39,18 @@ FRINGE_EXTENSION = 1.25
 MARGIN_PX = 2.0
 RING_PX = 3.0
 MIN_SIGNAL_TO_NOISE = 5.0
+# The 5 x 5 mean widens the part above half level of LED images with a smaller semi-axis than about its own width.
+SMALL_PX = 6.0
+# Second moments replace the ellipse where noise changes them by a few percent at most.
+MIN_SIGNAL_FOR_MOMENTS = 50.0
+# Pixels of the ring this many standard deviations from its median are no background of the LED.
+BACKGROUND_SIGMA = 3.0
+# Of fewer pixels the variance is not measured.
+MIN_RING_PIXELS = 20
+# A ring whose variance exceeds the noise's by this many standard deviations has a structure.
+STRUCTURE_SIGMA = 4.0
+# A sampling error with a smaller share of the noise's variance is left alone.
+MIN_SAMPLING_SHARE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,8 +79,8 @@ class Readout:
     """A region of interest in electrons, `image_e` (rows, columns); its first pixel is (row, column) of the sensor.
 
     `raw_e` is the image before denoising; `clipped` marks saturated pixels. Beside shot noise a pixel's variance has a
-    signal-independent part, `floor_e2`, and one proportional to its signal squared, by the photo response
-    nonuniformity `prnu`.
+    signal-independent part, `floor_e2`, of which `rounding_e2` is by the ADC's steps, and one proportional to its
+    signal squared, by the photo response nonuniformity `prnu`.
     """
 
     row: int
@@ -77,6 +90,7 @@ class Readout:
     clipped: NDArray[np.bool_]
     floor_e2: float = 0.0
     prnu: float = 0.0
+    rounding_e2: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,8 +98,8 @@ class _Ellipse:
     """Part of a blob above half level: its centroid (u, v) and the ellipse of the same second moments.
 
     `axes` (2, 2) are its unit axes as columns, `semi_axes_px` (2,) their lengths. `low_px` and `high_px` (2,) are
-    opposite vertices of the upright box around the part itself. `fringe_px` is the width of the light found around the
-    ellipse beyond that of a sharp LED image.
+    opposite vertices of the upright box around the part itself. `stretch` is the factor that makes the ellipse enclose
+    a square. `fringe_px` is the width of the light found around the ellipse beyond that of a sharp LED image.
     """
 
     centre_px: NDArray[np.float64]
@@ -94,7 +108,8 @@ class _Ellipse:
     low_px: NDArray[np.float64]
     high_px: NDArray[np.float64]
     area_px: int
-    fringe_px: float
+    stretch: float
+    fringe_px: float = 0.0
 
     def distance2(self, u_px: NDArray[np.float64], v_px: NDArray[np.float64], padding_px: float) -> NDArray[np.float64]:
         """Squared distance from the centre in units of the padded ellipse, at most 1 inside.
@@ -116,55 +131,69 @@ def detect(
     denoise_radius_px: int,
     decoded_px: Pixels | None = None,
     any_square: bool = False,
+    near_px: float = 40.0,
+    lens: LensBlur = SHARP,
 ) -> tuple[Spot, ...]:
     """Detect LED images in the regions read out of a sensor of `sensor_px` pixels: one full frame, or several.
 
-    The brightness scale is measured near `decoded_px` (n, 2), the rough pixels of decoded LEDs, so that a brighter
-    light elsewhere does not hide them; without them, or if nothing was read out there, it is the image's maximum.
-    `any_square` says that LEDs may be square: the ellipse for the centroid then encloses the square.
-    `denoise_radius_px` is the radius of the box that the denoiser averaged over, 0 for raw images. An LED image that
+    The brightness scale is measured within `near_px` of `decoded_px` (n, 2), the rough pixels of decoded LEDs, so that
+    a brighter light elsewhere does not hide them; without them, or if nothing was read out there, it is the image's
+    maximum. `any_square` says that LEDs may be square: the ellipse for the centroid then encloses the square.
+    `lens` says how sharp LED images are. `denoise_radius_px` is the radius of the box that the denoiser averaged over,
+    0 for raw images, whose centroids alone are corrected for sampling. An LED image that
     may be cut by the border of its region is reported and flagged. Raises EstimationFailure if there is none at all.
     """
     size = (SMOOTHING_PX, SMOOTHING_PX)
     smooth = [cv2.blur(readout.image_e, size, borderType=cv2.BORDER_REPLICATE) for readout in readouts]
     whole = sum(image.size for image in smooth) == sensor_px and len(smooth) == 1
-    background_e, threshold_e = _levels(smooth, whole, _brightest(readouts, smooth, decoded_px))
+    background_e, threshold_e = _levels(smooth, whole, _brightest(readouts, smooth, decoded_px, near_px))
     spots: list[Spot] = []
     for readout, image in zip(readouts, smooth, strict=True):
         stretch = SQUARE_STRETCH if any_square else 1.0
         ellipses = _ellipses(image, background_e, threshold_e, MAX_BLOB_OF_FRAME * sensor_px, stretch)
-        spots += _spots(readout, ellipses, denoise_radius_px)
+        spots += _spots(readout, ellipses, denoise_radius_px, any_square, lens)
     if not spots:
         raise EstimationFailure("detect", "no spot found")
     return tuple(spots)
 
 
-def _spots(readout: Readout, ellipses: Sequence[_Ellipse], denoise_radius_px: int) -> list[Spot]:
+def _spots(
+    readout: Readout, ellipses: Sequence[_Ellipse], denoise_radius_px: int, any_square: bool, lens: LensBlur
+) -> list[Spot]:
     """Measure each ellipse of a region, given those near it."""
+    if denoise_radius_px == 0:
+        narrowed = [_narrowed(readout, e, others) for e, others in _with_neighbours(ellipses, denoise_radius_px)]
+        ellipses = narrowed
+    measured = [
+        _measure(readout, ellipse, others, denoise_radius_px, any_square, lens)
+        for ellipse, others in _with_neighbours(ellipses, denoise_radius_px)
+    ]
+    return [spot for spot in measured if spot is not None]
+
+
+def _with_neighbours(ellipses: Sequence[_Ellipse], denoise_radius_px: int) -> Iterator[tuple[_Ellipse, list[_Ellipse]]]:
+    """Each ellipse with the others whose surroundings overlap its own."""
     fringe_px = max((ellipse.fringe_px for ellipse in ellipses), default=0.0)
     margin_px = MARGIN_PX + max(denoise_radius_px, fringe_px)
     centres = np.array([ellipse.centre_px for ellipse in ellipses]).reshape(-1, 2)
     extents = np.array([ellipse.half_extent(margin_px + RING_PX) for ellipse in ellipses]).reshape(-1, 2)
-    spots = []
     for index, ellipse in enumerate(ellipses):
         overlaps = (np.abs(centres - centres[index]) < extents + extents[index]).all(axis=1)
         overlaps[index] = False
-        others = [ellipses[other] for other in np.flatnonzero(overlaps).tolist()]
-        spot = _measure(readout, ellipse, others, denoise_radius_px)
-        if spot is not None:
-            spots.append(spot)
-    return spots
+        yield ellipse, [ellipses[other] for other in np.flatnonzero(overlaps).tolist()]
 
 
-def _brightest(readouts: Sequence[Readout], smooth: Sequence[NDArray[np.float32]], decoded_px: Pixels | None) -> float:
+def _brightest(
+    readouts: Sequence[Readout], smooth: Sequence[NDArray[np.float32]], decoded_px: Pixels | None, near_px: float
+) -> float:
     """Brightness of the LEDs, electrons: median of the maxima near the decoded pixels, or the image's maximum."""
     peaks = []
     if decoded_px is not None:
         first = np.array([(readout.column, readout.row) for readout in readouts])
         size = np.array([image.shape[::-1] for image in smooth])
         for centre_px in decoded_px:
-            low = np.clip(centre_px - NEAR_PX - first, 0, size).astype(int)
-            high = np.clip(centre_px + NEAR_PX - first, 0, size).astype(int)
+            low = np.clip(centre_px - near_px - first, 0, size).astype(int)
+            high = np.clip(centre_px + near_px - first, 0, size).astype(int)
             for part in np.flatnonzero((low < high).all(axis=1)).tolist():
                 (left, top), (right, bottom) = low[part], high[part]
                 peaks.append(float(smooth[part][top:bottom, left:right].max()))
@@ -242,7 +271,7 @@ def _ellipse(core: NDArray[np.bool_], left: int, top: int, stretch: float) -> _E
     columns, rows = np.flatnonzero(of_columns), np.flatnonzero(of_rows)
     low_px = np.array([columns[0] + left, rows[0] + top], dtype=np.float64)
     high_px = np.array([columns[-1] + left + 1, rows[-1] + top + 1], dtype=np.float64)
-    return _Ellipse(centre, axes, semi_axes_px, low_px, high_px, int(count), fringe_px=0.0)
+    return _Ellipse(centre, axes, semi_axes_px, low_px, high_px, int(count), stretch)
 
 
 def _fringe_px(ellipse: _Ellipse, low_px: NDArray[np.int64], high_px: NDArray[np.int64]) -> float:
@@ -254,8 +283,53 @@ def _fringe_px(ellipse: _Ellipse, low_px: NDArray[np.int64], high_px: NDArray[np
     return FRINGE_EXTENSION * float(fringe_px) if 0 < fringe_px < ellipse.semi_axes_px.max() else 0.0
 
 
-def _measure(readout: Readout, ellipse: _Ellipse, others: list[_Ellipse], denoise_radius_px: int) -> Spot | None:
-    """Centroid and covariance of one spot; None if its signal-to-noise ratio is too small."""
+@dataclass(frozen=True, eq=False)
+class _Light:
+    """Light of an LED image: pixels of a rectangle `roi` at u (1, columns) and v (rows, 1), of its region's own.
+
+    `signal_e` (rows, columns) are electrons above the background, 0 outside the support; `variance_e2` is the variance
+    of every pixel.
+    """
+
+    roi: tuple[slice, slice]
+    u_px: NDArray[np.float64]
+    v_px: NDArray[np.float64]
+    electrons: NDArray[np.float64]
+    support: NDArray[np.bool_]
+    signal_e: NDArray[np.float64]
+    variance_e2: NDArray[np.float64]
+
+    @property
+    def flux_e(self) -> float:
+        """Sum of the signal, electrons."""
+        return float(self.signal_e.sum())
+
+    @property
+    def signal_to_noise(self) -> float:
+        """Flux over its standard deviation."""
+        return self.flux_e / max(float(np.sqrt(self.variance_e2[self.support].sum())), 1e-300)
+
+    def centroid_px(self) -> NDArray[np.float64]:
+        """Centroid (u, v), (2,)."""
+        by_column, by_row = self.signal_e.sum(axis=0), self.signal_e.sum(axis=1)
+        return np.array([by_column @ self.u_px[0], by_row @ self.v_px[:, 0]]) / self.flux_e
+
+    def moments_px2(self, centroid_px: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Second moments about the centroid, (2, 2)."""
+        du, dv = self.u_px - centroid_px[0], self.v_px - centroid_px[1]
+        mixed = float((du * dv * self.signal_e).sum())
+        uu, vv = float((du**2 * self.signal_e).sum()), float((dv**2 * self.signal_e).sum())
+        return np.array([[uu, mixed], [mixed, vv]]) / self.flux_e
+
+    def moment_sigmas_px2(self, centroid_px: NDArray[np.float64], moments: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Standard deviations (2,) of the second moments along u and v by the pixels' noise."""
+        along = (self.u_px - centroid_px[0]) ** 2 - moments[0, 0], (self.v_px - centroid_px[1]) ** 2 - moments[1, 1]
+        noise = [float((np.where(self.support, one, 0.0) ** 2 * self.variance_e2).sum()) for one in along]
+        return np.sqrt(noise) / self.flux_e
+
+
+def _light(readout: Readout, ellipse: _Ellipse, others: list[_Ellipse], denoise_radius_px: int) -> _Light:
+    """Light in the ellipse and a margin; the background is that of a ring around them."""
     margin_px = MARGIN_PX + max(denoise_radius_px, ellipse.fringe_px)
     height_px, width_px = readout.image_e.shape
     half_extent = ellipse.half_extent(margin_px + RING_PX)
@@ -264,7 +338,6 @@ def _measure(readout: Readout, ellipse: _Ellipse, others: list[_Ellipse], denois
     roi = np.s_[top:bottom, left:right]
     u_px, v_px = np.arange(left, right)[None, :] + 0.5, np.arange(top, bottom)[:, None] + 0.5
     electrons = readout.image_e[roi].astype(np.float64)
-
     distance2 = ellipse.distance2(u_px, v_px, margin_px)
     support = distance2 <= 1
     ring = ~support & (ellipse.distance2(u_px, v_px, margin_px + RING_PX) <= 1)
@@ -273,33 +346,114 @@ def _measure(readout: Readout, ellipse: _Ellipse, others: list[_Ellipse], denois
         other_distance2 = other.distance2(u_px, v_px, MARGIN_PX + max(denoise_radius_px, other.fringe_px))
         support &= distance2 <= other_distance2
         ring &= other_distance2 > 1
-    background_e = electrons[ring].mean() if ring.any() else 0.0
-
-    signal = np.where(support, electrons - background_e, 0.0)
     # Shot noise: a raw pixel's variance is its electrons.
     raw_e = np.maximum(readout.raw_e[roi].astype(np.float64), 0.0)
-    variance = raw_e + readout.floor_e2 + (readout.prnu * raw_e) ** 2
-    flux = signal.sum()
-    if flux <= MIN_SIGNAL_TO_NOISE * np.sqrt(variance[support].sum()):
+    variance_e2 = raw_e + readout.floor_e2 + (readout.prnu * raw_e) ** 2
+    background_e = 0.0
+    if ring.any():
+        # One electron more: the noise of a pixel with fewer is not normal.
+        gate_e = BACKGROUND_SIGMA * float(np.sqrt(np.median(variance_e2[ring]) + 1.0))
+        # The ring without pixels of another surface or light.
+        ring &= np.abs(electrons - np.median(electrons[ring])) <= gate_e
+        background_e = float(electrons[ring].mean())
+        if np.count_nonzero(ring) >= MIN_RING_PIXELS:
+            unlit = support & (electrons - background_e <= gate_e)
+            variance_e2[unlit] += _excess_variance(readout, readout.raw_e[roi][ring], float(variance_e2[ring].mean()))
+    signal_e = np.where(support, electrons - background_e, 0.0)
+    return _Light(roi, u_px, v_px, electrons, support, signal_e, variance_e2)
+
+
+def _excess_variance(readout: Readout, ring_e: NDArray[np.float32], model_e2: float) -> float:
+    """Variance of a pixel without light of an LED, by the ring's pixels, less that by the model, electrons squared.
+
+    It is negative where the ADC's steps exceed the noise: neighbouring pixels are then rounded alike, while the model's
+    rounding errors are independent. It is positive where the background has a structure.
+    """
+    # The variance of n normal numbers has a relative standard deviation of sqrt(2 / n).
+    noise_e2 = STRUCTURE_SIGMA * np.sqrt(2 / ring_e.size) * model_e2
+    excess_e2 = float(ring_e.var(ddof=1, dtype=np.float64)) - model_e2
+    return excess_e2 if excess_e2 > noise_e2 else max(min(excess_e2, 0.0), -readout.rounding_e2)
+
+
+def _narrowed(readout: Readout, ellipse: _Ellipse, others: list[_Ellipse]) -> _Ellipse:
+    """The ellipse, or that of the light's second moments if the smoothing has widened it."""
+    if ellipse.semi_axes_px.max() > SMALL_PX:
+        return ellipse
+    for _ in range(2):
+        light = _light(readout, ellipse, others, 0)
+        if light.signal_to_noise < MIN_SIGNAL_FOR_MOMENTS:
+            return ellipse
+        centroid = light.centroid_px()
+        variances, axes = np.linalg.eigh(light.moments_px2(centroid))
+        semi_axes_px = 2 * ellipse.stretch * np.sqrt(np.maximum(variances, 0)) + 0.5
+        if (semi_axes_px >= ellipse.semi_axes_px).any():
+            return ellipse
+        ellipse = replace(ellipse, centre_px=centroid, axes=axes, semi_axes_px=semi_axes_px)
+        half_extent = ellipse.half_extent(0.0)
+        ellipse = replace(ellipse, low_px=centroid - half_extent, high_px=centroid + half_extent)
+    return ellipse
+
+
+def _corrected_for_sampling(
+    light: _Light,
+    centroid: NDArray[np.float64],
+    covariance_px2: NDArray[np.float64],
+    any_square: bool,
+    lens: LensBlur,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Centroid without its sampling error as far as it is known, and its covariance with the rest of that error.
+
+    The image of a square depends on its orientation, that of a lens with blur on the blur: there the error is variance
+    alone, as over all positions.
+    """
+    moments = light.moments_px2(centroid)
+    own_px2 = np.maximum(np.diag(moments) - PIXEL_VARIANCE, 0.0)
+    # A semi-ellipse of half extent a has the second moment a^2 / 4, a line a^2 / 3.
+    half_px = np.sqrt((3 if any_square else 4) * own_px2)
+    variance_px2 = lens.transfer**2 * sampling_variance_px2(half_px, any_square)
+    if (variance_px2 < MIN_SAMPLING_SHARE * np.diag(covariance_px2)).all():
+        return centroid, covariance_px2
+    if any_square or not lens.sharp:
+        return centroid, covariance_px2 + np.diag(variance_px2)
+    found = sampling_error(centroid, np.diag(moments), light.moment_sigmas_px2(centroid, moments))
+    corrected = covariance_px2 / np.outer(found.slope, found.slope) + np.diag(found.variance_px2)
+    return centroid - found.error_px, corrected
+
+
+def _measure(
+    readout: Readout,
+    ellipse: _Ellipse,
+    others: list[_Ellipse],
+    denoise_radius_px: int,
+    any_square: bool,
+    lens: LensBlur,
+) -> Spot | None:
+    """Centroid and covariance of one spot; None if its signal-to-noise ratio is too small."""
+    height_px, width_px = readout.image_e.shape
+    light = _light(readout, ellipse, others, denoise_radius_px)
+    if light.signal_to_noise <= MIN_SIGNAL_TO_NOISE:
         return None
-    u, v = float(signal.sum(axis=0) @ u_px[0] / flux), float(signal.sum(axis=1) @ v_px[:, 0] / flux)
+    centroid, u_px, v_px = light.centroid_px(), light.u_px, light.v_px
     # A centroid of box means is a sum over the raw pixels, weighted by the box means of the centroid's weights.
     box = (2 * denoise_radius_px + 1, 2 * denoise_radius_px + 1)
-    levers = np.stack([support * ((u_px - u) / flux), support * ((v_px - v) / flux)])
+    levers = np.stack([light.support * (u_px - centroid[0]), light.support * (v_px - centroid[1])]) / light.flux_e
     weights = np.stack([cv2.blur(lever, box, borderType=cv2.BORDER_CONSTANT).ravel() for lever in levers])
-    covariance = (weights * variance.ravel()) @ weights.T
+    covariance = (weights * light.variance_e2.ravel()) @ weights.T
+    if denoise_radius_px == 0:
+        centroid, covariance = _corrected_for_sampling(light, centroid, covariance, any_square, lens)
 
     inside = ellipse.distance2(u_px, v_px, 0.0) <= 1
-    brightest = np.unravel_index(np.argmax(np.where(inside, electrons, -np.inf)), inside.shape)
+    brightest = np.unravel_index(np.argmax(np.where(inside, light.electrons, -np.inf)), inside.shape)
+    margin_px = MARGIN_PX + max(denoise_radius_px, ellipse.fringe_px)
     low, high = ellipse.low_px - margin_px, ellipse.high_px + margin_px
     return Spot(
-        u_px=u + readout.column,
-        v_px=v + readout.row,
+        u_px=float(centroid[0]) + readout.column,
+        v_px=float(centroid[1]) + readout.row,
         covariance_px2=covariance,
         brightest_u_px=float(u_px[0, brightest[1]]) + readout.column,
         brightest_v_px=float(v_px[brightest[0], 0]) + readout.row,
         area_px=ellipse.area_px,
-        peak_e=float(electrons[brightest]),
+        peak_e=float(light.electrons[brightest]),
         touches_border=bool((low < 0).any() or high[0] > width_px or high[1] > height_px),
-        saturated=bool(readout.clipped[roi][inside].any()),
+        saturated=bool(readout.clipped[light.roi][inside].any()),
     )

@@ -9,8 +9,11 @@ from estimator.errors import EstimationFailure
 from estimator.io.device import DecodedSpot, Led
 from estimator.spots.detect import Spot
 
-# Four standard deviations of a decoded pixel, about 10 px each.
-GATE_PX = 40.0
+# Standard deviation of a decoded pixel as a share of the sensor's width: 10 px of 4000 (datasets/FORMAT.md).
+ROUGH_SHARE = 10 / 4000
+# Error of a centroid that the decoded pixel's does not include, on a sensor of any width.
+CENTROID_PX = 0.25
+GATE_SIGMA = 4.0
 # The second nearest spot has to be this many times further from a decoded pixel, or the identity is ambiguous.
 CLEARANCE = 2.0
 
@@ -23,15 +26,21 @@ class Correspondence:
     spot: Spot
 
 
+def gate_px(width_px: int) -> float:
+    """Largest distance of a spot from its decoded pixel on a sensor `width_px` wide, px: four standard deviations."""
+    return float(GATE_SIGMA * np.hypot(ROUGH_SHARE * width_px, CENTROID_PX))
+
+
 def identify(
-    spots: Sequence[Spot], decoded: Sequence[DecodedSpot], leds: Mapping[int, Led]
+    spots: Sequence[Spot], decoded: Sequence[DecodedSpot], leds: Mapping[int, Led], gate_px: float
 ) -> tuple[Correspondence, ...]:
     """Match spots and decoded identities one to one; the result is in the order of `decoded`.
 
-    An identity is assigned its nearest spot, at most GATE_PX away, unless another spot is within CLEARANCE times that
+    An identity is assigned its nearest spot, at most `gate_px` away, unless another spot is within CLEARANCE times that
     distance, or another identity has the same nearest spot: a merged blob is assigned to no LED. Spots that touch the
     image's border take part, so that their identity is not assigned to another spot, and are then left out because
-    their centroid is biased. Raises EstimationFailure if no correspondence is left.
+    their centroid is biased. Raises EstimationFailure, with the number of identities by cause, if no correspondence is
+    left.
     """
     if not decoded:
         raise EstimationFailure("identify", "no identity was decoded")
@@ -39,15 +48,28 @@ def identify(
     decoded_px = np.array([(identity.u_px, identity.v_px) for identity in decoded])
     distance_px = np.linalg.norm(decoded_px[:, None] - spots_px[None], axis=2)
     nearest = np.argmin(distance_px, axis=1)
-    inside = distance_px.min(axis=1) <= GATE_PX
+    inside = distance_px.min(axis=1) <= gate_px
     identities_of_spot = np.bincount(nearest[inside], minlength=len(spots))
     correspondences = []
+    beyond, unclear, cut = 0, 0, 0
     for row, identity in enumerate(decoded):
         spot = spots[nearest[row]]
         second_px = np.delete(distance_px[row], nearest[row]).min(initial=np.inf)
         clear = second_px >= CLEARANCE * distance_px[row].min() and identities_of_spot[nearest[row]] == 1
-        if inside[row] and clear and not spot.touches_border:
+        if not inside[row]:
+            beyond += 1
+        elif not clear:
+            unclear += 1
+        elif spot.touches_border:
+            cut += 1
+        else:
             correspondences.append(Correspondence(leds[identity.led], spot))
     if not correspondences:
-        raise EstimationFailure("identify", "no whole spot matches a decoded identity")
+        causes = [
+            (beyond, f"without a spot within {gate_px:.3g} px"),
+            (unclear, "near two spots, or two identities near one spot"),
+            (cut, "with a spot cut by the border of its region"),
+        ]
+        told = "; ".join(f"{count} {cause}" for count, cause in causes if count)
+        raise EstimationFailure("identify", f"no whole spot matches a decoded identity: {told}")
     return tuple(correspondences)

@@ -27,6 +27,9 @@ from vlcrender.sensor.radiometry import WAVELENGTHS_NM, detectors
 from vlcrender.sensor.sensor import Sensor
 
 ScaleMode = Literal["binned", "same-photons"]
+MIN_SCALED_MARGIN_PX = 6.0
+"""Smallest margin of a scaled recipe's regions, px: a background of some pixels on each side of an LED image, whose
+edge the pixel raster widens by up to one pixel. A recipe's own margin stays where it is smaller."""
 
 
 class Recipe(Settings):
@@ -198,6 +201,8 @@ def load_plan(path: Path, assignments: Iterable[str] = (), scale: int = 1, scale
 def scaled(recipe: Recipe, by: int, mode: ScaleMode) -> Recipe:
     """The recipe with `by` x `by` pixels binned into one, and every length in pixels divided by `by`.
 
+    The margin of regions does not fall below MIN_SCALED_MARGIN_PX: an LED image of any size needs some pixels of
+    background around it.
     "binned" keeps all photons: full well and gain grow with the pixels' area, so that digital numbers keep their range
     (`Sensor.binned`). "same-photons" divides the exposure time by the pixels' area: as many photons a pixel as before.
     Raises InputError where `by` does not divide the size of a sensor or the result is not a valid recipe.
@@ -216,7 +221,9 @@ def scaled(recipe: Recipe, by: int, mode: ScaleMode) -> Recipe:
     if isinstance(recipe.poses, AimedPoses):
         changes["poses"] = recipe.poses.model_copy(update={"border_px": recipe.poses.border_px / by})
     if recipe.regions is not None:
-        changes["regions"] = recipe.regions.model_copy(update={"margin_px": recipe.regions.margin_px / by})
+        margin_px = recipe.regions.margin_px
+        least_px = min(margin_px, MIN_SCALED_MARGIN_PX)
+        changes["regions"] = recipe.regions.model_copy(update={"margin_px": max(margin_px / by, least_px)})
     if mode == "same-photons":
         if recipe.exposure_s is not None:
             changes["exposure_s"] = recipe.exposure_s / by**2

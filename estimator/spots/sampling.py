@@ -1,0 +1,149 @@
+"""Sampling of an LED image by pixels: the error that it causes in the centroid, and its correction.
+
+A pixel gathers the light on its area, and a centroid puts that light at the pixel's centre. The errors of the pixels
+cancel but for the image's spectrum at whole cycles a pixel. With U(k) the Fourier transform of the image's marginal
+along u over its flux, at k cycles a pixel, and u0 the true centroid in pixels with pixel centres at +0.5, Poisson's
+summation formula gives for a marginal that is even about u0:
+
+    centroid = u0 + sum over k >= 1 of U(k) sin(2 pi k u0) / (pi k)
+    second moment about u0 = true one + 1 / 12 + sum over k >= 1 of cos(2 pi k u0) (U(k) / k^2 - U'(k) / k) / pi^2
+
+and the same along v. The marginal of a uniform ellipse of half extent a is a semi-ellipse: U(k) = 2 J1(x) / x and
+U'(k) = -4 pi a J2(x) / x with x = 2 pi k a, and its true second moment is a^2 / 4. The error in the centroid of a disc
+is up to 0.02 px for a = 1 px and falls as a^-1.5. A lens that blurs the image lowers U(k).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import j1, jv
+
+from estimator.io.device import Camera
+
+Floats = NDArray[np.float64]
+
+# U(k) / k falls as k^-2.5: the eighth is 0.6 % of the first.
+HARMONICS = np.arange(1.0, 9.0)
+PIXEL_VARIANCE = 1 / 12
+# Relative uncertainty of the half extent that a second moment gives: a gradient of the luminance over the face, a halo
+# and crosstalk change the moment. Ours.
+SHAPE_UNCERTAINTY = 0.003
+# The light of a smaller image is in one or two pixels, which do not determine its centre and its size.
+MIN_HALF_EXTENT_PX = 0.7
+# A centroid that moves by less than this share of the LED image's movement says little about it.
+MIN_SLOPE = 0.3
+MAX_ROUNDS = 30
+CONVERGED_PX = 1e-5
+SOLVED_PX = 1e-3
+
+
+@dataclass(frozen=True)
+class LensBlur:
+    """Blur of a lens: whether it is `sharp`, and an upper limit of its transfer function at one cycle a pixel."""
+
+    sharp: bool = True
+    transfer: float = 1.0
+
+
+SHARP = LensBlur()
+
+
+def lens_blur(camera: Camera) -> LensBlur:
+    """Blur that the device knows of; the transfer function of defocus and of a measured kernel counts as 1."""
+    if camera.psf == "none" and camera.focus_distance_m is None:
+        return SHARP
+    if camera.psf != "diffraction":
+        return LensBlur(sharp=False)
+    # A circular pupil: (2 / pi) (acos s - s sqrt(1 - s^2)) up to the cutoff, s = 1 (Goodman, Fourier Optics, 6.4).
+    f_number = camera.f_number * camera.image_distance_mm / camera.focal_length_mm
+    s = min(camera.psf_wavelength_nm / 1000 * f_number / camera.pixel_pitch_um, 1.0)
+    return LensBlur(sharp=False, transfer=float(2 / np.pi * (np.arccos(s) - s * np.sqrt(1 - s**2))))
+
+
+@dataclass(frozen=True, eq=False)
+class SamplingError:
+    """Errors of a centroid along u and v by sampling, all (2,).
+
+    `error_px` is the error to subtract, `variance_px2` the variance of the error that remains, `slope` the derivative
+    of the centroid by the true one: noise in the centroid is noise of 1 / `slope` times that in the corrected one.
+    """
+
+    error_px: Floats
+    variance_px2: Floats
+    slope: Floats
+
+
+def sampling_variance_px2(half_extent_px: Floats, square: bool) -> Floats:
+    """Variance of the sampling error over all positions on the pixels, px^2, for half extents (n,).
+
+    The mean of sin^2 is 1/2. The mean of U(k)^2 over half extents of about the same size is 4 / (pi x^3) for an ellipse
+    and 1 / (2 x^2) for a square with sides along the pixels' rows, x = 2 pi k a; U(k)^2 is at most 1.
+    """
+    x = 2 * np.pi * HARMONICS * np.maximum(half_extent_px, 1e-3)[:, None]
+    spectrum2 = np.minimum(1 / (2 * x**2) if square else 4 / (np.pi * x**3), 1.0)
+    return np.asarray((spectrum2 / (np.pi * HARMONICS) ** 2).sum(axis=1) / 2)
+
+
+def sampling_error(centroid_px: Floats, moments_px2: Floats, moment_sigmas_px2: Floats) -> SamplingError:
+    """Sampling error of a sharp, uniform ellipse along u and v, from its centroid and second moments by pixels, (2,).
+
+    The half extents follow from the second moments about the centroid, whose standard deviations by noise are
+    `moment_sigmas_px2`. A standard deviation s of the half extent makes the phase of U(k) uncertain by 2 pi k s: the
+    expected error shrinks by the mean of a cosine, exp(-(2 pi k s)^2 / 2), and the rest is variance. If the pixels do
+    not determine position and size, the error is 0 and its variance that over all positions.
+    """
+    true_px, half_px, solved = _solve(centroid_px, moments_px2)
+    step_px = 1e-3
+    by_half = (_moments(true_px, half_px + step_px) - _moments(true_px, half_px - step_px)) / (2 * step_px)
+    model_px2 = SHAPE_UNCERTAINTY * half_px**2 / 2
+    sigma_px = np.hypot(moment_sigmas_px2, model_px2) / np.maximum(np.abs(by_half), 1e-6)
+    shrinking = np.exp(-((2 * np.pi * HARMONICS * sigma_px[:, None]) ** 2) / 2)
+    error_px, slope = _error(true_px, half_px, shrinking)
+    # The envelope of J1 is sqrt(2 / (pi x)). The mean of sin^2 over positions is 1/2.
+    x = 2 * np.pi * HARMONICS * half_px[:, None]
+    envelope2 = np.minimum(8 / (np.pi * x**3), 1.0)
+    rest = (envelope2 * (1 - shrinking**2) / (np.pi * HARMONICS) ** 2).sum(axis=1) / 2
+    usable = solved & (slope > MIN_SLOPE)
+    return SamplingError(
+        error_px=np.where(usable, error_px, 0.0),
+        variance_px2=np.where(usable, rest, sampling_variance_px2(half_px, square=False)),
+        slope=np.where(usable, slope, 1.0),
+    )
+
+
+def _solve(centroid_px: Floats, moments_px2: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    """True centroids and half extents (2,) for sampled centroids and second moments, and whether they were found."""
+    true_px = centroid_px
+    half_px = 2 * np.sqrt(np.maximum(moments_px2 - PIXEL_VARIANCE, MIN_HALF_EXTENT_PX**2 / 4))
+    for _ in range(MAX_ROUNDS):
+        error_px, slope = _error(true_px, half_px)
+        step_px = (centroid_px - true_px - error_px) / np.maximum(slope, MIN_SLOPE)
+        excess_px2 = _moments(true_px, half_px) - half_px**2 / 4
+        found_px = 2 * np.sqrt(np.maximum(moments_px2 - excess_px2, MIN_HALF_EXTENT_PX**2 / 4))
+        change_px = np.abs(found_px - half_px)
+        # Half of the change: near the smallest sizes the whole one would swing about the solution.
+        true_px, half_px = true_px + step_px, (half_px + found_px) / 2
+        if max(np.abs(step_px).max(), change_px.max()) < CONVERGED_PX:
+            break
+    solved = (np.abs(step_px) < SOLVED_PX) & (change_px < SOLVED_PX) & (found_px > MIN_HALF_EXTENT_PX)
+    return true_px, half_px, np.asarray(solved)
+
+
+def _error(true_px: Floats, half_px: Floats, weights: Floats | float = 1.0) -> tuple[Floats, Floats]:
+    """Sampling error (2,) of ellipses at true centroids (2,), and the sampled centroid's slope by the true one, (2,).
+
+    `weights` (2, k) multiply the harmonics.
+    """
+    x, phase = 2 * np.pi * HARMONICS * half_px[:, None], 2 * np.pi * HARMONICS * true_px[:, None]
+    spectrum = weights * 2 * j1(x) / x
+    error_px = (spectrum * np.sin(phase) / (np.pi * HARMONICS)).sum(axis=1)
+    return np.asarray(error_px), np.asarray(1 + 2 * (spectrum * np.cos(phase)).sum(axis=1))
+
+
+def _moments(true_px: Floats, half_px: Floats) -> Floats:
+    """Second moments (2,), px^2, by pixels about the sampled centroid, of ellipses at true centroids (2,)."""
+    x, phase = 2 * np.pi * HARMONICS * half_px[:, None], 2 * np.pi * HARMONICS * true_px[:, None]
+    spectrum, slopes = 2 * j1(x) / x, -4 * np.pi * half_px[:, None] * jv(2, x) / x
+    excess = (np.cos(phase) * (spectrum / HARMONICS**2 - slopes / HARMONICS)).sum(axis=1) / np.pi**2
+    return np.asarray(half_px**2 / 4 + PIXEL_VARIANCE + excess - _error(true_px, half_px)[0] ** 2)
