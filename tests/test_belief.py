@@ -33,7 +33,7 @@ from vlcrender.dataset.verify import verify
 from vlcrender.errors import InputError
 from vlcrender.scene.as_built import luminaires_of
 from vlcrender.scene.loader import build_scene
-from vlcrender.scene.schema import PanelFrame
+from vlcrender.scene.schema import Bake, PanelFrame
 
 Array = NDArray[np.float64]
 
@@ -426,9 +426,9 @@ def test_a_led_raised_into_its_panel_is_not_hidden_by_it() -> None:
     )
     settings = raised.scene.settings
     rim = PanelFrame(width_m=0.01, depth_m=0.002, reflectance=0.5)
-    framed = build_scene(
-        settings.model_copy(update={"panels": (settings.panels[0].model_copy(update={"frame": rim}),)}), "framed"
-    )
+    panels = (settings.panels[0].model_copy(update={"frame": rim}),)
+    coarse = Bake(texel_m=3.0, paths=8)
+    framed = build_scene(settings.model_copy(update={"panels": panels, "bake": coarse}), "framed")
     heights = built_leds(raised.recipe, framed, 0).centers_m[:, 2] - framed.leds.centers_m[:, 2]
     assert (heights > 0.03).all(), "the draw of this seed is upwards"
     job = Job(raised.recipe.model_dump_json(), framed.settings.model_dump_json(), str(framed.folder), "/nowhere")
