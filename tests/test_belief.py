@@ -13,8 +13,11 @@ from conftest import ROOT, SMALL, copy_of
 from numpy.typing import NDArray
 
 import estimator as est
+from vlcrender.camera.distortion import Distortion
 from vlcrender.camera.intrinsics import Camera, Pose, transform
+from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.config.presets import presets
+from vlcrender.core.backend import dr
 from vlcrender.dataset.belief import CAMERA_PARAMETERS, Belief
 from vlcrender.dataset.files import read_dataset_file
 from vlcrender.dataset.frame_job import Job, _noise_free_frame, make_frame
@@ -31,13 +34,15 @@ from vlcrender.dataset.true_world import (
 )
 from vlcrender.dataset.verify import verify
 from vlcrender.errors import InputError
+from vlcrender.rendering.renderer import Renderer
 from vlcrender.scene.as_built import luminaires_of
-from vlcrender.scene.loader import build_scene
+from vlcrender.scene.loader import Scene, build_scene
 from vlcrender.scene.schema import Bake, PanelFrame
 
 Array = NDArray[np.float64]
 
 REGIONS = 'regions={ kind = "leds", margin_px = 3 }'
+SMALL_CAMERA = {"width_px": 400, "height_px": 300, "pixel_pitch_um": 12.0}
 CALIBRATED = ("belief.preset=calibrated", "belief.devices=3", "belief.maps=2")
 
 
@@ -624,3 +629,30 @@ def test_a_journal_line_is_a_whole_frame(tmp_path: Path) -> None:
     record = make_frame(job, 5)
     assert (record.device.device, record.truth.map) == (2, 0)
     assert make_frame(job, 5) == record
+
+
+# Kernels
+
+
+def test_a_camera_as_data_gives_the_same_image_with_one_kernel_for_all_cameras(office: Scene) -> None:
+    """Bit for bit, with a distortion; a second camera launches the kernels of the first."""
+    plain = Renderer(office)
+    varying = plain.with_leds(office.leds)
+    pose = Pose((3.4, 3.6, 1.0), 12.0, -7.0, 20.0)
+    cameras = [
+        Camera(**SMALL_CAMERA, principal_point_px=(195.3, 151.1), distortion=Distortion(k1=k1, p1=3e-4, p2=-2e-4))
+        for k1 in (0.02, 0.03)
+    ]
+    for camera in cameras:
+        posed = PosedCamera(camera, pose)
+        expected, image = (r.expected_image(posed).expected_electrons(1e-4) for r in (plain, varying))
+        assert np.array_equal(expected, image)
+
+    def kernels(renderer: Renderer, camera: Camera) -> set[str]:
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            renderer.expected_image(PosedCamera(camera, pose))
+            return {entry["hash"] for entry in dr.kernel_history([dr.KernelType.JIT])}
+
+    assert kernels(varying, cameras[0]) == kernels(varying, cameras[1])
+    assert kernels(plain, cameras[0]) != kernels(plain, cameras[1]), "the history tells kernels apart"
