@@ -570,6 +570,29 @@ def test_a_focused_lens_keeps_its_focus_and_aperture() -> None:
     assert true.focal_px / told.focal_px - 1 == pytest.approx(float(errors_of_camera(far, 2)[0]), rel=1e-9)
 
 
+def test_an_aspect_ratio_leaves_the_light_of_an_led() -> None:
+    """The image of an LED, wider than high by a fifth, has the light of an image of equal scales.
+
+    fx fy is f^2 (1 - (0.2 / 2.2)^2), 0.8 % less, and each pixel sees as much more. Coverage takes the scale as constant
+    in a pixel: 1e-4.
+    """
+    light = []
+    for ratio in (1.0, 1.04):
+        settings = plan(
+            "poses={ kind = 'grid', columns = 1, rows = 1, height_m = 1.0 }", f"camera.aspect_ratio={ratio}"
+        )
+        job = Job(
+            *(settings.recipe.model_dump_json(), settings.scene.settings.model_dump_json()),
+            *(str(settings.scene.folder), "/nowhere"),
+        )
+        patches = _noise_free_frame(job, 0, 0, None).view.patches
+        light.append({p.led_id: float(p.electrons_per_s.sum()) for p in patches if p.visible_fraction == 1})
+    common = light[0].keys() & light[1].keys()
+    assert len(common) > 5
+    for led in common:
+        assert light[1][led] == pytest.approx(light[0][led], rel=2e-4)
+
+
 # Damage
 
 
