@@ -71,6 +71,19 @@ def test_principal_point_and_skew_enter_as_in_k() -> None:
     assert (u, v) == pytest.approx((1990.5 + 500 + 30 * 0.2 / 3, 1510.25 + 1000))
 
 
+def test_fx_over_fy_is_the_aspect_ratio_and_their_mean_the_image_distance() -> None:
+    """Led 0.1 m to +x and to +y of a camera 3 m below it."""
+    camera = Camera(aspect_ratio=1.02)
+    ((fx, _, _), (_, fy, _), _) = camera.matrix.tolist()
+    assert fx / fy == pytest.approx(1.02, rel=1e-15)
+    assert (fx + fy) / 2 == pytest.approx(15000.0, rel=1e-15)
+    u, v = image_of(np.array([3.1, 4.1, 3.5]), camera) - [2000.0, 1500.0]
+    assert (u, v) == pytest.approx((fx / 30, fy / 30), rel=1e-9)
+    across, down = camera.view_angles_deg()
+    assert across == pytest.approx(2 * np.degrees(np.arctan(2000 / fx)))
+    assert down == pytest.approx(2 * np.degrees(np.arctan(1500 / fy)))
+
+
 def test_rays_invert_projection(rng: np.random.Generator) -> None:
     camera = Camera(principal_point_px=(1900.0, 1600.0), skew_px=12.0)
     pose = Pose((3.0, 2.0, 1.0), 35.0, -50.0, 120.0)

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from functools import cache, partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -74,9 +75,10 @@ def generate(
             raise InputError(f"{directory}: complete but damaged: {damage[0]}; delete it or choose another --out")
         log.info("%s: complete and intact already", directory)
         return False
+    mounted_of = cache(partial(true_camera, plan.recipe))
     for pose_number in range(plan.recipe.poses.count):  # an impossible pose ends the run before the first frame
         for which in range(len(plan.recipe.cameras)):
-            mounted = true_camera(plan.recipe, which, device_of_pose(plan.recipe, pose_number))
+            mounted = mounted_of(which, device_of_pose(plan.recipe, pose_number))
             _, during = poses_of(plan.recipe, plan.scene, pose_number, mounted)
             check_inside(plan.scene, during[0])
             check_inside(plan.scene, during[-1])

@@ -100,5 +100,7 @@ def electron_rate_per_cd_m2(camera: Camera, spectrum_name: str, detector: Detect
     photon_j = constants.h * constants.c / (WAVELENGTHS_NM * 1e-9)
     electrons = np.trapezoid(watt_per_nm * detector.quantum_efficiency(WAVELENGTHS_NM) / photon_j, WAVELENGTHS_NM)
     solid_angle_sr = np.pi / 4 / camera.working_f_number**2
-    area_m2 = (camera.pixel_pitch_um * 1e-6) ** 2
+    fx, fy = camera.focal_xy_px
+    # A pixel sees a solid angle of 1 / (fx fy), not of 1 / f_i^2. The factor is exactly 1 for fx = fy.
+    area_m2 = (camera.pixel_pitch_um * 1e-6) ** 2 * (camera.focal_px**2 / (fx * fy))
     return float(solid_angle_sr * area_m2 * camera.transmittance * electrons)
