@@ -24,6 +24,7 @@ UNITS = {
     "e_s": "e/s",
     "m_s": "m/s",
     "percent": "%",
+    "ppm": "ppm",
     "deg": "deg",
     "lux": "lux",
     "db": "dB",
@@ -72,6 +73,7 @@ def recipe_schema() -> Schema:
     tree = Recipe.model_json_schema()
     tables, properties = tree["$defs"], tree["properties"]
     tables["Sensor"]["properties"] = {"preset": _preset("sensor"), **tables["Sensor"]["properties"]}
+    tables["Belief"]["properties"] = {"preset": _preset("belief"), **tables["Belief"]["properties"]}
     preset_imu = copy.deepcopy(tables["Imu"])
     preset_imu["description"] = "An accelerometer by the name of a preset; keys beside it replace the preset's values."
     preset_imu["properties"] = {"preset": _preset("accelerometer"), **preset_imu["properties"]}

@@ -38,8 +38,10 @@ def test_the_version_is_4_and_discs_have_a_radius(made: Path) -> None:
     assert tree["provenance"]["data_version"] == DATA_VERSION
     assert len(tree["led_map"]) == 49 * 25
     for led in tree["led_map"]:
-        assert set(led) == {"id", "position_m", "shape", "radius_m"}
+        stated = {"luminaire", "sigma_m", "radius_sigma_m", "gradient_sigma"}
+        assert set(led) == {"id", "position_m", "shape", "radius_m", *stated}
         assert (led["shape"], led["radius_m"]) == ("disc", 0.01)
+        assert {led[key] for key in stated} == {None}
 
 
 def test_squares_have_their_whole_side(office: Scene) -> None:

@@ -11,11 +11,14 @@ import pytest
 from vlcrender.dataset.schema import (
     FRAMES_SCHEMA,
     TRUTH_SCHEMA,
+    DeviceTruthRow,
     FrameRecord,
     FrameRow,
     LedTruth,
+    MapTruthRow,
     SpotRow,
     TruthRow,
+    arrow_schema,
     flat9,
 )
 from vlcrender.dataset.tables import read_table, write_table
@@ -25,11 +28,12 @@ SPOT = [("led", pa.int64()), ("u_px", pa.float64()), ("v_px", pa.float64())]
 
 
 def test_the_columns_are_those_of_the_format() -> None:
-    """FORMAT.md's two tables, written out by hand."""
+    """FORMAT.md's four tables, written out by hand."""
     expected = {
         "frame": pa.int64(),
         "shot": pa.int64(),
         "pose": pa.int64(),
+        "device": pa.int64(),
         "file": pa.string(),
         "sha256": pa.string(),
         "camera": pa.string(),
@@ -42,6 +46,9 @@ def test_the_columns_are_those_of_the_format() -> None:
     expected = {
         "frame": pa.int64(),
         "shot": pa.int64(),
+        "map": pa.int64(),
+        "K": pa.list_(pa.float64(), 9),
+        "distortion": pa.list_(pa.float64(), 5),
         "position_m": pa.list_(pa.float64(), 3),
         "R_cam_world": pa.list_(pa.float64(), 9),
         "tilt_x_deg": pa.float64(),
@@ -49,8 +56,28 @@ def test_the_columns_are_those_of_the_format() -> None:
         "yaw_deg": pa.float64(),
         "leds": pa.list_(pa.struct([*SPOT, ("visible_fraction", pa.float64())])),
         "bound_m2": pa.list_(pa.float64(), 9),
+        "bound_exact_m2": pa.list_(pa.float64(), 9),
     }
     assert pa.schema(list(expected.items())).equals(TRUTH_SCHEMA)
+    expected = {
+        "device": pa.int64(),
+        "map": pa.int64(),
+        "camera": pa.string(),
+        "K": pa.list_(pa.float64(), 9),
+        "distortion": pa.list_(pa.float64(), 5),
+        "R_cam_rig": pa.list_(pa.float64(), 9),
+        "offset_m": pa.list_(pa.float64(), 3),
+        "tilt_error_deg": pa.list_(pa.float64(), 2),
+    }
+    assert pa.schema(list(expected.items())).equals(arrow_schema(DeviceTruthRow))
+    expected = {
+        "map": pa.int64(),
+        "led": pa.int64(),
+        "position_m": pa.list_(pa.float64(), 3),
+        "size_m": pa.float64(),
+        "gradient": pa.list_(pa.float64(), 2),
+    }
+    assert pa.schema(list(expected.items())).equals(arrow_schema(MapTruthRow))
 
 
 def record(rng: np.random.Generator, bound: bool) -> FrameRecord:
@@ -65,6 +92,7 @@ def record(rng: np.random.Generator, bound: bool) -> FrameRecord:
         "frame": 3,
         "shot": 2,
         "pose": 1,
+        "device": 1,
         "file": "frames/000003.exr",
         "sha256": "0" * 64,
         "camera": "main",
@@ -76,11 +104,15 @@ def record(rng: np.random.Generator, bound: bool) -> FrameRecord:
     truth = {
         "frame": 3,
         "shot": 2,
+        "map": 1,
+        "K": numbers(9),
+        "distortion": numbers(5) if bound else None,
         "position_m": numbers(3),
         "R_cam_world": numbers(9),
         **dict(zip(("tilt_x_deg", "tilt_y_deg", "yaw_deg"), tilts, strict=True)),
         "leds": (LedTruth(led=7, u_px=v, v_px=u, visible_fraction=share),),
         "bound_m2": numbers(9) if bound else None,
+        "bound_exact_m2": numbers(9) if bound else None,
     }
     return FrameRecord(device=FrameRow.model_validate(device), truth=TruthRow.model_validate(truth))
 

@@ -163,6 +163,11 @@ class Camera(Settings):
         fx, fy = self.focal_xy_px
         return np.array([[fx, self.skew_px, u], [0.0, fy, v], [0.0, 0.0, 1.0]])
 
+    def inverse_matrix(self) -> list[list[Any]]:
+        """K^-1, rows of Python floats: a NumPy scalar times a Dr.Jit array would become a NumPy array."""
+        inverse: list[list[Any]] = np.linalg.inv(self.matrix).tolist()
+        return inverse
+
     def view_angles_deg(self) -> tuple[float, float]:
         """Full angles of view across and down, for a sensor centred on the axis.
 
@@ -180,8 +185,7 @@ class Camera(Settings):
 
     def sensor_position(self, u: Any, v: Any) -> tuple[Any, Any]:
         """Position on the sensor, K^-1 [u, v, 1]: (x, y) from the axis in units of f_i. Arrays as in `unproject`."""
-        # Python floats: a NumPy scalar times a Dr.Jit array would become a NumPy array
-        inverse = np.linalg.inv(self.matrix).tolist()
+        inverse = self.inverse_matrix()
         x = inverse[0][0] * u + inverse[0][1] * v + inverse[0][2]
         y = inverse[1][1] * v + inverse[1][2]
         return x, y

@@ -3,6 +3,7 @@
 One ray through each pixel's centre, and a grid of rays in each pixel where two surfaces may meet.
 """
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -16,6 +17,7 @@ from vlcrender.camera.vignetting import relative_illumination
 from vlcrender.core.backend import dr, exact_math, mi
 from vlcrender.light.lightmap import Lightmap
 from vlcrender.light.raycast import Hit, Room
+from vlcrender.rendering.camera_data import CameraData
 from vlcrender.rendering.electron_rates import DARK, ElectronRates
 from vlcrender.rendering.expected_image import Image
 from vlcrender.scene.loader import Scene
@@ -47,13 +49,21 @@ class Background:
         self.room = Room(light.mesh, scene.glazings, scene.surfaces)
         self._light = light
         self._values: dict[ElectronRates, Any] = {}
+        self.cameras_vary = False
+        """Whether each view has a camera of its own, so that a camera's numbers are data of the kernels."""
+
+    def with_varying_cameras(self) -> "Background":
+        """The same room for views of which each has a camera of its own."""
+        background = copy.copy(self)
+        background.cameras_vary = True
+        return background
 
     def trace(self, posed: PosedCamera, u: Any, v: Any, rates: ElectronRates = DARK, size_px: float = 1.0) -> Hit:
         """Surfaces and light seen by squares of `size_px` around the pixel positions (u, v), Dr.Jit arrays.
 
         The value is in electrons a second and includes the lens's relative illumination.
         """
-        camera = posed.camera
+        camera = CameraData.of(posed.camera, mi.Float) if self.cameras_vary else posed.camera
         if rates not in self._values:
             self._values[rates] = self.room.values(self._light, rates.led, rates.ambient)
             while len(self._values) > MAX_RATES:

@@ -1,5 +1,6 @@
 """Occlusion of LEDs by furniture, by frames of panels, and by panels that hang lower than an LED."""
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -11,6 +12,7 @@ from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.roi import Roi, merged
 from vlcrender.core.backend import dr, exact_math, mi
 from vlcrender.rendering.background import Background, differs_from_neighbour, sub_pixels
+from vlcrender.rendering.camera_data import CameraData
 from vlcrender.scene.loader import Scene
 
 DISTANCE_TOLERANCE = 1e-4
@@ -55,6 +57,12 @@ class Occlusion:
             or min(undersides_m, default=np.inf) < scene.leds.centers_m[:, 2].max() * (1 - DISTANCE_TOLERANCE)
         )
         """Whether anything in the scene can occlude an LED that is seen directly."""
+
+    def with_varying_cameras(self) -> "Occlusion":
+        """The same surfaces for views of which each has a camera of its own."""
+        occlusion = copy.copy(self)
+        occlusion._background = self._background.with_varying_cameras()
+        return occlusion
 
     def clear_shares(
         self, posed: PosedCamera, images: Sequence[LitRegion], mirror: Mirror | None = None
@@ -110,7 +118,9 @@ class Occlusion:
             rotation = mirror.pose.rotation
             path_m = dr.select(hit.surface == self._background.room.first_glazing + mirror.glazing, hit.path_m, 0.0)
         # Double precision, and numbers as data: as literals each pose would compile a kernel of its own.
-        x, y, z = posed.camera.unproject(mi.Float64(u), mi.Float64(v), dr)
+        vary = self._background.cameras_vary
+        camera = CameraData.of(posed.camera, mi.Float64) if vary else posed.camera
+        x, y, z = camera.unproject(mi.Float64(u), mi.Float64(v), dr)
         up = [dr.opaque(mi.Float64, number) for number in rotation[:, 2].tolist()]
         slope = (up[0] * x + up[1] * y + up[2] * z) / dr.sqrt(x * x + y * y + z * z)
         rise_m = dr.opaque(mi.Float64, height_m - posed.pose.position_m[2])

@@ -63,6 +63,9 @@ class Renderer:
         """
         renderer = copy.copy(self)
         renderer.scene = replace(self.scene, leds=leds)
+        # Where LEDs are as built, cameras are as made: each device, or frame, has its own.
+        renderer._background = self._background.with_varying_cameras()
+        renderer._occlusion = self._occlusion.with_varying_cameras()
         return renderer
 
     def expected_image(

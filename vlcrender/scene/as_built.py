@@ -66,13 +66,13 @@ def as_built(leds: Leds, luminaires: Luminaires, errors: BuildingErrors) -> Leds
     Faces stay horizontal, and the sides of squares along x and y. The lit part of a diffuser moves with its LED.
     """
     of_led = luminaires.of_led
-    rotations = Rotation.from_rotvec(errors.luminaire_rotation_deg, degrees=True).as_matrix()
-    centers = luminaires.centers_m[of_led]
+    turns = Rotation.from_rotvec(errors.luminaire_rotation_deg, degrees=True).as_matrix() - np.eye(3)
+    from_center = leds.centers_m - luminaires.centers_m[of_led]
     # not `@`: the last bits of a matrix product may depend on threads and processor
-    turned = (rotations[of_led] * (leds.centers_m - centers)[:, None, :]).sum(axis=2)
-    in_place = centers + errors.luminaire_m[of_led] + turned + errors.led_m
-    positions = (1 + errors.datum_scale) * in_place + errors.datum_m
-    shifts = positions - leds.centers_m
+    turned = (turns[of_led] * from_center[:, None, :]).sum(axis=2)
+    shifts = errors.luminaire_m[of_led] + turned + errors.led_m
+    # As a sum of small shifts: an error of 0 leaves every bit.
+    shifts = shifts + errors.datum_scale * (leds.centers_m + shifts) + errors.datum_m
     sizes = 1 + errors.led_size
     diffusers = tuple(
         diffuser and diffuser.as_built(x, y, size)
@@ -80,7 +80,7 @@ def as_built(leds: Leds, luminaires: Luminaires, errors: BuildingErrors) -> Leds
     )
     return replace(
         leds,
-        centers_m=positions,
+        centers_m=leds.centers_m + shifts,
         half_widths_m=leds.half_widths_m * sizes,
         diffusers=diffusers,
         face_gradients=leds.face_gradients + errors.led_gradient,
