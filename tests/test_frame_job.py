@@ -7,6 +7,7 @@ import OpenEXR
 import pytest
 from conftest import ROOT, SMALL
 
+import vlcrender as vr
 from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.roi import RegionImage, Roi
 from vlcrender.dataset.frame_job import _white_balance
@@ -107,6 +108,27 @@ def test_the_bound_of_a_frame_is_that_of_its_noise_and_its_accelerometer(tmp_pat
     )
     assert bound is not None
     assert np.array(truth.bound_m2).reshape(3, 3) == pytest.approx(bound, rel=1e-5, abs=1e-5 * np.trace(bound))
+    assert truth.bound_exact_m2 == truth.bound_m2  # without [belief]
+
+
+def test_with_a_belief_the_truth_has_the_hybrid_bound_beside_the_exact_one(tmp_path: Path) -> None:
+    """The hybrid one is the budget's of the same pose; the exact one is that of pixel noise alone, below.
+
+    The frame's camera and LEDs are the true ones, the budget's the told ones. A luminaire 3 mm and 0.2 deg off in 2.5 m
+    and a focal length 0.1 % off change distances and angles by 1e-3; LEDs 0.3 mm off, the distances of 130 mm between
+    them by 2e-3. Bounds follow with small powers of these: 1e-2.
+    """
+    plan = plan_of("poses.count=1", "bound=true", "belief.preset=calibrated")
+    generate(plan, tmp_path / "set")
+    (truth,) = read_table(tmp_path / "set/truth.parquet", TruthRow)
+    assert truth.bound_m2 is not None
+    assert truth.bound_exact_m2 is not None
+    hybrid, exact = (np.array(bound).reshape(3, 3) for bound in (truth.bound_m2, truth.bound_exact_m2))
+    of_budget = vr.budget(plan, poses=1).bound
+    assert of_budget is not None
+    assert 1e3 * np.sqrt(hybrid[2, 2]) == pytest.approx(of_budget.vertical_mm, rel=1e-2)
+    assert 1e3 * np.sqrt(hybrid[0, 0] + hybrid[1, 1]) == pytest.approx(of_budget.horizontal_mm, rel=1e-2)
+    assert np.linalg.eigvalsh(hybrid - exact).min() > 0
 
 
 def test_white_balance_multiplies_the_weaker_colours_and_leaves_a_blind_one() -> None:

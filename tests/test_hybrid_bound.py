@@ -342,7 +342,7 @@ def test_motions_of_a_face_move_its_rendered_image(renderer: Renderer) -> None:
         u, v = patch.roi.centers_px()
         light = patch.electrons_per_s
         places.append(np.array([(light * u).sum(), (light * v).sum()]) / light.sum())
-    shift = 1e-6 * np.array([*face_motions(mounted, POSE, leds, 1).lens[:2, 0], 0.0])
+    shift = 1e-6 * np.array([*face_motions(mounted, POSE, leds, np.array([1])).lens[0, :2, 0], 0.0])
     center = leds.centers_m[1]
     predicted = (mounted.posed(POSE).project(center + shift) - mounted.posed(POSE).project(center - shift)) / 2e-6
     assert predicted == pytest.approx((places[0] - places[1]) / (2 * step), abs=0.03)
@@ -358,23 +358,24 @@ def test_motions_of_a_face_over_a_level_camera_are_known(renderer: Renderer) -> 
     leds = renderer.scene.leds
     x, y, height = POSE.position_m
     mounted = mounted_cameras(CAMERA.model_copy(update={"distortion": None}), ())[0]
-    found = face_motions(mounted, Pose(POSE.position_m), leds, 1)
+    motions = face_motions(mounted, Pose(POSE.position_m), leds, np.array([0, 1]))
+    pose, lens, own = motions.pose[1], motions.lens[1], motions.own[1]
     (a, b, h) = leds.centers_m[1] - np.array([x, y, height])
     grown = np.array([a, b, 1, 0, 0, 1])
     still = [0, 0, 0, 0]
     for motion, expected in (
-        (found.pose[:, 0], [-1, 0, *still]),
-        (found.pose[:, 1], [0, -1, *still]),
-        (found.pose[:, 2], grown / h),
-        (found.lens[:, 0], grown),
-        (found.lens[:, 2], [h / 1500, 0, *still]),
-        (found.position[:, 0], [1, 0, *still]),
-        (found.position[:, 2], -grown / h),
-        (found.size[:, 0], [0, 0, 1, 0, 0, 1]),
-        (np.abs(found.pose[:, 5]), [abs(b), abs(a), *still]),
+        (pose[:, 0], [-1, 0, *still]),
+        (pose[:, 1], [0, -1, *still]),
+        (pose[:, 2], grown / h),
+        (lens[:, 0], grown),
+        (lens[:, 2], [h / 1500, 0, *still]),
+        (own[:, 0], [1, 0, *still]),
+        (own[:, 2], -grown / h),
+        (own[:, 3], [0, 0, 1, 0, 0, 1]),
+        (np.abs(pose[:, 5]), [abs(b), abs(a), *still]),
         # lift w_x y moves a point by -lift (a, b) / h to first order in the size of the face
-        (found.tilts[:, 0], [0, 0, 0, -a / h / 2, -a / h / 2, -b / h]),
-        (found.tilts[:, 1], [0, 0, a / h, b / h / 2, b / h / 2, 0]),
+        (own[:, 4], [0, 0, 0, -a / h / 2, -a / h / 2, -b / h]),
+        (own[:, 5], [0, 0, a / h, b / h / 2, b / h / 2, 0]),
     ):
         assert motion == pytest.approx(np.array(expected), abs=1e-8)
 

@@ -32,6 +32,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from vlcrender.camera.intrinsics import Pose
 from vlcrender.camera.posed_camera import PosedCamera
@@ -42,7 +43,6 @@ from vlcrender.rendering.expected_image import LedPatch
 from vlcrender.rendering.led_coverage import intersections_with_plane
 from vlcrender.rendering.led_radiance import face_of_led
 from vlcrender.rendering.uncertainty import (
-    INTRINSICS,
     MapLevers,
     Uncertainty,
     intrinsics_displacements_px,
@@ -185,41 +185,31 @@ class FrameSlopes:
         """`hybrid_bound_m2` from the place and linear shape of each LED's image, for any `uncertainty`."""
         index_of = {int(led_id): i for i, led_id in enumerate(leds.ids)}
         indices = np.array(sorted({index_of[patch.led_id] for patch in self.at_pose}))
-        levers = MapLevers(uncertainty, leds, indices)
         place = {int(i): number for number, i in enumerate(indices)}
-        nuisances = len(INTRINSICS) + levers.shared.shape[2]
-        # Unknowns in units of sigmas: lens, datum and scale, luminaires; then the pose in units of its steps.
+        levers = MapLevers(uncertainty, leds, indices)
+        motions = face_motions(self.mounted, self.main, leds, indices)
+        # In units of sigmas: lens, datum and scale, luminaires; then the pose in units of its steps.
+        shared = np.concatenate(
+            [
+                motions.lens * uncertainty.intrinsics,
+                motions.own[:, :, :3] @ levers.shared,
+                motions.pose * np.array(self.steps),
+            ],
+            axis=2,
+        )
+        tilts_of_faces = [uncertainty.led_faces_rad[:, None]] * 2
+        sigmas = np.concatenate([uncertainty.led_positions_m, uncertainty.led_sizes[:, None], *tilts_of_faces], axis=1)
+        own = motions.own * sigmas[indices][:, None, :]
+        nuisances = shared.shape[2] - 6
         rows = [np.eye(nuisances, nuisances + 6)]
         for box in self._boxes():
             factor, of_box = self._box_factor(box, leds, index_of, uncertainty)
-            if not of_box:
-                continue
-            motions = [face_motions(self.mounted, self.main, leds, i) for i in of_box]
-            own = np.zeros((FACE_NUMBERS * len(of_box), OWN * len(of_box)))
-            shared = []
-            for number, (i, motion) in enumerate(zip(of_box, motions, strict=True)):
-                sigmas = [
-                    *uncertainty.led_positions_m[i],
-                    uncertainty.led_sizes[i],
-                    *[uncertainty.led_faces_rad[i]] * 2,
-                ]
-                here = slice(FACE_NUMBERS * number, FACE_NUMBERS * (number + 1))
-                own[here, OWN * number : OWN * (number + 1)] = np.concatenate(
-                    [motion.position, motion.size, motion.tilts], axis=1
-                ) * np.array(sigmas)
-                shared.append(
-                    np.concatenate(
-                        [
-                            motion.lens * uncertainty.intrinsics,
-                            motion.position @ levers.shared[place[i]],
-                            motion.pose * np.array(self.steps),
-                        ],
-                        axis=1,
-                    )
-                )
-            with_own = np.concatenate([factor @ own, factor @ np.concatenate(shared)], axis=1)
-            priors = np.eye(own.shape[1], with_own.shape[1])
-            rows.append(_triangle(np.concatenate([priors, with_own]))[own.shape[1] :, own.shape[1] :])
+            if of_box:
+                places = [place[i] for i in of_box]
+                effects = [block_diag(*own[places]), shared[places].reshape(-1, nuisances + 6)]
+                with_own = factor @ np.concatenate(effects, axis=1)
+                priors = np.eye(OWN * len(of_box), with_own.shape[1])
+                rows.append(_triangle(np.concatenate([priors, with_own]))[len(priors) :, len(priors) :])
         tilts = tilt_covariance_rad2(self.mounted, self.main, tilt_sigmas_deg, uncertainty.mounting_rad)
         free = [0, 1, 2, 5]
         if tilts.any():
@@ -401,9 +391,9 @@ class FrameSlopes:
 
 @dataclass(frozen=True)
 class FaceMotions:
-    """How unknowns move and deform an LED's image, told as motions of its face in its own plane.
+    """How unknowns move and deform the images of k LEDs, told as motions of each face in its own plane.
 
-    Each is (6, unknowns), the FACE_NUMBERS of the linear motion d(x, y) = (t_x, t_y) + E (x, y): t_x, t_y, m; then
+    Each is (k, 6, unknowns), the FACE_NUMBERS of the linear motion d(x, y) = (t_x, t_y) + E (x, y): t_x, t_y, m; then
     E_xx, E_yx, E_xy, E_yy.
     """
 
@@ -411,60 +401,63 @@ class FaceMotions:
     """By the pose of `main`: x, y, z, m; tilt_x, tilt_y, yaw, radians."""
     lens: Array
     """By the unknowns of the lens, in the units of INTRINSICS."""
-    position: Array
-    """By the LED's own x, y, z, m."""
-    size: Array
-    """By the logarithm of its radius or side, (6, 1)."""
-    tilts: Array
-    """By a tilt of its face about x and about y, radians, (6, 2)."""
+    own: Array
+    """By what is the LED's own: x, y, z, m; the logarithm of its radius or side; tilts about x and y, radians."""
 
 
-def face_motions(mounted: Mounted, main: Pose, leds: Leds, i: int) -> FaceMotions:
-    """The motions of one LED's face; those of a disc without its turn in its plane, which no image shows.
+def face_motions(mounted: Mounted, main: Pose, leds: Leds, indices: NDArray[np.int64]) -> FaceMotions:
+    """The motions of the faces of some LEDs; those of a disc without its turn in its plane, which no image shows.
 
     A point of the face whose image moves to another pixel position moves in the face's plane to the point that the
     unmoved camera sees there. The linear motion is that of the centre and of four points of the rim.
     """
     posed = mounted.posed(main)
-    face = face_of_led(leds, i)
-    if isinstance(face.shape, Disc):
-        half_x = half_y = face.shape.radius_m
-    else:
-        half_x, half_y = (side / 2 for side in face.shape.size_m)
-    plane = np.array([[0.0, 0.0], [half_x, 0.0], [-half_x, 0.0], [0.0, half_y], [0.0, -half_y]])
-    points = np.column_stack([plane, np.zeros(5)]) + face.center_m
+    faces = [face_of_led(leds, int(i)) for i in indices]
+    discs = np.array([isinstance(face.shape, Disc) for face in faces])
+    halves = np.array(
+        [
+            [face.shape.radius_m] * 2 if isinstance(face.shape, Disc) else [side / 2 for side in face.shape.size_m]
+            for face in faces
+        ]
+    )
+    centers_m = np.stack([face.center_m for face in faces])
+    plane = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]]) * halves[:, None, :]  # (k, 5, 2)
+    points = np.concatenate([plane, np.zeros((len(faces), 5, 1))], axis=2) + centers_m[:, None, :]
     pixels = posed.project(points)
 
     def motion(plus_px: Array, minus_px: Array, step: float) -> Array:
+        """(k, 6), from the pixel positions (k, 5, 2) of the points at a step to either side."""
         (x1, y1), (x0, y0) = (
-            intersections_with_plane(posed, face.center_m, px[:, 0], px[:, 1]) for px in (plus_px, minus_px)
+            intersections_with_plane(posed, centers_m.T[:, :, None], px[..., 0], px[..., 1])
+            for px in (plus_px, minus_px)
         )
-        d = np.column_stack([x1 - x0, y1 - y0]) / (2 * step)
-        by_x, by_y = (d[1] - d[2]) / (2 * half_x), (d[3] - d[4]) / (2 * half_y)
-        if isinstance(face.shape, Disc):
-            by_x[1] = by_y[0] = (by_x[1] + by_y[0]) / 2
-        return np.concatenate([d[0], by_x, by_y])
-
-    def by_points(change: Array) -> Array:
-        step = FACE_STEP
-        return motion(posed.project(points + step * change), posed.project(points - step * change), step)
+        d = np.stack([x1 - x0, y1 - y0], axis=-1) / (2 * step)
+        by_x, by_y = (d[:, 1] - d[:, 2]) / (2 * halves[:, :1]), (d[:, 3] - d[:, 4]) / (2 * halves[:, 1:])
+        shear = (by_x[:, 1] + by_y[:, 0]) / 2
+        by_x[:, 1] = np.where(discs, shear, by_x[:, 1])
+        by_y[:, 0] = np.where(discs, shear, by_y[:, 0])
+        return np.concatenate([d[:, 0], by_x, by_y], axis=1)
 
     def by_pose(unknown: int) -> Array:
         plus, minus = (mounted.posed(moved(main, unknown, sign * FACE_STEP)).project(points) for sign in (1, -1))
         return motion(plus, minus, FACE_STEP)
 
-    displaced = np.moveaxis(intrinsics_displacements_px(mounted.camera, pixels[:, 0], pixels[:, 1]), 1, 2)
-    scale = FACE_STEP * mounted.camera.focal_px / np.maximum(np.abs(displaced).max(axis=(1, 2)), 1.0)
-    lens = [motion(pixels + s * d, pixels - s * d, s) for s, d in zip(scale, displaced, strict=True)]
-    zero = np.zeros(5)
-    lifts = [np.column_stack([zero, zero, lift]) for lift in (plane[:, 1], -plane[:, 0])]
-    bare = float(leds.diffusers[i] is None)
+    def by_lens(displaced: Array) -> Array:
+        step = FACE_STEP * mounted.camera.focal_px / max(float(np.abs(displaced).max()), 1.0)
+        return motion(pixels + step * displaced, pixels - step * displaced, step)
+
+    def by_points(change: Array) -> Array:
+        return motion(posed.project(points + FACE_STEP * change), posed.project(points - FACE_STEP * change), FACE_STEP)
+
+    displacements = np.moveaxis(intrinsics_displacements_px(mounted.camera, pixels[..., 0], pixels[..., 1]), 1, -1)
+    lifts = [np.stack([0 * lift, 0 * lift, lift], axis=-1) for lift in (plane[..., 1], -plane[..., 0])]
+    bare = np.array([leds.diffusers[int(i)] is None for i in indices], dtype=np.float64)[:, None]
+    growth = np.tile([0.0, 0.0, 1.0, 0.0, 0.0, 1.0], (len(faces), 1))
+    shifts = [by_points(np.broadcast_to(axis, points.shape)) for axis in np.eye(3)]
     return FaceMotions(
-        pose=np.stack([by_pose(unknown) for unknown in range(6)], axis=1),
-        lens=np.stack(lens, axis=1),
-        position=np.stack([by_points(np.tile(axis, (5, 1))) for axis in np.eye(3)], axis=1),
-        size=bare * np.array([[0.0, 0.0, 1.0, 0.0, 0.0, 1.0]]).T,
-        tilts=bare * np.stack([by_points(lift) for lift in lifts], axis=1),
+        pose=np.stack([by_pose(unknown) for unknown in range(6)], axis=2),
+        lens=np.stack([by_lens(displaced) for displaced in displacements], axis=2),
+        own=np.stack([*shifts, bare * growth, *(bare * by_points(lift) for lift in lifts)], axis=2),
     )
 
 
