@@ -10,6 +10,7 @@ by the kernel of its depth (`led_blur`), and scatters a share of all light into 
 
 import os
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -43,6 +44,29 @@ LedImages = Mapping[int, LedImage]
 """Images of the LEDs at one pose, by the LED's index."""
 
 
+@dataclass(frozen=True)
+class LedView:
+    """The LEDs as a camera sees them at one or more poses, and the pixels that each lights, by its index."""
+
+    posed: PosedCamera
+    poses: tuple[PosedCamera, ...]
+    blurs: LedBlur
+    images: tuple[LedImages, ...]
+    patch_rois: Mapping[int, Roi]
+
+
+def read_out(views: Sequence[LedView], regions: LedRegions | None) -> tuple[Roi, ...]:
+    """The regions that are read out of a sensor: all of it, or regions around the LEDs of one or more views."""
+    camera = views[0].posed.camera
+    if regions is None:
+        return (Roi.of_sensor(camera),)
+    rois = dict(views[0].patch_rois)
+    for view in views[1:]:
+        for i, roi in view.patch_rois.items():
+            rois[i] = rois[i].union(roi) if i in rois else roi
+    return led_regions(rois.values(), camera, regions)
+
+
 class Renderer:
     """Renders expected images of one scene on one detector."""
 
@@ -66,19 +90,33 @@ class Renderer:
         centres of the LEDs are given for `posed`. Raises InputError where the camera is not inside the room, or where
         the regions hold more than MAX_SENSORS times the sensor's pixels, and for a lens with glare with overscan.
         """
+        view = self.view(posed, regions, during)
+        return self.image_of(view, read_out((view,), regions))
+
+    def view(
+        self, posed: PosedCamera, regions: LedRegions | None = None, during: Sequence[Pose] | None = None
+    ) -> "LedView":
+        """The LEDs of a view before their light is computed, and the pixels that they light.
+
+        Arguments and exceptions of `expected_image`.
+        """
         if posed.camera.glare is not None and regions is not None and regions.overscan:
             raise InputError(OVERSCAN_WITH_GLARE)
+        if posed.camera.lateral_colour_um is not None:
+            raise InputError("camera.lateral_colour_um: needs a sensor with a mosaic; remove it, or choose a mosaic")
         poses = [posed] if during is None else [posed.at(pose) for pose in during]
         for each in poses:
             check_inside(self.scene, each.pose)
-        camera, leds = posed.camera, self.scene.leds
-        blurs = led_blur(leds, posed)
-        images = [led_images(leds, self._occlusion, each, regions, blurs) for each in poses]
-        patch_rois = _patch_rois(camera, images, blurs, regions)
-        rois = (Roi.of_sensor(camera),) if regions is None else led_regions(patch_rois.values(), camera, regions)
-        _check_size(rois, camera)
-        backgrounds, reflections = self._rooms(poses, rois, images, blurs)
-        patches = self._patches(posed, images, patch_rois, blurs)
+        blurs = led_blur(self.scene.leds, posed)
+        images = [led_images(self.scene.leds, self._occlusion, each, regions, blurs) for each in poses]
+        return LedView(posed, tuple(poses), blurs, tuple(images), _patch_rois(posed.camera, images, blurs, regions))
+
+    def image_of(self, view: "LedView", rois: Sequence[Roi]) -> ExpectedImage:
+        """The expected image of a view, in the regions of `read_out`."""
+        posed = view.posed
+        _check_size(rois, posed.camera)
+        backgrounds, reflections = self._rooms(view.poses, rois, view.images, view.blurs)
+        patches = self._patches(posed, view.images, view.patch_rois, view.blurs)
         halo = self._halo(posed, patches)
         return ExpectedImage(
             tuple(
