@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.roi import LedRegions, Roi
+from vlcrender.rendering.crosstalk import REACH_PX, shared_patch, with_crosstalk
 from vlcrender.rendering.expected_image import ExpectedImage, ExpectedRegion, Halo, Image, LedPatch
 from vlcrender.rendering.renderer import Renderer, read_out
 from vlcrender.scene.loader import Scene
@@ -59,11 +60,14 @@ class MosaicHalo:
 class MosaicRenderer:
     """Renders expected images through a mosaic: a whole image under each of COLOURS, of which each pixel takes one.
 
-    The lens's blur therefore comes before the filters. `of_colours` has one renderer for each of COLOURS.
+    The lens's blur therefore comes before the filters, crosstalk after. `of_colours` has one renderer without crosstalk
+    for each of COLOURS.
     """
 
     of_colours: tuple[Renderer, ...]
     mosaic: str
+    crosstalk: float = 0.0
+    """Share of a pixel's electrons that its neighbours collect."""
 
     @property
     def scene(self) -> Scene:
@@ -78,20 +82,24 @@ class MosaicRenderer:
             renderer.view(of_colour, regions, during)
             for renderer, of_colour in zip(self.of_colours, self._of_colours(posed), strict=True)
         ]
-        rois = read_out(views, regions)
+        rois = read_out(views, regions, REACH_PX if self.crosstalk else 0)
         images = [renderer.image_of(view, rois) for renderer, view in zip(self.of_colours, views, strict=True)]
-        return ExpectedImage(tuple(map(self._region, zip(*(image.parts for image in images), strict=True))))
+        image = ExpectedImage(tuple(map(self._region, zip(*(image.parts for image in images), strict=True))))
+        return with_crosstalk(image, self.crosstalk, Roi.of_sensor(posed.camera)) if self.crosstalk else image
 
     def led_patches(
         self, posed: PosedCamera, regions: LedRegions | None = None, blurred_at: Pose | None = None
     ) -> tuple[LedPatch, ...]:
         """As `Renderer.led_patches`."""
-        return self._patches(
+        patches = self._patches(
             [
                 renderer.led_patches(of_colour, regions, blurred_at)
                 for renderer, of_colour in zip(self.of_colours, self._of_colours(posed), strict=True)
             ]
         )
+        if not self.crosstalk:
+            return patches
+        return tuple(shared_patch(patch, self.crosstalk, Roi.of_sensor(posed.camera)) for patch in patches)
 
     def _of_colours(self, posed: PosedCamera) -> tuple[PosedCamera, ...]:
         """The camera as light of each colour sees it (lateral colour)."""

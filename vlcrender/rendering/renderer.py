@@ -24,6 +24,7 @@ from vlcrender.core.backend import dr
 from vlcrender.errors import InputError
 from vlcrender.light.lightmap import Lightmap, bake
 from vlcrender.rendering.background import Background, BackgroundRegion
+from vlcrender.rendering.crosstalk import REACH_PX, shared_patch, with_crosstalk
 from vlcrender.rendering.electron_rates import ElectronRates
 from vlcrender.rendering.expected_image import ExpectedImage, ExpectedRegion, Image, LedPatch, SpecularReflection
 from vlcrender.rendering.halo import GlareHalo, glare_halo, halo_of_sources
@@ -55,8 +56,11 @@ class LedView:
     patch_rois: Mapping[int, Roi]
 
 
-def read_out(views: Sequence[LedView], regions: LedRegions | None) -> tuple[Roi, ...]:
-    """The regions that are read out of a sensor: all of it, or regions around the LEDs of one or more views."""
+def read_out(views: Sequence[LedView], regions: LedRegions | None, reach_px: int = 0) -> tuple[Roi, ...]:
+    """The regions that are read out of a sensor: all of it, or regions around the LEDs of one or more views.
+
+    reach_px: pixels around its image that an LED lights by crosstalk.
+    """
     camera = views[0].posed.camera
     if regions is None:
         return (Roi.of_sensor(camera),)
@@ -64,17 +68,29 @@ def read_out(views: Sequence[LedView], regions: LedRegions | None) -> tuple[Roi,
     for view in views[1:]:
         for i, roi in view.patch_rois.items():
             rois[i] = rois[i].union(roi) if i in rois else roi
+    if reach_px:
+        sensor = Roi.of_sensor(camera)
+        lit = {i: roi.padded(reach_px) for i, roi in rois.items()}
+        rois = {i: lit[i].intersection(sensor) if sensor.contains(roi) else lit[i] for i, roi in rois.items()}
     return led_regions(rois.values(), camera, regions)
 
 
 class Renderer:
     """Renders expected images of one scene on one detector."""
 
-    def __init__(self, scene: Scene, light: Lightmap | None = None, detector: Detector | None = None) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        light: Lightmap | None = None,
+        detector: Detector | None = None,
+        crosstalk: float = 0.0,
+    ) -> None:
         """Prepare a scene.
 
-        light: baked light of the scene, made or taken from the cache where not given; detector: silicon by default.
+        light: baked light of the scene, made or taken from the cache where not given; detector: silicon by default;
+        crosstalk: share of a pixel's electrons that its neighbours collect.
         """
+        self._crosstalk = crosstalk
         self.scene = scene
         self.detector = detector or Silicon()
         self._light = light or bake(scene)
@@ -91,7 +107,9 @@ class Renderer:
         the regions hold more than MAX_SENSORS times the sensor's pixels, and for a lens with glare with overscan.
         """
         view = self.view(posed, regions, during)
-        return self.image_of(view, read_out((view,), regions))
+        rois = read_out((view,), regions, REACH_PX if self._crosstalk else 0)
+        image = self.image_of(view, rois)
+        return with_crosstalk(image, self._crosstalk, Roi.of_sensor(posed.camera)) if self._crosstalk else image
 
     def view(
         self, posed: PosedCamera, regions: LedRegions | None = None, during: Sequence[Pose] | None = None
@@ -112,7 +130,7 @@ class Renderer:
         return LedView(posed, tuple(poses), blurs, tuple(images), _patch_rois(posed.camera, images, blurs, regions))
 
     def image_of(self, view: "LedView", rois: Sequence[Roi]) -> ExpectedImage:
-        """The expected image of a view, in the regions of `read_out`."""
+        """The expected image of a view before crosstalk, in the regions of `read_out`."""
         posed = view.posed
         _check_size(rois, posed.camera)
         backgrounds, reflections = self._rooms(view.poses, rois, view.images, view.blurs)
@@ -143,7 +161,10 @@ class Renderer:
         blurs = led_blur(leds, posed if blurred_at is None else posed.at(blurred_at))
         images = [led_images(leds, self._occlusion, posed, regions, blurs)]
         patch_rois = _patch_rois(posed.camera, images, blurs, regions)
-        return self._patches(posed, images, patch_rois, blurs, np.float64)
+        patches = self._patches(posed, images, patch_rois, blurs, np.float64)
+        if not self._crosstalk:
+            return patches
+        return tuple(shared_patch(patch, self._crosstalk, Roi.of_sensor(posed.camera)) for patch in patches)
 
     def halo_of(self, camera: Camera) -> Callable[[Sequence[LedPatch], Roi], Array] | None:
         """The function from patches of `led_patches` to their halo in a region of the sensor, electrons a second.
