@@ -171,7 +171,7 @@ class Sensor(Settings):
     def acting(self) -> dict[str, Any]:
         """Sensor parameters in effect at the ISO, temperature and noise mode of the frames, as in dataset.json.
 
-        Dark current and standard deviations are 0 unless `noise` is "full".
+        Dark current, standard deviations and hot pixels are 0 unless `noise` is "full".
         """
         full = self.noise == "full"
         return {
@@ -180,6 +180,9 @@ class Sensor(Settings):
             "full_well_e": self.full_well_e,
             "black_level_dn": self.black_level_dn,
             "noise": self.noise,
+            "crosstalk": self.crosstalk,
+            "hot_pixel_share": self.hot_pixel_share if full else 0.0,
+            "hot_pixel_e_s": self.hot_electrons(1.0) if full and self.hot_pixel_share > 0 else 0.0,
             "dark_current_e_s": self.dark_electrons(1.0) if full else 0.0,
             **{key: getattr(self, key) if full else 0.0 for key in SPREADS},
             "mosaic": self.mosaic,
