@@ -150,7 +150,7 @@ def _bound_m2(
         float(np.median(np.linalg.norm(renderer.scene.leds.centers_m - at.position_m, axis=1))),
         recipe.accelerometer.tilt_errors_deg(main),
         recipe.regions is not None and recipe.regions.overscan,
-        renderer.halo_of(mounted.camera),
+        halo_of=renderer.halo_of(mounted.camera),
     )
     return None if bound is None else flat9(bound)
 
