@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from vlcrender.camera.glare import Glare
 from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.rig import mounted_cameras
@@ -13,6 +14,8 @@ from vlcrender.dataset.motion import Motion, poses_during
 from vlcrender.rendering.renderer import Renderer
 from vlcrender.scene.loader import Scene, build_scene, load_scene
 from vlcrender.scene.schema import SceneSettings
+from vlcrender.sensor.sensor import Sensor
+from vlcrender.sensor.signal_chain import expose
 
 ROOT = Path(__file__).parent.parent
 OUT = ROOT / "docs/pictures"
@@ -52,6 +55,61 @@ def office(folder: Path = ROOT / "scenes", **changes: object) -> Scene:
     """The office with some of its tables replaced."""
     tree = {**read_toml(ROOT / "scenes/office.toml"), **changes}
     return build_scene(check(tree, SceneSettings, "picture"), "picture", folder)
+
+
+def fine_effects() -> None:
+    """Write the picture of effects that are small: crops around LEDs, each beside the same view without the effect."""
+    panels = read_toml(ROOT / "scenes/office.toml")["panels"]
+    profile = {"face_gradient": [0.3, 0.0], "face_falloff": 0.5}
+    plain = Renderer(office())
+    uneven = Renderer(office(panels=[{**panels[0], "leds": {**panels[0]["leds"], **profile}}]))
+    camera = {"width_px": 1600, "height_px": 1200, "pixel_pitch_um": 3.0}
+    corner = np.s_[900:1200, 1200:1600]
+    blurred, fringed = {"off_axis_sigma_um": 15.0}, {"lateral_colour_um": (24.0, -24.0)}
+    glaring = {"glare": Glare(share=0.05)}
+    coarse = {"width_px": 240, "height_px": 180, "pixel_pitch_um": 20.0}
+    mixing = Renderer(plain.scene, crosstalk=0.2)
+
+    def view(renderer: Renderer, camera: Camera) -> np.ndarray:
+        return renderer.expected_image(PosedCamera(camera, TILTED)).expected_electrons(1.0)
+
+    sharp = view(plain, Camera(**camera))
+    middle = _busiest(sharp)
+    small = view(plain, Camera(**coarse))
+    small_middle = _busiest(small, 36, 48)
+    colours = np.stack([view(plain, Camera(**camera, **fringed).for_colour(c))[corner] for c in range(3)], axis=-1)
+    sensor = Sensor(noise="full", read_noise_e=2.0, hot_pixel_share=0.0, hot_pixel_e_s=2e4)
+    dark = np.full((60, 80), 10.0, dtype=np.float32)
+    hot = sensor.model_copy(update={"hot_pixel_share": 5e-3})
+    pairs = {
+        "face: gradient 0.3, fall-off 0.5": (sharp[middle], view(uneven, Camera(**camera))[middle], 1.4),
+        "veiling glare, 5 %; white at 1.5 % of the LEDs": (sharp, view(plain, Camera(**camera, **glaring)), 0.015),
+        "off-axis blur, 15 um at the corner": (sharp[corner], view(plain, Camera(**camera, **blurred))[corner], 1.0),
+        "lateral colour, +-24 um at the corner": (np.stack([sharp[corner]] * 3, axis=-1), colours, 1.0),
+        "crosstalk, 20 %": (small[small_middle], view(mixing, Camera(**coarse))[small_middle], 1.0),
+        "0.5 % hot pixels, 20 ms": (
+            expose(sensor, dark, "picture", exposure_s=0.02),
+            expose(hot, dark, "picture", exposure_s=0.02),
+            1.0,
+        ),
+    }
+    figure = Figure(figsize=(15, 7.4), layout="constrained")
+    for row, (title, (without, with_it, share)) in enumerate(pairs.items()):
+        for column, image in enumerate((without, with_it)):
+            axes = figure.add_subplot(3, 4, 2 * row + column + 1)
+            white = 100.0 if "hot" in title else share * float(without.max())
+            axes.imshow(np.clip(image / white, 0, 1) ** (1 / 2.2), cmap="gray", vmin=0, vmax=1)
+            axes.set_title(title if column else "without", fontsize=10)
+            axes.set_axis_off()
+    figure.savefig(OUT / "fine_effects.png", dpi=90)
+
+
+def _busiest(image: np.ndarray, rows: int = 150, columns: int = 200) -> tuple[slice, slice]:
+    """A crop of this size with the most light."""
+    sums = image[: image.shape[0] // rows * rows, : image.shape[1] // columns * columns]
+    sums = sums.reshape(image.shape[0] // rows, rows, -1, columns).sum(axis=(1, 3))
+    row, column = np.unravel_index(sums.argmax(), sums.shape)
+    return np.s_[row * rows : (row + 1) * rows, column * columns : (column + 1) * columns]
 
 
 def main() -> None:
@@ -119,3 +177,4 @@ def main() -> None:
 
 if __name__ == "__main__":
     main()
+    fine_effects()

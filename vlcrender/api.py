@@ -52,7 +52,7 @@ class ExpectedFrame(ExpectedImage):
     camera: Camera
     pose: Pose
     sensor: Sensor
-    """Its quantum efficiency and mosaic are in the image; nothing else of it is."""
+    """Its quantum efficiency, mosaic and crosstalk are in the image; nothing else of it is."""
     regions: LedRegions | None = None
 
     @property
@@ -180,10 +180,10 @@ def render(
 ) -> ExpectedFrame:
     """Render the expected image: mean photoelectrons a second of every pixel, without noise, and the truth.
 
-    Of the `sensor`, by default `Sensor()`, quantum efficiency and mosaic count. With `regions` the regions around the
-    LEDs are rendered alone. The scene's light is computed once and kept in the cache folder; renderers are kept for
-    each scene object and spectral response. Raises InputError if the camera is not inside the room, or if overscan is
-    asked of a camera with distortion.
+    Of the `sensor`, by default `Sensor()`, quantum efficiency, mosaic and crosstalk count. With `regions` the regions
+    around the LEDs are rendered alone. The scene's light is computed once and kept in the cache folder; renderers are
+    kept for each scene object and spectral response. Raises InputError if the camera is not inside the room, or if
+    overscan is asked of a camera with distortion.
     """
     sensor = sensor or Sensor()
     if regions is not None and regions.overscan and camera.distortion is not None:
@@ -205,8 +205,8 @@ def expose(
 
     Noise depends on `seed`, `frame` and the pixel: the result has the bits of frame number `frame` of a dataset with
     this seed, one camera and no repeats. `accelerometer` is `TiltError()` by default, with 0.1 deg of error. If the
-    quantum efficiency or the mosaic of `sensor` differs from those that `mean` was rendered with, the view is rendered
-    again with the sensor's. Raises InputError for an exposure time or a seed out of range.
+    quantum efficiency, mosaic or crosstalk of `sensor` differs from those that `mean` was rendered with, the view is
+    rendered again with the sensor's. Raises InputError for an exposure time or a seed out of range.
     """
     from vlcrender.core.random_keys import random_key, stream
     from vlcrender.dataset.downlink import decoded_spots
@@ -320,7 +320,7 @@ def _plan(
 
 
 def _spectral_response(sensor: Sensor) -> str:
-    return sensor.model_dump_json(include={"quantum_efficiency", "mosaic"})
+    return sensor.model_dump_json(include={"quantum_efficiency", "mosaic", "crosstalk"})
 
 
 def renderer_of(plan: "Plan") -> "Renderer | MosaicRenderer":
@@ -345,8 +345,11 @@ def _renderer(scene: Scene, sensor: Sensor) -> "Renderer | MosaicRenderer":
         renderer = _renderers.pop(key, None)
         if renderer is None:
             light = bake(scene)
-            of_colours = tuple(Renderer(scene, light, detector) for detector in detectors(sensor))
-            renderer = of_colours[0] if sensor.mosaic == "none" else MosaicRenderer(of_colours, sensor.mosaic)
+            if sensor.mosaic == "none":
+                renderer = Renderer(scene, light, detectors(sensor)[0], sensor.crosstalk)
+            else:
+                of_colours = tuple(Renderer(scene, light, detector) for detector in detectors(sensor))
+                renderer = MosaicRenderer(of_colours, sensor.mosaic, sensor.crosstalk)
         _renderers[key] = renderer
         while len(_renderers) > MAX_RENDERERS:
             del _renderers[next(iter(_renderers))]

@@ -19,9 +19,12 @@ from vlcrender.config.toml_model import Settings
 
 Pixels = Annotated[int, Field(ge=8, le=20000)]
 Positive = Annotated[float, Field(gt=0, le=1e6)]
+Shift = Annotated[float, Field(ge=-1000, le=1000)]
 
 SENSOR_MARGIN = 1 / 20
 """Share of the sensor's width and height beyond its borders out to which a lens has to be valid."""
+MAX_LATERAL_COLOUR = 0.02
+"""Largest lateral colour, as a share of the distance from the axis; the lens has to be valid that far too."""
 BORDER_POINTS = 65
 """Pixel positions along each side of a border whose field of view is wanted."""
 
@@ -71,6 +74,13 @@ class Camera(Settings):
     """Wavelength of the Airy pattern, nm."""
     psf_kernel: tuple[tuple[Annotated[float, Field(ge=0, le=1)], ...], ...] | None = None
     """Measured point spread function: an odd number of rows, as many columns, sum 1; with psf = "measured" only."""
+    off_axis_sigma_um: Annotated[float, Field(ge=0, le=1000)] = 0.0
+    """Off-axis blur: standard deviation of a normal blur at the sensor's corner farthest from the axis, um. It grows
+    with the square of the distance from the axis."""
+    lateral_colour_um: tuple[Shift, Shift] | None = None
+    """Lateral colour: distance by which the red and the blue image lie outside the green one at the sensor's corner
+    farthest from the axis, um, negative for inside; in proportion to the distance from the axis. For sensors with a
+    mosaic."""
     vignetting_deg: Annotated[float, Field(gt=0, lt=90)] | None = None
     """Field angle at which a second stop hides the whole pupil, deg; no mechanical vignetting where not given."""
     glare: Glare | None = None
@@ -110,6 +120,17 @@ class Camera(Settings):
         return self
 
     @model_validator(mode="after")
+    def _lateral_colour_is_small(self) -> Self:
+        if self.lateral_colour_um is not None:
+            limit_um = MAX_LATERAL_COLOUR * self.corner_radius_px * self.pixel_pitch_um
+            if max(map(abs, self.lateral_colour_um)) > limit_um:
+                raise ValueError(
+                    f"lateral_colour_um = {list(self.lateral_colour_um)}: at most {limit_um:.4g} to either side, "
+                    f"{MAX_LATERAL_COLOUR:.0%} of the corner's distance from the axis"
+                )
+        return self
+
+    @model_validator(mode="after")
     def _glare_is_wider_than_a_blur(self) -> Self:
         if self.glare is not None:
             lowest_um = max(6, max(self.width_px, self.height_px) / 100) * self.pixel_pitch_um
@@ -140,6 +161,29 @@ class Camera(Settings):
     def center_px(self) -> tuple[float, float]:
         """The principal point (u, v)."""
         return self.principal_point_px or (self.width_px / 2, self.height_px / 2)
+
+    @property
+    def corner_radius_px(self) -> float:
+        """Distance of the sensor's corner farthest from the principal point."""
+        u, v = self.center_px
+        return float(np.hypot(max(abs(u), abs(self.width_px - u)), max(abs(v), abs(self.height_px - v))))
+
+    def for_colour(self, colour: int) -> "Camera":
+        """The camera as light of one colour sees it: 0 red, 1 green, 2 blue.
+
+        An image enlarged by m about the axis is the same image on pixels smaller by m: each gets 1 / m^2 of the light.
+        """
+        if self.lateral_colour_um is None:
+            return self
+        shift_um = (self.lateral_colour_um[0], 0.0, self.lateral_colour_um[1])[colour]
+        enlarged = 1 + shift_um / (self.corner_radius_px * self.pixel_pitch_um)
+        return self.model_copy(
+            update={
+                "lateral_colour_um": None,
+                "pixel_pitch_um": self.pixel_pitch_um / enlarged,
+                "skew_px": self.skew_px * enlarged,
+            }
+        )
 
     @property
     def image_distance_mm(self) -> float:

@@ -1,4 +1,4 @@
-"""Point spread function of the lens: defocus, diffraction, and measured kernels, and images blurred by them.
+"""Point spread function of the lens: defocus, diffraction, off-axis blur, measured kernels, and images blurred by them.
 
 Sources: thin lens and similar triangles; G. B. Airy, On the diffraction of an object-glass with circular aperture,
 Trans. Camb. Phil. Soc. 5 (1835) 283; Born & Wolf, Principles of Optics, 7th ed., 8.5.2.
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
-from scipy.special import j1
+from scipy.special import j1, ndtr
 
 from vlcrender.camera.intrinsics import Camera
 from vlcrender.core.planar_shapes import circle_polygon_area
@@ -25,6 +25,10 @@ MAX_AIRY_PX = 150
 PARTS_FOR_DISC = 12.0
 PARTS_FOR_AIRY = 8.0
 """Parts across a pixel that a disc of 1 px and an Airy pattern of lambda N = 1 px need."""
+DISC_OF_GAUSSIAN = 4 / np.pi * np.sqrt(2 * np.pi)
+"""Diameter of the disc whose line spread function is as high as a normal one's, in standard deviations."""
+MAX_DEVIATIONS = 4.5
+"""Radius of the kernel of a normal blur, in standard deviations: exp(-4.5^2 / 2) = 4e-5 of the light is beyond."""
 MAX_PARTS = 64
 """Most parts across a pixel. A disc narrower than a part is ignored: it moves 0.2 % of an edge pixel's light."""
 
@@ -44,10 +48,26 @@ def defocus_diameter_px(camera: Camera, depth_m: Any) -> Any:
     return camera.aperture_mm * 1000 / camera.pixel_pitch_um * camera.image_distance_mm / 1000 * np.abs(focus - depth)
 
 
-def blur_kernel(camera: Camera, depth_m: float) -> Array | None:
+def off_axis_sigma_px(camera: Camera, image_px: Array) -> Array:
+    """Standard deviation in pixels of the off-axis blur at image positions (n, 2), (n,).
+
+    It grows with the square of the distance from the axis, as astigmatism and field curvature of the third order do
+    (Born & Wolf, Principles of Optics, 7th ed., 5.3), to `off_axis_sigma_um` at the sensor's corner farthest from the
+    axis, and stays at that beyond it. Where an LED's centre is not imaged (NaN), as at the corner.
+    """
+    corner_px = camera.corner_radius_px
+    share = np.hypot(*(image_px - np.array(camera.center_px)).T) / corner_px
+    sigma: Array = (
+        camera.off_axis_sigma_um / camera.pixel_pitch_um * np.minimum(np.nan_to_num(share, nan=1.0), 1.0) ** 2
+    )
+    return sigma
+
+
+def blur_kernel(camera: Camera, depth_m: float, sigma_px: float = 0.0) -> Array | None:
     """Blur kernel of a point of light at this depth, (m, m) with m odd, sum 1; None where the kernel is one pixel.
 
-    The disc of `defocus_diameter_px` averaged over each pixel, exactly, convolved with the `psf`.
+    The disc of `defocus_diameter_px` averaged over each pixel, exactly, convolved with the `psf`, and with a normal
+    blur of `sigma_px` (`off_axis_sigma_px`).
 
     The kernel is for images whose pixels hold averages over their areas already. It puts the light of each such pixel
     at the pixel's centre, which widens the image by about 1/12 px^2 too much, as if the pixel's square were counted
@@ -55,7 +75,7 @@ def blur_kernel(camera: Camera, depth_m: float) -> Array | None:
     4 px, 0.8 % for 8 px, 0.1 % for 35 px: less than 0.2 / diameter^1.5 (tested). This is enough for the room behind
     the LEDs; LEDs, whose edges are high, have `split_kernel` where the blur is narrow.
     """
-    kernel = _kernel(camera, float(defocus_diameter_px(camera, depth_m)), 1)
+    kernel = _kernel(camera, float(defocus_diameter_px(camera, depth_m)), sigma_px, 1)
     if camera.psf_kernel is not None:
         kernel = signal.convolve(kernel, np.array(camera.psf_kernel), method="direct")
     kernel = kernel / kernel.sum()
@@ -83,33 +103,34 @@ class SplitKernel:
         return mean
 
 
-def split_for(camera: Camera, depth_m: float) -> int:
+def split_for(camera: Camera, depth_m: float, sigma_px: float = 0.0) -> int:
     """Number of parts across an edge pixel that the blur at this depth needs, a power of 2; 1 means no split.
 
     With the light of parts of 1 / n px at their centres, the error of a pixel at a straight edge of step 1 is at most
     D / (12 n^2), where D is the greatest change of the blurred image of a line from one pixel to the next: 4 / (pi d)
-    for discs of a diameter d below 1 px, about d^-1.5 for wide ones. With these numbers of parts the square of the
+    for discs of a diameter d below 1 px, about d^-1.5 for wide ones; a normal blur counts as the disc of
+    DISC_OF_GAUSSIAN. With these numbers of parts the square of the
     error is below 5 % of the shot noise's variance in every pixel along an edge of 4000 e beside a background of 24 e,
     which is the ceiling beside an LED of the quickstart (tested).
     """
     disc_px = float(defocus_diameter_px(camera, depth_m))
-    needed = PARTS_FOR_DISC / disc_px**0.5 if disc_px > 1 / MAX_PARTS else 1.0
+    discs_px = (disc_px, DISC_OF_GAUSSIAN * sigma_px)
+    needed = [PARTS_FOR_DISC / diameter**0.5 for diameter in discs_px if diameter > 1 / MAX_PARTS]
     if camera.psf == "diffraction":
-        airy = PARTS_FOR_AIRY / _airy_scale_px(camera) ** 0.9
-        # light blurred twice is as smooth as the smoother of the two blurs makes it
-        needed = min(needed, airy) if disc_px > 1 / MAX_PARTS else airy
-    return min(1 << max(0, int(np.ceil(np.log2(needed)))), MAX_PARTS)
+        needed.append(PARTS_FOR_AIRY / _airy_scale_px(camera) ** 0.9)
+    # light blurred twice is as smooth as the smoother of the two blurs makes it
+    return min(1 << max(0, int(np.ceil(np.log2(min(needed, default=1.0))))), MAX_PARTS)
 
 
-def split_kernel(camera: Camera, depth_m: float) -> SplitKernel | None:
+def split_kernel(camera: Camera, depth_m: float, sigma_px: float = 0.0) -> SplitKernel | None:
     """`blur_kernel` of the parts of pixels split by `split_for`, averaged over whole pixels; None without a split.
 
     A measured `psf_kernel` is known on whole pixels and is applied last.
     """
-    n = split_for(camera, depth_m)
+    n = split_for(camera, depth_m, sigma_px)
     if n == 1:
         return None
-    fine = _kernel(camera, float(defocus_diameter_px(camera, depth_m)), n)
+    fine = _kernel(camera, float(defocus_diameter_px(camera, depth_m)), sigma_px, n)
     # Light of a point in each pixel, for points in steps of a part: sums of n x n elements of the fine kernel.
     radius = -(-(fine.shape[0] // 2) // n)
     padded = np.pad(fine / fine.sum(), (radius + 1) * n - 1 - fine.shape[0] // 2)
@@ -123,11 +144,25 @@ def split_kernel(camera: Camera, depth_m: float) -> SplitKernel | None:
     return SplitKernel(parts / parts.sum(axis=(2, 3), keepdims=True))
 
 
-def _kernel(camera: Camera, disc_px: float, n: int) -> Array:
-    """Disc and Airy pattern on pixels split n x n."""
-    if camera.psf == "diffraction":
-        return _blurred_airy(_airy_scale_px(camera), disc_px, n)
-    return _disc(disc_px * n)
+def _kernel(camera: Camera, disc_px: float, sigma_px: float, n: int) -> Array:
+    """Disc, Airy pattern and normal blur on pixels split n x n."""
+    kernel = _blurred_airy(_airy_scale_px(camera), disc_px, n) if camera.psf == "diffraction" else _disc(disc_px * n)
+    line = _normal_line(sigma_px * n)
+    if line.size == 1:
+        return kernel
+    blurred: Array = np.maximum(signal.oaconvolve(kernel, np.outer(line, line), mode="full"), 0.0)
+    return blurred
+
+
+def _normal_line(sigma: float) -> Array:
+    """Share of a normal distribution in each pixel along a line; it is centred on the middle pixel."""
+    radius = max(0, int(np.ceil(MAX_DEVIATIONS * sigma - 0.5)))
+    if radius == 0:
+        return np.ones(1)
+    edges = (np.arange(2 * radius + 2) - radius - 0.5) / sigma
+    shares = np.diff(ndtr(edges))
+    line: Array = shares / shares.sum()
+    return line
 
 
 def _airy_scale_px(camera: Camera) -> float:

@@ -240,8 +240,8 @@ def spot_errors_at(
         ],
         float(np.median(np.linalg.norm(scene.leds.centers_m - at.position_m, axis=1))),
         recipe.regions is not None and recipe.regions.overscan,
-        renderer.halo_of(mounted.camera),
-        6 if bound else 2,
+        halo_of=renderer.halo_of(mounted.camera),
+        unknowns=6 if bound else 2,
     )
     if slopes is None:
         return None, None

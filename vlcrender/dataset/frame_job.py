@@ -173,7 +173,7 @@ def _bounds_m2(
         [RegionImage(roi, variance_e2(recipe.sensor, image, exposure_s)) for roi, image in expected],
         float(np.median(np.linalg.norm(renderer.scene.leds.centers_m - at.position_m, axis=1))),
         recipe.regions is not None and recipe.regions.overscan,
-        renderer.halo_of(mounted.camera),
+        halo_of=renderer.halo_of(mounted.camera),
     )
     if slopes is None:
         return None, None
@@ -208,9 +208,11 @@ def _renderer(recipe_json: str, scene_json: str, scene_folder: str) -> tuple[Rec
     """The recipe and its renderer; one for each process and plan."""
     scene = build_scene(SceneSettings.model_validate_json(scene_json), "scene", Path(scene_folder))
     recipe, light = Recipe.model_validate_json(recipe_json), bake(scene)
-    of_colours = tuple(Renderer(scene, light, detector) for detector in detectors(recipe.sensor))
-    mosaic = recipe.sensor.mosaic
-    return recipe, of_colours[0] if mosaic == "none" else MosaicRenderer(of_colours, mosaic)
+    sensor = recipe.sensor
+    if sensor.mosaic == "none":
+        return recipe, Renderer(scene, light, detectors(sensor)[0], sensor.crosstalk)
+    of_colours = tuple(Renderer(scene, light, detector) for detector in detectors(sensor))
+    return recipe, MosaicRenderer(of_colours, sensor.mosaic, sensor.crosstalk)
 
 
 @cache

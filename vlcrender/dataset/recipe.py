@@ -136,6 +136,16 @@ class Recipe(Settings):
         return self
 
     @model_validator(mode="after")
+    def _lateral_colour_needs_a_mosaic(self) -> Self:
+        coloured = [c.name for c in self.cameras if c.camera.lateral_colour_um is not None]
+        if coloured and self.sensor.mosaic == "none":
+            raise ValueError(
+                f"lateral_colour_um: camera {coloured[0]!r} has it, and the sensor has no mosaic; remove it, or choose "
+                "sensor.mosaic"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _overscan_needs_a_lens_without_glare(self) -> Self:
         glaring = [c.name for c in self.cameras if c.camera.glare is not None]
         if self.regions is not None and self.regions.overscan and glaring:

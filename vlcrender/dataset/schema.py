@@ -233,6 +233,9 @@ class SensorEntry(Settings):
     full_well_e: float
     black_level_dn: int
     noise: str
+    crosstalk: float
+    hot_pixel_share: float
+    hot_pixel_e_s: float
     prnu: float
     dark_current_e_s: float
     dsnu_e: float

@@ -117,8 +117,14 @@ def make_datasheet(
 ) -> Datasheet:
     """Measure a sensor of `side_px` x `side_px` pixels. `progress` is called with the number of frames taken.
 
-    Raises InputError for a sensor without response at this wavelength, without noise, or without saturation.
+    Raises InputError for a sensor without response at this wavelength, without noise, or without saturation, and for
+    one with hot pixels. Crosstalk does not show: the light is uniform.
     """
+    if sensor.hot_pixel_share > 0:
+        raise InputError(
+            f"sensor.hot_pixel_share = {sensor.hot_pixel_share:g}: the set values of a data sheet are those of pixels "
+            "without defects; set it to 0"
+        )
     kinds = detectors(sensor)
     detector = kinds[0] if len(kinds) == 1 else kinds[COLOURS.index("green")]
     efficiency = float(detector.quantum_efficiency(np.array([wavelength_nm]))[0])

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import partial, reduce
 from typing import Any
 
 import numpy as np
@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.roi import LedRegions, Roi
+from vlcrender.rendering.crosstalk import REACH_PX, shared_patch, with_crosstalk
 from vlcrender.rendering.expected_image import ExpectedImage, ExpectedRegion, Halo, Image, LedPatch
-from vlcrender.rendering.renderer import Renderer
+from vlcrender.rendering.renderer import Renderer, read_out
 from vlcrender.scene.leds import Leds
 from vlcrender.scene.loader import Scene
 from vlcrender.sensor.quantum_efficiency import COLOURS
@@ -25,6 +26,16 @@ def colour_of_pixels(mosaic: str, roi: Roi) -> NDArray[np.intp]:
     columns = np.arange(roi.column, roi.end_column) % 2
     pixels: NDArray[np.intp] = tile[rows[:, None], columns]
     return pixels
+
+
+def _padded(patch: LedPatch | None, roi: Roi, dtype: Any) -> NDArray[Any]:
+    """A patch's light in a region that contains it, (rows, columns); dark without a patch."""
+    if patch is not None and patch.roi == roi:
+        return patch.electrons_per_s
+    light = np.zeros((roi.rows, roi.columns), dtype=dtype)
+    if patch is not None:
+        light[roi.slices(patch.roi)] = patch.electrons_per_s
+    return light
 
 
 def select_colours(images: Sequence[NDArray[Any]], mosaic: str, roi: Roi) -> NDArray[Any]:
@@ -50,11 +61,14 @@ class MosaicHalo:
 class MosaicRenderer:
     """Renders expected images through a mosaic: a whole image under each of COLOURS, of which each pixel takes one.
 
-    The lens's blur therefore comes before the filters. `of_colours` has one renderer for each of COLOURS.
+    The lens's blur therefore comes before the filters, crosstalk after. `of_colours` has one renderer without crosstalk
+    for each of COLOURS.
     """
 
     of_colours: tuple[Renderer, ...]
     mosaic: str
+    crosstalk: float = 0.0
+    """Share of a pixel's electrons that its neighbours collect."""
 
     @property
     def scene(self) -> Scene:
@@ -69,14 +83,32 @@ class MosaicRenderer:
         self, posed: PosedCamera, regions: LedRegions | None = None, during: Sequence[Pose] | None = None
     ) -> ExpectedImage:
         """As `Renderer.expected_image`."""
-        images = [renderer.expected_image(posed, regions, during) for renderer in self.of_colours]
-        return ExpectedImage(tuple(map(self._region, zip(*(image.parts for image in images), strict=True))))
+        views = [
+            renderer.view(of_colour, regions, during)
+            for renderer, of_colour in zip(self.of_colours, self._of_colours(posed), strict=True)
+        ]
+        rois = read_out(views, regions, REACH_PX if self.crosstalk else 0)
+        images = [renderer.image_of(view, rois) for renderer, view in zip(self.of_colours, views, strict=True)]
+        image = ExpectedImage(tuple(map(self._region, zip(*(image.parts for image in images), strict=True))))
+        return with_crosstalk(image, self.crosstalk, Roi.of_sensor(posed.camera)) if self.crosstalk else image
 
     def led_patches(
         self, posed: PosedCamera, regions: LedRegions | None = None, blurred_at: Pose | None = None
     ) -> tuple[LedPatch, ...]:
         """As `Renderer.led_patches`."""
-        return self._patches([r.led_patches(posed, regions, blurred_at) for r in self.of_colours])
+        patches = self._patches(
+            [
+                renderer.led_patches(of_colour, regions, blurred_at)
+                for renderer, of_colour in zip(self.of_colours, self._of_colours(posed), strict=True)
+            ]
+        )
+        if not self.crosstalk:
+            return patches
+        return tuple(shared_patch(patch, self.crosstalk, Roi.of_sensor(posed.camera)) for patch in patches)
+
+    def _of_colours(self, posed: PosedCamera) -> tuple[PosedCamera, ...]:
+        """The camera as light of each colour sees it (lateral colour)."""
+        return tuple(replace(posed, camera=posed.camera.for_colour(c)) for c in range(len(COLOURS)))
 
     def halo_of(self, camera: Camera) -> Callable[[Sequence[LedPatch], Roi], NDArray[np.float64]] | None:
         """As `Renderer.halo_of`, of patches under the mosaic: each colour's light is that of its pixels, times 4 or 2.
@@ -121,10 +153,17 @@ class MosaicRenderer:
         return MosaicHalo(halos, self.mosaic) if halos else None
 
     def _patches(self, of_colours: Sequence[Sequence[LedPatch]]) -> tuple[LedPatch, ...]:
-        return tuple(
-            replace(same[0], electrons_per_s=self._select([p.electrons_per_s for p in same], same[0].roi))
-            for same in zip(*of_colours, strict=True)
-        )
+        """Patches with the pixels of each colour; place and visible share are those of the green image."""
+        by_id = [{patch.led_id: patch for patch in patches} for patches in of_colours]
+        patches = []
+        for led_id in dict.fromkeys(patch.led_id for one in of_colours for patch in one):
+            same = [of_colour.get(led_id) for of_colour in by_id]
+            found = [patch for patch in same if patch is not None]
+            roi = reduce(Roi.union, (patch.roi for patch in found))
+            light = [_padded(patch, roi, found[0].electrons_per_s.dtype) for patch in same]
+            leading = same[COLOURS.index("green")] or found[0]
+            patches.append(replace(leading, row=roi.row, column=roi.column, electrons_per_s=self._select(light, roi)))
+        return tuple(patches)
 
     def _select(self, images: Sequence[NDArray[Any]], roi: Roi) -> NDArray[Any]:
         """For each pixel of a region, the image of the pixel's colour."""

@@ -10,7 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlcrender.camera.posed_camera import PosedCamera
-from vlcrender.camera.psf import SplitKernel, blur, blur_kernel, kernel_radius_px, split_for, split_kernel
+from vlcrender.camera.psf import (
+    SplitKernel,
+    blur,
+    blur_kernel,
+    kernel_radius_px,
+    off_axis_sigma_px,
+    split_for,
+    split_kernel,
+)
 from vlcrender.camera.roi import Roi
 from vlcrender.rendering.led_coverage import candidate_leds
 from vlcrender.rendering.led_edges import LedEdges
@@ -19,8 +27,10 @@ from vlcrender.scene.leds import Leds
 BLUR_MARGIN_PX = 500
 """Distance from the sensor within which an LED's blur is computed, since it may light the sensor."""
 DEPTH_STEP = 0.005
-"""Depths within this relative step share a kernel: 0.2 px of a defocus disc of 35 px."""
+"""Depths within this relative step share a kernel: 0.2 px of a defocus disc of 35 px. So do off-axis blurs."""
 MIN_DEPTH_M = 0.05
+MIN_SIGMA_PX = 1e-3
+"""An off-axis blur narrower than this moves less light than one part of 64 across a pixel shows."""
 
 Array = NDArray[np.float64]
 
@@ -77,25 +87,31 @@ class LedBlur:
 def led_blur(leds: Leds, posed: PosedCamera) -> LedBlur:
     """The blur at a pose. LEDs whose depths differ by less than DEPTH_STEP share a kernel where the blur is wide.
 
-    The room behind is blurred as at the median depth of the LEDs that are blurred.
+    The room behind is blurred as at the median depth, and place in the field, of the LEDs that are blurred.
     """
     camera = posed.camera
     kernels = [LedKernel()] * len(leds)
-    if camera.focus_distance_m is None and camera.psf == "none":
+    if camera.focus_distance_m is None and camera.psf == "none" and camera.off_axis_sigma_um == 0:
         return LedBlur(tuple(kernels), None)
     led_depths_m = np.maximum(posed.focus_depths_m(leds.centers_m), MIN_DEPTH_M)
-    depth_m: dict[int, float] = {}
-    by_depth: dict[float, LedKernel] = {}
+    sigmas_px = np.zeros(len(leds))
+    if camera.off_axis_sigma_um > 0:
+        sigmas_px = off_axis_sigma_px(camera, posed.project(leds.centers_m))
+        sigmas_px = np.exp(np.round(np.log(np.maximum(sigmas_px, MIN_SIGMA_PX)) / DEPTH_STEP) * DEPTH_STEP)
+    point: dict[int, tuple[float, float]] = {}
+    by_point: dict[tuple[float, float], LedKernel] = {}
     for i in candidate_leds(posed, leds.centers_m, leds.circumradii_m, BLUR_MARGIN_PX).tolist():
         depth = float(np.exp(np.round(np.log(led_depths_m[i]) / DEPTH_STEP) * DEPTH_STEP))
-        if split_for(camera, depth) > 1:
+        sigma_px = float(sigmas_px[i])
+        if split_for(camera, depth, sigma_px) > 1:
             # A narrow disc may change more within a step than it is wide. Without a focus depth has no effect.
             depth = float(led_depths_m[i]) if camera.focus_distance_m is not None else 1.0
-        if depth not in by_depth:
-            parts = split_kernel(camera, depth)
-            by_depth[depth] = LedKernel(blur_kernel(camera, depth) if parts is None else parts.whole, parts)
-        kernels[i] = by_depth[depth]
-        depth_m[i] = depth
-    blurred = sorted((i for i in depth_m if kernels[i].whole is not None), key=lambda i: kernels[i].radius_px)
-    typical = blur_kernel(camera, depth_m[blurred[len(blurred) // 2]]) if blurred else None
+        point[i] = depth, sigma_px
+        if point[i] not in by_point:
+            parts = split_kernel(camera, depth, sigma_px)
+            whole = blur_kernel(camera, depth, sigma_px) if parts is None else parts.whole
+            by_point[point[i]] = LedKernel(whole, parts)
+        kernels[i] = by_point[point[i]]
+    blurred = sorted((i for i in point if kernels[i].whole is not None), key=lambda i: kernels[i].radius_px)
+    typical = blur_kernel(camera, *point[blurred[len(blurred) // 2]]) if blurred else None
     return LedBlur(tuple(kernels), typical)

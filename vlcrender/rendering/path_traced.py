@@ -49,15 +49,17 @@ def reference_cd_m2(scene: Scene, posed: PosedCamera, samples_per_pixel: int, se
     """Luminance averaged over each pixel (and the pupil), without relative illumination and aperture.
 
     A pinhole is Mitsuba's own perspective sensor; for other lenses rays are drawn here, evenly over the pixel and the
-    pupil, and traced by Mitsuba. The variance comes from the scatter of BATCHES images. Raises InputError for a psf
-    or glare, and for bare LEDs that are not Lambertian: Mitsuba's area emitters are Lambertian or emit along the normal
-    only.
+    pupil, and traced by Mitsuba. The variance comes from the scatter of BATCHES images. Raises InputError for a psf,
+    off-axis blur or glare, and for bare LEDs that are not Lambertian: Mitsuba's area emitters are Lambertian or emit
+    along the normal only.
     """
     camera = posed.camera
     if camera.psf != "none":
         raise InputError(f"camera.psf = {camera.psf!r}: the reference renderer has no diffraction; it has to be 'none'")
     if camera.glare is not None:
         raise InputError("camera.glare: the reference renderer has no glare; remove the table")
+    if camera.off_axis_sigma_um > 0:
+        raise InputError(f"camera.off_axis_sigma_um = {camera.off_axis_sigma_um:g}: the reference renderer needs 0")
     bare = np.array([diffuser is None for diffuser in scene.leds.diffusers])
     if not np.allclose(scene.leds.orders[bare], 1.0):
         raise InputError("half_power_deg: the reference renderer's LEDs are Lambertian; it has to be 60")

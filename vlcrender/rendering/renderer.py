@@ -11,7 +11,7 @@ by the kernel of its depth (`led_blur`), and scatters a share of all light into 
 import copy
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -25,6 +25,7 @@ from vlcrender.core.backend import dr
 from vlcrender.errors import InputError
 from vlcrender.light.lightmap import Lightmap, bake
 from vlcrender.rendering.background import Background, BackgroundRegion
+from vlcrender.rendering.crosstalk import REACH_PX, shared_patch, with_crosstalk
 from vlcrender.rendering.electron_rates import ElectronRates
 from vlcrender.rendering.expected_image import ExpectedImage, ExpectedRegion, Image, LedPatch, SpecularReflection
 from vlcrender.rendering.halo import GlareHalo, glare_halo, halo_of_sources
@@ -46,14 +47,52 @@ LedImages = Mapping[int, LedImage]
 """Images of the LEDs at one pose, by the LED's index."""
 
 
+@dataclass(frozen=True)
+class LedView:
+    """The LEDs as a camera sees them at one or more poses, and the pixels that each lights, by its index."""
+
+    posed: PosedCamera
+    poses: tuple[PosedCamera, ...]
+    blurs: LedBlur
+    images: tuple[LedImages, ...]
+    patch_rois: Mapping[int, Roi]
+
+
+def read_out(views: Sequence[LedView], regions: LedRegions | None, reach_px: int = 0) -> tuple[Roi, ...]:
+    """The regions that are read out of a sensor: all of it, or regions around the LEDs of one or more views.
+
+    reach_px: pixels around its image that an LED lights by crosstalk.
+    """
+    camera = views[0].posed.camera
+    if regions is None:
+        return (Roi.of_sensor(camera),)
+    rois = dict(views[0].patch_rois)
+    for view in views[1:]:
+        for i, roi in view.patch_rois.items():
+            rois[i] = rois[i].union(roi) if i in rois else roi
+    if reach_px:
+        sensor = Roi.of_sensor(camera)
+        lit = {i: roi.padded(reach_px) for i, roi in rois.items()}
+        rois = {i: lit[i].intersection(sensor) if sensor.contains(roi) else lit[i] for i, roi in rois.items()}
+    return led_regions(rois.values(), camera, regions)
+
+
 class Renderer:
     """Renders expected images of one scene on one detector."""
 
-    def __init__(self, scene: Scene, light: Lightmap | None = None, detector: Detector | None = None) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        light: Lightmap | None = None,
+        detector: Detector | None = None,
+        crosstalk: float = 0.0,
+    ) -> None:
         """Prepare a scene.
 
-        light: baked light of the scene, made or taken from the cache where not given; detector: silicon by default.
+        light: baked light of the scene, made or taken from the cache where not given; detector: silicon by default;
+        crosstalk: share of a pixel's electrons that its neighbours collect.
         """
+        self._crosstalk = crosstalk
         self.scene = scene
         self.detector = detector or Silicon()
         self._light = light or bake(scene)
@@ -81,19 +120,35 @@ class Renderer:
         centres of the LEDs are given for `posed`. Raises InputError where the camera is not inside the room, or where
         the regions hold more than MAX_SENSORS times the sensor's pixels, and for a lens with glare with overscan.
         """
+        view = self.view(posed, regions, during)
+        rois = read_out((view,), regions, REACH_PX if self._crosstalk else 0)
+        image = self.image_of(view, rois)
+        return with_crosstalk(image, self._crosstalk, Roi.of_sensor(posed.camera)) if self._crosstalk else image
+
+    def view(
+        self, posed: PosedCamera, regions: LedRegions | None = None, during: Sequence[Pose] | None = None
+    ) -> "LedView":
+        """The LEDs of a view before their light is computed, and the pixels that they light.
+
+        Arguments and exceptions of `expected_image`.
+        """
         if posed.camera.glare is not None and regions is not None and regions.overscan:
             raise InputError(OVERSCAN_WITH_GLARE)
+        if posed.camera.lateral_colour_um is not None:
+            raise InputError("camera.lateral_colour_um: needs a sensor with a mosaic; remove it, or choose a mosaic")
         poses = [posed] if during is None else [posed.at(pose) for pose in during]
         for each in poses:
             check_inside(self.scene, each.pose)
-        camera, leds = posed.camera, self.scene.leds
-        blurs = led_blur(leds, posed)
-        images = [led_images(leds, self._occlusion, each, regions, blurs) for each in poses]
-        patch_rois = _patch_rois(camera, images, blurs, regions)
-        rois = (Roi.of_sensor(camera),) if regions is None else led_regions(patch_rois.values(), camera, regions)
-        _check_size(rois, camera)
-        backgrounds, reflections = self._rooms(poses, rois, images, blurs)
-        patches = self._patches(posed, images, patch_rois, blurs)
+        blurs = led_blur(self.scene.leds, posed)
+        images = [led_images(self.scene.leds, self._occlusion, each, regions, blurs) for each in poses]
+        return LedView(posed, tuple(poses), blurs, tuple(images), _patch_rois(posed.camera, images, blurs, regions))
+
+    def image_of(self, view: "LedView", rois: Sequence[Roi]) -> ExpectedImage:
+        """The expected image of a view before crosstalk, in the regions of `read_out`."""
+        posed = view.posed
+        _check_size(rois, posed.camera)
+        backgrounds, reflections = self._rooms(view.poses, rois, view.images, view.blurs)
+        patches = self._patches(posed, view.images, view.patch_rois, view.blurs)
         halo = self._halo(posed, patches)
         return ExpectedImage(
             tuple(
@@ -120,7 +175,10 @@ class Renderer:
         blurs = led_blur(leds, posed if blurred_at is None else posed.at(blurred_at))
         images = [led_images(leds, self._occlusion, posed, regions, blurs)]
         patch_rois = _patch_rois(posed.camera, images, blurs, regions)
-        return self._patches(posed, images, patch_rois, blurs, np.float64)
+        patches = self._patches(posed, images, patch_rois, blurs, np.float64)
+        if not self._crosstalk:
+            return patches
+        return tuple(shared_patch(patch, self._crosstalk, Roi.of_sensor(posed.camera)) for patch in patches)
 
     def halo_of(self, camera: Camera) -> Callable[[Sequence[LedPatch], Roi], Array] | None:
         """The function from patches of `led_patches` to their halo in a region of the sensor, electrons a second.

@@ -2,10 +2,11 @@
 
 The chain, in this order (`signal_chain.expose` runs it):
 
-1. mean photoelectrons of each pixel, `expected_e`
+1. mean photoelectrons of each pixel, `expected_e`, after crosstalk
 2. PRNU scales the mean. It is a spread of quantum efficiency: a pixel of response 1 + p has the Poisson variance
    (1 + p) mu; multiplying the drawn electrons would give (1 + p)^2 mu
-3. dark current adds its mean electrons for the exposure time at the sensor's temperature
+3. dark current adds its mean electrons for the exposure time at the sensor's temperature; hot pixels have a dark
+   current of their own in addition, exponentially distributed
 4. one Poisson draw: the shot noise of light and dark current together
 5. DSNU, a fixed pattern, is added
 6. the full well clips, before anything is read out
@@ -20,6 +21,7 @@ Source: EMVA Standard 1288, Release 4.0 Linear (2021), sections 2 and 3. Differe
 noise, and rows and columns have offsets, which Release 4.0 separates from DSNU.
 """
 
+import math
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -60,6 +62,9 @@ class Sensor(Settings):
     """Digital number of a pixel without signal; below the largest number."""
     noise: Literal["shot", "none", "full"] = "shot"
     """"shot": photon noise alone. "full": the whole chain. "none": rounded means."""
+    crosstalk: Annotated[float, Field(ge=0, le=0.5)] = 0.0
+    """Share of a pixel's electrons that its four neighbours collect, a quarter each, 0 to 0.5. Electrons diffuse one by
+    one: shot noise stays independent from pixel to pixel."""
     prnu: Annotated[float, Field(ge=0, le=0.5)] = 0.0
     """Photoresponse nonuniformity: standard deviation of the pixels' response over its mean. Fixed pattern."""
     dark_current_e_s: Annotated[float, Field(ge=0, le=1e9)] = 0.0
@@ -70,6 +75,11 @@ class Sensor(Settings):
     """Temperature rise that doubles the dark current, deg C."""
     temperature_c: Celsius = 25.0
     """Temperature of the sensor during the frames, deg C."""
+    hot_pixel_share: Annotated[float, Field(ge=0, le=0.1)] = 0.0
+    """Share of the pixels that are hot, 0 to 0.1. Fixed pattern."""
+    hot_pixel_e_s: Annotated[float, Field(gt=0, le=1e9)] = 5000.0
+    """Mean additional dark current of hot pixels at `reference_temperature_c`, electrons a second; exponentially
+    distributed over them."""
     dsnu_e: Spread = 0.0
     """Dark signal nonuniformity: standard deviation of the pixels' offsets, electrons. Fixed pattern."""
     read_noise_e: Spread = 0.0
@@ -153,10 +163,15 @@ class Sensor(Settings):
         doublings = (self.temperature_c - self.reference_temperature_c) / self.dark_current_doubling_c
         return float(self.dark_current_e_s * 2.0**doublings * exposure_s)
 
+    def hot_electrons(self, exposure_s: float) -> float:
+        """Mean electrons of the additional dark current over all hot pixels, which grows with temperature alike."""
+        doublings = (self.temperature_c - self.reference_temperature_c) / self.dark_current_doubling_c
+        return float(self.hot_pixel_e_s * 2.0**doublings * exposure_s)
+
     def acting(self) -> dict[str, Any]:
         """Sensor parameters in effect at the ISO, temperature and noise mode of the frames, as in dataset.json.
 
-        Dark current and standard deviations are 0 unless `noise` is "full".
+        Dark current, standard deviations and hot pixels are 0 unless `noise` is "full".
         """
         full = self.noise == "full"
         return {
@@ -165,6 +180,9 @@ class Sensor(Settings):
             "full_well_e": self.full_well_e,
             "black_level_dn": self.black_level_dn,
             "noise": self.noise,
+            "crosstalk": self.crosstalk,
+            "hot_pixel_share": self.hot_pixel_share if full else 0.0,
+            "hot_pixel_e_s": self.hot_electrons(1.0) if full and self.hot_pixel_share > 0 else 0.0,
             "dark_current_e_s": self.dark_electrons(1.0) if full else 0.0,
             **{key: getattr(self, key) if full else 0.0 for key in SPREADS},
             "mosaic": self.mosaic,
@@ -185,13 +203,18 @@ class Sensor(Settings):
         """The sensor with `by` x `by` pixels summed into one; digital numbers keep their range.
 
         Means grow by by^2, independent noise by `by`, and a row offset by by^1.5: `by` columns share each of `by`
-        independent row offsets.
+        independent row offsets. Crosstalk across the border of the larger pixel falls with its circumference over its
+        area; a larger pixel is hot if one of its pixels is.
         """
         means = {key: getattr(self, key) * by**2 for key in ("gain_e_per_dn", "full_well_e", "dark_current_e_s")}
         noise = {key: getattr(self, key) * by for key in ("dsnu_e", "read_noise_e")}
         shares = {key: getattr(self, key) / by for key in ("prnu", "adc_noise_dn")}
         offsets = {key: getattr(self, key) * by**1.5 for key in ("row_offset_e", "column_offset_e")}
-        return self.model_copy(update={**means, **noise, **shares, **offsets})
+        defects = {
+            "crosstalk": self.crosstalk / by,
+            "hot_pixel_share": -math.expm1(by**2 * math.log1p(-self.hot_pixel_share)),
+        }
+        return self.model_copy(update={**means, **noise, **shares, **offsets, **defects})
 
 
 def clip_full_well(electrons: Electrons, full_well_e: float) -> Electrons:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlcrender.core.backend import dr, exact_math, mi
-from vlcrender.core.philox import kernel_seed, normals, pixel_indices
+from vlcrender.core.philox import PHILOX, kernel_seed, normals, pixel_indices
 from vlcrender.core.random_keys import random_key
 from vlcrender.sensor.poisson import MAX_MEAN, draw, poisson
 from vlcrender.sensor.sensor import Electrons, Sensor, clip_full_well
@@ -17,7 +17,7 @@ def variance_e2(sensor: Sensor, expected_e: NDArray[np.float32], exposure_s: flo
 
     Fixed patterns count as noise, independent in each pixel: an estimator does not know them. A pixel is saturated
     where its mean is at the full well or the upper limit of the ADC. Rounding adds gain^2 / 12, except where digital
-    numbers are counts of electrons.
+    numbers are counts of electrons. Hot pixels, which are few, are left out: they hold less information.
     """
     gain, full = sensor.gain_at_iso_e_per_dn, sensor.noise == "full"
     mean = expected_e.astype(np.float64)
@@ -76,7 +76,10 @@ def _full_chain(
         response, offset = normals(kernel_seed(individual, "pixels"), column, row)
         mean = mi.Float(np.ascontiguousarray(expected_e).ravel())
         mean = mean * dr.maximum(1.0 + number(sensor.prnu) * response, 0.0)  # 2
-        mean = dr.minimum(mean + number(sensor.dark_electrons(exposure_s)), MAX_MEAN)  # 3
+        mean = mean + number(sensor.dark_electrons(exposure_s))  # 3
+        if sensor.hot_pixel_share > 0:
+            mean = mean + number(sensor.hot_electrons(exposure_s)) * _of_hot_pixels(sensor, individual, column, row)
+        mean = dr.minimum(mean, MAX_MEAN)
         electrons = draw(mean, kernel_seed(key), column, row)  # 4
         electrons = electrons + number(sensor.dsnu_e) * offset  # 5
         electrons = dr.minimum(electrons, number(sensor.full_well_e))  # 6
@@ -91,3 +94,11 @@ def _full_chain(
         dr.eval(dn)
     image: NDArray[np.uint32] = dn.numpy().reshape(expected_e.shape)
     return image
+
+
+def _of_hot_pixels(sensor: Sensor, individual: str, column: Any, row: Any) -> Any:
+    """Exponential numbers of mean 1 in hot pixels, 0 in all others; the same in every frame of a sensor."""
+    chance, size, _, _ = PHILOX(
+        kernel_seed(individual, "hot pixels"), column, row, mi.UInt32(0), iterations=10
+    ).next_float32x4(mi.Bool(True))
+    return dr.select(chance < dr.opaque(mi.Float, sensor.hot_pixel_share), -dr.log(1.0 - size), 0.0)
