@@ -12,6 +12,7 @@ from vlcrender.camera.roi import Roi, merged
 from vlcrender.core.backend import dr, exact_math, mi
 from vlcrender.rendering.background import Background, differs_from_neighbour, sub_pixels
 from vlcrender.scene.loader import Scene
+from vlcrender.scene.visibility import can_occlude_leds
 
 DISTANCE_TOLERANCE = 1e-4
 """Relative difference below which two distances, computed in float32, count as equal."""
@@ -44,13 +45,7 @@ class Occlusion:
     def __init__(self, scene: Scene, background: Background) -> None:
         """Prepare a scene; `background` holds its surfaces."""
         self._background = background
-        panels = scene.settings.panels
-        undersides_m = [grid.first_center_m[2] for grid in panels]
-        self.possible = (
-            bool(scene.settings.furniture)
-            or any(grid.frame is not None for grid in panels)
-            or min(undersides_m, default=np.inf) < scene.leds.centers_m[:, 2].max() * (1 - DISTANCE_TOLERANCE)
-        )
+        self.possible = can_occlude_leds(scene)
         """Whether anything in the scene can occlude an LED that is seen directly."""
 
     def clear_shares(
