@@ -71,6 +71,9 @@ def recipe_schema() -> Schema:
     """JSON Schema of a recipe file, with the key `preset` that stands for several others."""
     tree = Recipe.model_json_schema()
     tables, properties = tree["$defs"], tree["properties"]
+    of_camera = _preset("camera")
+    of_camera["description"] += " It is whole: the sensor's preset is in it. Under [camera] alone, not in a rig."
+    tables["Camera"]["properties"] = {"preset": of_camera, **tables["Camera"]["properties"]}
     tables["Sensor"]["properties"] = {"preset": _preset("sensor"), **tables["Sensor"]["properties"]}
     preset_imu = copy.deepcopy(tables["Imu"])
     preset_imu["description"] = "An accelerometer by the name of a preset; keys beside it replace the preset's values."
