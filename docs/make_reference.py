@@ -72,6 +72,9 @@ def recipe_schema() -> Schema:
     """JSON Schema of a recipe file, with the key `preset` that stands for several others."""
     tree = Recipe.model_json_schema()
     tables, properties = tree["$defs"], tree["properties"]
+    of_camera = _preset("camera")
+    of_camera["description"] += " It is whole: the sensor's preset is in it. Under [camera] alone, not in a rig."
+    tables["Camera"]["properties"] = {"preset": of_camera, **tables["Camera"]["properties"]}
     tables["Sensor"]["properties"] = {"preset": _preset("sensor"), **tables["Sensor"]["properties"]}
     tables["Belief"]["properties"] = {"preset": _preset("belief"), **tables["Belief"]["properties"]}
     preset_imu = copy.deepcopy(tables["Imu"])

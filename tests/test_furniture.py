@@ -15,6 +15,7 @@ from test_path_traced import BOX, scene_of
 from vlcrender.core.backend import mi
 from vlcrender.core.warn_once import warn_once
 from vlcrender.errors import InputError
+from vlcrender.light.lightmap import bake
 from vlcrender.scene.furniture import MAX_TRIANGLES, furniture_meshes
 from vlcrender.scene.mesh import Mesh
 
@@ -148,6 +149,43 @@ def test_an_open_mesh_is_taken_as_it_is_with_a_warning(tmp_path: Path, warnings:
     mesh = mesh_of(tmp_path, "board.obj", OBJ + "f 1 3 2\n")
     assert mesh.normals.tolist() == [[0.0, 0.0, -1.0]] * 3
     assert "'board.obj': is not closed" in warnings.text
+
+
+BOTTOM = "f 1 3 2\nf 1 4 3\n"
+TOP = "f 5 6 7\nf 5 7 8\n"
+
+
+@pytest.mark.parametrize(("left_out", "up"), [(BOTTOM, 1.0), (TOP, -1.0)])
+@pytest.mark.parametrize("inwards", [False, True])
+@pytest.mark.parametrize("position_m", [[1.5, 1.5, 1.0], [0.3, 0.3, 0.0]])
+def test_an_open_box_faces_outwards_wherever_it_stands(
+    tmp_path: Path,
+    warnings: pytest.LogCaptureFixture,
+    left_out: str,
+    up: float,
+    inwards: bool,
+    position_m: list[float],
+) -> None:
+    """A box without its bottom or its top: the level side that is left faces up or down, the others away."""
+    box = BOX.replace(left_out, "")
+    assert box != BOX
+    mesh = mesh_of(tmp_path, "box.obj", turned(box) if inwards else box, position_m=position_m)
+    level = np.abs(mesh.normals[:, 2]) > 0.5
+    assert np.sign(mesh.normals[level, 2]).tolist() == [up] * 6
+    away = ((mesh.vertices_m - position_m)[:, :2] * mesh.normals[:, :2]).sum(axis=1)
+    assert (away[~level] > 0).all()
+    assert ("'box.obj': is inside out; 10 of 10 triangles were turned" in warnings.text) == inwards
+    assert "'box.obj': is not closed" in warnings.text
+
+
+def test_furniture_without_light_is_told_by_name(tmp_path: Path, warnings: pytest.LogCaptureFixture) -> None:
+    """A board on the floor that faces down bakes to 0 lx; one that faces up does not."""
+    (tmp_path / "up.obj").write_text(OBJ + "f 1 2 3\n")
+    (tmp_path / "down.obj").write_text(OBJ + "f 1 3 2\n")
+    pieces = [{"file": name, "position_m": [1.0, 1.0, 0.0]} for name in ("up.obj", "down.obj")]
+    bake(scene_of(tmp_path, led=[LED], furniture=pieces, bake={"texel_m": 2.0, "paths": 8}), tmp_path)
+    assert "furniture[1].file = 'down.obj': no light falls on the front sides" in warnings.text
+    assert "furniture[0].file = 'up.obj': no light" not in warnings.text
 
 
 PLY_BOX = (

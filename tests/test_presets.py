@@ -1,5 +1,6 @@
 """Presets, renamed keys, and limits of a recipe's sensor: error messages are one line with key and value."""
 
+import re
 from pathlib import Path
 from typing import get_args
 
@@ -7,11 +8,14 @@ import pytest
 from conftest import ROOT
 from pydantic import BaseModel
 
+from vlcrender.camera.intrinsics import Camera
 from vlcrender.config.presets import preset, presets, with_presets
 from vlcrender.config.toml_model import RENAMED_KEYS
 from vlcrender.dataset.recipe import Recipe, load_plan
 from vlcrender.errors import InputError
 from vlcrender.scene.schema import SceneSettings
+from vlcrender.sensor.radiometry import detectors, electron_rate_per_cd_m2
+from vlcrender.sensor.sensor import Sensor
 
 QUICKSTART = ROOT / "datasets/quickstart.toml"
 
@@ -42,6 +46,65 @@ def test_every_number_of_a_preset_names_its_source(name: str) -> None:
 
 def test_the_presets_include_ideal_industrial_and_phone() -> None:
     assert {"ideal", "industrial", "phone-1.2um"} < set(presets("sensors"))
+
+
+@pytest.mark.parametrize("name", presets("cameras"))
+def test_every_camera_preset_is_whole_and_names_its_sources(name: str) -> None:
+    """A lens that light can pass, with diffraction, and a real sensor; in place of the recipe's own."""
+    made = recipe(f"camera.preset={name}")
+    given = preset("cameras", name)
+    assert set(given) == {"camera", "sensor"}
+    assert made.camera.model_dump(include=set(given["camera"]) - {"distortion"}) == {
+        key: value for key, value in given["camera"].items() if key != "distortion"
+    }
+    assert made.camera.psf == "diffraction"
+    of_sensor = preset("sensors", given["sensor"]["preset"])
+    assert made.camera.pixel_pitch_um == of_sensor["camera"]["pixel_pitch_um"]
+    assert made.sensor == Sensor.preset(given["sensor"]["preset"])  # none of quickstart's [sensor] is left
+    assert made.sensor.noise == "full"
+    assert Camera.preset(name) == made.camera
+    text = (ROOT / f"vlcrender/config/preset_files/cameras/{name}.toml").read_text()
+    for line in text.splitlines():
+        if "=" in line and not line.startswith(("#", "preset = ")):
+            assert "#" in line, line
+
+
+def test_a_recipe_overrides_keys_and_sensor_of_its_camera_preset() -> None:
+    tree = {"camera": {"preset": "phone-wide", "f_number": 2.4}, "sensor": {"prnu": 0.01}}
+    made = with_presets(tree, [], "here")
+    assert (made["camera"]["f_number"], made["camera"]["focal_length_mm"]) == (2.4, 3.6)
+    assert (made["sensor"]["prnu"], made["sensor"]["full_well_e"]) == (0.01, 4900.0)
+    made = with_presets({**tree, "sensor": {"preset": "phone-1.55um"}}, ["camera.transmittance=0.8"], "here")
+    assert (made["sensor"]["full_well_e"], made["camera"]["pixel_pitch_um"]) == (8180.0, 1.55)
+    assert (made["camera"]["transmittance"], made["camera"]["focal_length_mm"]) == (0.8, 3.6)
+    with pytest.raises(
+        InputError, match=r'^here: camera\.preset = "phone": unknown; presets of cameras: machine-vision'
+    ):
+        with_presets({"camera": {"preset": "phone"}}, [], "here")
+    with pytest.raises(InputError, match=r"presets of cameras: machine-vision, phone-wide"):
+        Camera.preset("phone")
+
+
+def test_recipes_say_the_electrons_of_their_brightest_led() -> None:
+    """Light of its own in a pixel on the axis: luminance * rate * time, as `generate` computes it."""
+    said = 0
+    for path in sorted((ROOT / "datasets").glob("*.toml")):
+        found = re.search(r"the brightest LED, ([\d ]+) cd/m2, gives ([\d ]+) electrons", path.read_text())
+        assert found or "brightest LED" not in path.read_text(), path
+        if not found:
+            continue
+        plan = load_plan(path)
+        luminance, electrons = (float(number.replace(" ", "")) for number in found.groups())
+        brightest = plan.scene.leds.luminances_cd_m2.max()
+        (detector,) = detectors(plan.recipe.sensor)
+        rate = electron_rate_per_cd_m2(plan.recipe.camera, plan.scene.settings.led_spectrum, detector)
+        assert plan.recipe.exposure_s is not None
+        # both are rounded to the digit
+        assert abs(brightest - luminance) <= 0.5
+        assert abs(brightest * rate * plan.recipe.exposure_s - electrons) <= 0.5
+        assert electrons < plan.recipe.sensor.full_well_e
+        said += 1
+    assert said >= 5
 
 
 def test_keys_of_a_recipe_override_its_preset(tmp_path: Path) -> None:

@@ -15,7 +15,8 @@ from pydantic import Field, ValidationError, ValidatorFunctionWrapHandler, WrapV
 from vlcrender.camera.distortion import Distortion
 from vlcrender.camera.glare import Glare
 from vlcrender.camera.projection import Equidistant, FieldOfView, Perspective, Projection
-from vlcrender.config.toml_model import Settings
+from vlcrender.config.presets import with_presets
+from vlcrender.config.toml_model import Settings, check
 
 Pixels = Annotated[int, Field(ge=8, le=20000)]
 Positive = Annotated[float, Field(gt=0, le=1e6)]
@@ -85,6 +86,15 @@ class Camera(Settings):
     """Field angle at which a second stop hides the whole pupil, deg; no mechanical vignetting where not given."""
     glare: Glare | None = None
     """Veiling glare of the lens; none where not given."""
+
+    @classmethod
+    def preset(cls, name: str) -> Self:
+        """The camera of a preset, such as "phone-wide", with its sensor's pixels; `Sensor.preset` gives the sensor.
+
+        Raises InputError with the names there are.
+        """
+        where = f"camera preset {name}"
+        return check(with_presets({"camera": {"preset": name}}, [], where)["camera"], cls, where)
 
     @model_validator(mode="after")
     def _principal_point_is_near_the_image(self) -> Self:

@@ -1,7 +1,8 @@
 """Presets: parts of recipes that come with the package, such as the parameters of a sensor.
 
 A preset is a TOML file `preset_files/KIND/NAME.toml` beside this module: a partial recipe with the source of each
-number. `preset = "NAME"` in the table of its kind, in a recipe or with --set, inserts the file's tables.
+number. `preset = "NAME"` in the table of its kind, in a recipe or with --set, inserts the file's tables. A preset of a
+camera is whole: a lens, and a sensor by the name of its preset.
 """
 
 from collections.abc import Iterable, Mapping
@@ -12,14 +13,14 @@ from vlcrender.config.toml_model import override, read_toml
 from vlcrender.errors import InputError
 
 FOLDER = Path(__file__).parent / "preset_files"
-KINDS = {"sensor": "sensors", "accelerometer": "accelerometers", "belief": "beliefs"}
-"""Folder of the presets, by table of a recipe."""
+KINDS = {"camera": "cameras", "sensor": "sensors", "accelerometer": "accelerometers", "belief": "beliefs"}
+"""Folder of the presets, by table of a recipe. Cameras come first: they name presets of sensors."""
 NOT_OF_PRESETS = {"belief": ("devices", "maps", "stated_factor")}
 """Keys of a recipe's table that its presets leave alone, and that stay where an assignment names another preset."""
 
 
 def presets(kind: str) -> tuple[str, ...]:
-    """Names of the presets of a kind, "sensors", "accelerometers" or "beliefs", sorted."""
+    """Names of the presets of a kind, "cameras", "sensors", "accelerometers" or "beliefs", sorted."""
     return tuple(sorted(path.stem for path in (FOLDER / kind).glob("*.toml")))
 
 
@@ -33,8 +34,9 @@ def preset(kind: str, name: str) -> dict[str, Any]:
 def with_presets(tree: Mapping[str, Any], assignments: Iterable[str], source: str) -> dict[str, Any]:
     """A recipe's tree with presets inserted and `key=value` assignments applied (see `toml_model.override`).
 
-    Keys of the recipe override a preset that it names. A preset named by an assignment replaces the recipe's table.
-    Other assignments override everything. Raises InputError that starts with `source` for an unknown preset.
+    Keys of the recipe override a preset that it names. A preset named by an assignment replaces the recipe's table; a
+    camera's replaces the sensor's table too. Other assignments override everything. Raises InputError that starts with
+    `source` for an unknown preset.
     """
     given = list(assignments)
     chosen = {key: [a for a in given if a.partition("=")[0].strip() == f"{key}.preset"] for key in KINDS}
@@ -46,11 +48,17 @@ def with_presets(tree: Mapping[str, Any], assignments: Iterable[str], source: st
             tree = _merged(_named(kind, key, table["preset"], source), own)
         for assignment in chosen[key]:
             name = override({}, [assignment])[key]["preset"]
-            table = tree.get(key)
-            stays = NOT_OF_PRESETS.get(key, ())
-            kept = {own: value for own, value in table.items() if own in stays} if isinstance(table, dict) else {}
-            tree = _merged({**tree, key: kept}, _named(kind, key, name, source))  # no key of another preset remains
+            named = _named(kind, key, name, source)
+            replaced = named if key == "camera" else (key,)
+            # No key of another preset remains.
+            tree = _merged({**tree, **{table: _kept(tree, table) for table in replaced}}, named)
     return override(tree, [a for a in given if not any(a in of_key for of_key in chosen.values())])
+
+
+def _kept(tree: Mapping[str, Any], key: str) -> dict[str, Any]:
+    """The keys of a recipe's table that no preset replaces."""
+    table, stays = tree.get(key), NOT_OF_PRESETS.get(key, ())
+    return {own: value for own, value in table.items() if own in stays} if isinstance(table, dict) else {}
 
 
 def _named(kind: str, key: str, name: object, source: str) -> dict[str, Any]:

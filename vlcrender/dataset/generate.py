@@ -16,8 +16,10 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from pydantic import ValidationError
 
+from vlcrender.core.warn_once import warn_once
 from vlcrender.dataset.files import FRAMES, sha256_of, whole_file, write_json
 from vlcrender.dataset.frame_job import Job, make_frame, poses_of
 from vlcrender.dataset.progress import FRAMES_STAGE, Progress, ProgressCallback
@@ -42,9 +44,12 @@ from vlcrender.dataset.tables import write_table
 from vlcrender.dataset.true_world import built_leds, device_of_pose, device_rows, map_rows, true_camera
 from vlcrender.dataset.verify import extra_folders, missing_files, verify
 from vlcrender.errors import InputError
-from vlcrender.light.lightmap import bake, room_mesh
+from vlcrender.light.lightmap import Lightmap, bake, room_mesh
+from vlcrender.rendering.electron_rates import ElectronRates
 from vlcrender.rendering.renderer import check_inside, share_cores
 from vlcrender.scene.as_built import luminaires_of
+from vlcrender.sensor.quantisation import MIN_NOISE_STEPS, noise_steps
+from vlcrender.sensor.radiometry import detectors
 
 log = logging.getLogger(__name__)
 
@@ -97,7 +102,8 @@ def generate(
         log.info("%s: resumed with %d of %d frames", directory, len(done), total)
         report(Progress(FRAMES_STAGE, len(done), total))
     # Into the cache, from which every worker reads it.
-    bake(plan.scene, progress=lambda step, share: report(Progress(step, share, 1.0)))
+    light = bake(plan.scene, progress=lambda step, share: report(Progress(step, share, 1.0)))
+    _warn_of_coarse_steps(plan, light)
     with (directory / "journal.jsonl").open("a", encoding="utf-8") as journal:
         for record in _records(job, missing, workers, scheduler):
             done[record.frame] = record
@@ -106,6 +112,29 @@ def generate(
             report(Progress(FRAMES_STAGE, len(done), total))
     _finish(plan, directory, provenance, [done[frame] for frame in sorted(done)])
     return True
+
+
+def _warn_of_coarse_steps(plan: Plan, light: Lightmap) -> None:
+    """Warn where the noise of the background is so far below a digital number that rounding errors are alike.
+
+    The background is the mean over all surfaces that face down, on the axis of the camera `main`.
+    """
+    recipe, sensor, mesh = plan.recipe, plan.recipe.sensor, light.mesh
+    exposure_s = recipe.exposure_s if recipe.exposure is None else recipe.exposure.max_s
+    assert exposure_s is not None  # Recipe checks it
+    count = len(mesh.vertices_m)
+    weights = mesh.areas_m2() * (mesh.normals[:, 2] < 0)
+    led, ambient = (np.average(cd_m2[:count], weights=weights) for cd_m2 in (light.led_cd_m2(), light.ambient_cd_m2()))
+    rates = [ElectronRates.of(plan.scene, recipe.camera, detector) for detector in detectors(sensor)]
+    background_e = max(float(rate.led * led + rate.ambient * ambient) for rate in rates) * exposure_s
+    steps = noise_steps(sensor, background_e, exposure_s)
+    if background_e < sensor.saturation_e and steps < MIN_NOISE_STEPS:
+        warn_once(
+            log,
+            f"sensor: a digital number is {sensor.gain_at_iso_e_per_dn:.3g} electrons, and the noise of the background "
+            f"{steps:.2f} of it: below {MIN_NOISE_STEPS} neighbouring pixels have the same rounding error; raise "
+            "sensor.iso, or sensor.bits with a smaller sensor.gain_e_per_dn, or choose a smaller --scale",
+        )
 
 
 def _records(job: Job, frames: list[int], workers: int, scheduler: str | None) -> Iterator[FrameRecord]:

@@ -1,29 +1,31 @@
-"""Poses of the frames: aimed at random, listed, or on a grid."""
+"""Poses of the frames: random ones that see LEDs, listed ones, or a grid."""
 
 from typing import Annotated, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from vlcrender.camera.intrinsics import Camera, Pose, rotation_cam_world
+from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.config.toml_model import Settings
 from vlcrender.core.random_keys import stream
 from vlcrender.errors import InputError
 from vlcrender.scene.loader import Scene
-from vlcrender.scene.visibility import leds_in_view
+from vlcrender.scene.visibility import can_occlude_leds, leds_in_view
 
 Tilt = Annotated[float, Field(ge=-85, le=85)]
+MIN_RISE = 0.01
+"""Smallest sine of a ray's elevation towards its target."""
 TRIES = 10_000
 """Random positions and yaws tried for the tilts of one frame before the recipe is refused."""
 
 
 class AimedPoses(Settings):
-    """Random poses aimed at LEDs.
+    """Random poses that see LEDs.
 
-    Tilts are stratified over their ranges, so that few frames already span them. For each frame a target LED, a height
-    and a yaw are drawn. The camera is placed where its optical axis meets the target. The pose is kept if the camera is
-    inside the room and enough LEDs are whole in the image.
+    Tilts are stratified over their ranges, so that few frames already span them. For each frame a target LED, a height,
+    a yaw and a place in the image are drawn. The camera is placed where it images the target there. The pose is kept if
+    the camera is inside the room and enough LEDs are whole in the image, hidden in no part by furniture or panels.
     """
 
     kind: Literal["aimed"]
@@ -37,7 +39,7 @@ class AimedPoses(Settings):
     height_m: tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]]
     """Range of the projection centre's height over the floor, metres: [lowest, highest]."""
     min_leds: Annotated[int, Field(ge=1, le=1000)] = 4
-    """Smallest number of LEDs whole in the image."""
+    """Smallest number of LEDs whole in the image. An LED that something hides in part does not count."""
     wall_distance_m: Annotated[float, Field(gt=0, le=100)] = 0.2
     """Smallest distance of the camera from the walls, metres."""
     border_px: Annotated[float, Field(ge=0, le=10000)] = 20.0
@@ -130,21 +132,39 @@ def _aimed_pose(poses: AimedPoses, frame: int, seed: int, camera: Camera, scene:
     generator = stream(seed, frame, "aim")
     low_corner = np.array([poses.wall_distance_m, poses.wall_distance_m, 0.0])
     high_corner = scene.room_m - [poses.wall_distance_m, poses.wall_distance_m, 0.0]
+    image_px = np.array([camera.width_px, camera.height_px], dtype=np.float64)
+    border_px = np.minimum(poses.border_px, image_px / 2)
+    most = None  # LEDs that any pose inside the room saw
     for _ in range(TRIES):
         target = scene.leds.centers_m[generator.integers(len(scene.leds))]
         yaw = float(generator.uniform(-180, 180))
         height = float(generator.uniform(*poses.height_m))
-        axis_world = rotation_cam_world(tilt_x, tilt_y, yaw)[2]
-        if axis_world[2] <= 0.01 or height >= target[2]:
+        place_px = generator.uniform(border_px, image_px - border_px)
+        towards = PosedCamera(camera, Pose((0.0, 0.0, 0.0), tilt_x, tilt_y, yaw)).rays_world(place_px)
+        towards = towards / np.linalg.norm(towards)
+        if not towards[2] > MIN_RISE or height >= target[2]:  # also where the lens images nothing at this place: NaN
             continue
-        position = target - axis_world * (target[2] - height) / axis_world[2]
+        position = target - towards * (target[2] - height) / towards[2]
         position[2] = height
         if (position <= low_corner).any() or (position >= high_corner).any():
             continue
         pose = Pose((float(position[0]), float(position[1]), height), tilt_x, tilt_y, yaw)
-        if len(leds_in_view(PosedCamera(camera, pose), scene, poses.border_px)) >= poses.min_leds:
+        count = _leds_seen(PosedCamera(camera, pose), scene, poses)
+        if count >= poses.min_leds:
             return pose
+        most = max(count, most or 0)
+    seen = "none is inside the room" if most is None else f"the most that any pose sees is {most}"
     raise InputError(
         f"poses: frame {frame}: no position in {TRIES} tries sees {poses.min_leds} LEDs whole at tilts "
-        f"({tilt_x:.1f}, {tilt_y:.1f}) deg; lower min_leds or the tilts, or raise height_m"
+        f"({tilt_x:.1f}, {tilt_y:.1f}) deg: {seen}; lower min_leds or the tilts, or raise height_m"
     )
+
+
+def _leds_seen(posed: PosedCamera, scene: Scene, poses: AimedPoses) -> int:
+    """Number of LEDs whole in the image; of those that nothing hides, where the others are enough."""
+    found = leds_in_view(posed, scene, poses.border_px)
+    if len(found) < poses.min_leds or not can_occlude_leds(scene):
+        return len(found)
+    from vlcrender.light.line_of_sight import lines_of_sight  # loads Mitsuba
+
+    return len(lines_of_sight(scene).not_hidden(posed, found))

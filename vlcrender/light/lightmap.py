@@ -11,6 +11,7 @@ is kept in a cache under a hash of everything that it depends on.
 """
 
 import hashlib
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlcrender.core.backend import dr, exact_math, mi
+from vlcrender.core.warn_once import warn_once
 from vlcrender.light.bake_cache import BakedIlluminance, cache_folder, load, store
 from vlcrender.light.mitsuba_room import mitsuba_scene
 from vlcrender.scene.fresnel import glazing_reflectance
@@ -31,6 +33,7 @@ from vlcrender.scene.surfaces import Glazing, check_absorptance
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
+logger = logging.getLogger(__name__)
 
 CACHE_VERSION = 7
 """Raised with every change of the program that changes bakes of the same scene."""
@@ -95,8 +98,22 @@ def bake(scene: Scene, cache: Path | None = None, progress: Progress = lambda st
     if baked is None:
         baked = _compute(scene, mesh, progress)
         store(key, baked, folder)
+    _warn_of_dark_furniture(scene, mesh, baked)
     ambient = baked.daylight_lux + scene.settings.ambient.illuminance_lux
     return Lightmap(mesh, albedo, baked.led_lux, ambient, baked.sigma_lux)
+
+
+def _warn_of_dark_furniture(scene: Scene, mesh: Mesh, baked: BakedIlluminance) -> None:
+    """Warn of each piece of furniture that neither light of LEDs nor daylight reaches."""
+    lux = baked.led_lux + baked.daylight_lux
+    for number, piece in enumerate(scene.settings.furniture):
+        vertices = mesh.faces[mesh.owners == len(scene.surfaces) + number]
+        if lux[: len(mesh.vertices_m)].any() and not lux[vertices].any():
+            warn_once(
+                logger,
+                f"furniture[{number}].file = {piece.file!r}: no light falls on the front sides of its triangles; their "
+                "vertices must be counter-clockwise as seen from the lit side, and nothing may enclose them",
+            )
 
 
 def led_illuminance_lux(
@@ -117,7 +134,7 @@ def led_illuminance_lux(
         origins = points_m[here] + RAY_OFFSET_M * normals[here]
         lux = _unshadowed_lux(points_m[here], normals[here], sources, sources.centers_m)
         point, source = np.nonzero(lux > 0)
-        visible = ~_blocked(blockers, origins[point], sources.centers_m[source] - [0, 0, RAY_OFFSET_M])
+        visible = ~is_blocked(blockers, origins[point], sources.centers_m[source] - [0, 0, RAY_OFFSET_M])
         np.add.at(total[here], point, lux[point, source] * visible)
         for glazing in glazings:
             images_m = glazing.mirrored(sources.centers_m)
@@ -131,8 +148,8 @@ def led_illuminance_lux(
             within = glazing.contains(on_glazing)
             point, source, on_glazing = point[within], source[within], on_glazing[within]
             start_m = on_glazing + RAY_OFFSET_M * glazing.normal
-            visible = ~_blocked(blockers, origins[point], start_m)
-            visible &= ~_blocked(blockers, start_m, sources.centers_m[source] - [0, 0, RAY_OFFSET_M])
+            visible = ~is_blocked(blockers, origins[point], start_m)
+            visible &= ~is_blocked(blockers, start_m, sources.centers_m[source] - [0, 0, RAY_OFFSET_M])
             cosine = -slope[point, source] / np.linalg.norm(to_image[point, source], axis=1)
             reflected = lux[point, source] * glazing_reflectance(cosine, glazing.refractive_index, np.sqrt)
             np.add.at(total[here], point, reflected * visible)
@@ -152,7 +169,7 @@ def _unshadowed_lux(points_m: Array, normals: Array, sources: Sources, centers_m
     return lux
 
 
-def _blocked(blockers: Any, origins_m: Array, targets_m: Array) -> NDArray[np.bool_]:
+def is_blocked(blockers: Any, origins_m: Array, targets_m: Array) -> NDArray[np.bool_]:
     """Whether something lies between origins (n, 3) and targets (n, 3), (n,)."""
     if not len(origins_m):
         return np.zeros(0, dtype=bool)  # Dr.Jit has no empty arrays

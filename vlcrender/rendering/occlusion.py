@@ -14,6 +14,7 @@ from vlcrender.core.backend import dr, exact_math, mi
 from vlcrender.rendering.background import Background, differs_from_neighbour, sub_pixels
 from vlcrender.rendering.camera_data import CameraData
 from vlcrender.scene.loader import Scene
+from vlcrender.scene.visibility import can_occlude_leds
 
 DISTANCE_TOLERANCE = 1e-4
 """Relative difference below which two distances, computed in float32, count as equal."""
@@ -49,13 +50,7 @@ class Occlusion:
         self.heights_m = scene.leds.centers_m[:, 2]
         """Height of each LED's face, m, (n,): the plane that a ray has to reach. LEDs as built count as reached at the
         height of the scene's, because the scene's panels, which they would enter, are not moved."""
-        panels = scene.settings.panels
-        undersides_m = [grid.first_center_m[2] for grid in panels]
-        self.possible = (
-            bool(scene.settings.furniture)
-            or any(grid.frame is not None for grid in panels)
-            or min(undersides_m, default=np.inf) < scene.leds.centers_m[:, 2].max() * (1 - DISTANCE_TOLERANCE)
-        )
+        self.possible = can_occlude_leds(scene)
         """Whether anything in the scene can occlude an LED that is seen directly."""
 
     def with_varying_cameras(self) -> "Occlusion":

@@ -1,9 +1,11 @@
 """Furniture: PLY and OBJ meshes, and Mitsuba XML made of meshes, as part of a room's mesh.
 
-Closed meshes end up with every triangle's vertices counter-clockwise as seen from outside, which is the side that is
-lit. A body that is inside out is turned, with a warning: furniture is opaque, so that its outside is the only side
-that can be meant, and files of both senses are common. A closed mesh whose neighbouring triangles disagree is refused:
-which of them are wrong is not known before all are compared, and every modeller has the command for it.
+Bodies end up with every triangle's vertices counter-clockwise as seen from outside, which is the side that is lit. A
+body that is inside out is turned, with a warning: furniture is opaque, so that its outside is the only side that can be
+meant, and files of both senses are common. An open body, such as a box without its bottom, counts as closed by a fan of
+triangles over its opening; a body that is flat, or nearly so, has no inside and is left as it is. A closed mesh whose
+neighbouring triangles disagree is refused: which of them are wrong is not known before all are compared, and every
+modeller has the command for it.
 """
 
 import logging
@@ -33,6 +35,8 @@ ROOM_TOLERANCE_M = 1e-6
 """Rounding allowance of furniture that stands on a floor or at a wall."""
 MAX_SUBDIVISIONS = 64
 """Each subdivision halves the long edges of triangles: 64 go from any length to any texel."""
+MIN_HOLLOW = 0.005
+"""Volume over area^1.5 from which an open body has an inside; 0.06 for an open cube, 0.04 for a tray 1 x 1 x 0.05."""
 OBJ_ZERO_INDEX = re.compile(rb"^[ \t]*f[ \t](?:[^\r\n]*[ \t])?0+(?=[/ \t\r\n]|$)", re.MULTILINE)
 """A face of an OBJ file with vertex 0; vertices count from 1, and trimesh takes 0 for the last one."""
 
@@ -184,7 +188,7 @@ def _room_mesh(shape: _Shape, piece: Furniture, owner: int, scene: Scene) -> Mes
 
 
 def _face_outwards(mesh: trimesh.Trimesh, where: str) -> None:
-    """Turn bodies of a mesh that are closed and inside out, in place, with a warning; warn of meshes not closed.
+    """Turn bodies of a mesh that are inside out, in place, with a warning; warn of meshes not closed.
 
     Raises InputError for a closed mesh whose neighbouring triangles run their common edge the same way.
     """
@@ -196,6 +200,8 @@ def _face_outwards(mesh: trimesh.Trimesh, where: str) -> None:
     trimesh.repair.fix_inversion(mesh, multibody=True)
     if not _has_boundary(mesh.faces) and mesh.volume < 0:  # bodies that share edges, which trimesh leaves alone
         mesh.invert()
+    inwards = _open_and_inside_out(mesh)
+    mesh.faces = np.where(inwards[:, None], mesh.faces[:, ::-1], mesh.faces)
     turned = int((before != np.array(mesh.faces)).any(axis=1).sum())
     if turned:
         warn_once(logger, f"{where}: is inside out; {turned} of {len(before)} triangles were turned to face outwards")
@@ -203,6 +209,26 @@ def _face_outwards(mesh: trimesh.Trimesh, where: str) -> None:
         warn_once(
             logger, f"{where}: is not closed; seen from behind, a triangle shows the light that falls on its front"
         )
+
+
+def _open_and_inside_out(mesh: trimesh.Trimesh) -> NDArray[np.bool_]:
+    """Which triangles (k,) belong to open bodies that face inwards: their volume, closed by fans, is negative."""
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    inwards = np.zeros(len(faces), dtype=bool)
+    for body in trimesh.graph.connected_components(mesh.face_adjacency, nodes=np.arange(len(faces))):
+        edges = np.concatenate([faces[body][:, [0, 1]], faces[body][:, [1, 2]], faces[body][:, [2, 0]]])
+        _, which, count = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
+        boundary = edges[count[which.ravel()] == 1]
+        one_way = len(np.unique(edges, axis=0)) == len(edges)  # neighbours run their common edge in opposite directions
+        if not len(boundary) or not one_way:
+            continue
+        # a fan from the middle of the boundary adds no volume about this middle
+        corners = vertices[faces[body]] - vertices[np.unique(boundary)].mean(axis=0)
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        volume = float((corners[:, 0] * normals).sum()) / 6
+        area = float(np.linalg.norm(normals, axis=1).sum()) / 2
+        inwards[body] = volume < -MIN_HOLLOW * area**1.5
+    return inwards
 
 
 def _has_boundary(faces: Indices) -> bool:

@@ -17,6 +17,8 @@ TILTED_POSES = 5_000
 """Random poses of `tilted_visibility`."""
 TILT_LIMIT_DEG = 60.0
 """Largest tilt of `tilted_visibility` about each axis."""
+SAME_HEIGHT = 1e-4
+"""Relative difference below which two heights count as equal."""
 ENOUGH_LEDS = 4
 """LEDs in view that count as enough for a position."""
 
@@ -55,6 +57,17 @@ def leds_in_view(posed: PosedCamera, scene: Scene, margin_px: float = 0.0) -> ND
     seen = inside.all(axis=(-1, -2)) & (posed.pose.position_m[2] < leds.centers_m[candidates, 2])
     visible: NDArray[np.int64] = candidates[seen]
     return visible
+
+
+def can_occlude_leds(scene: Scene) -> bool:
+    """Whether anything in a scene can hide an LED: furniture, frames of panels, or a panel lower than an LED."""
+    panels = scene.settings.panels
+    lowest_m = min((grid.first_center_m[2] for grid in panels), default=np.inf)
+    return (
+        bool(scene.settings.furniture)
+        or any(grid.frame is not None for grid in panels)
+        or bool(lowest_m < scene.leds.centers_m[:, 2].max() * (1 - SAME_HEIGHT))
+    )
 
 
 def level_visibility(camera: Camera, scene: Scene, height_m: float, yaw_deg: float) -> Visibility:
