@@ -49,6 +49,8 @@ BACKGROUND_SIGMA = 3.0
 MIN_RING_PIXELS = 20
 # A ring whose variance exceeds the noise's by this many standard deviations has a structure.
 STRUCTURE_SIGMA = 4.0
+# Below this share of the variance, which noise of half a step exceeds, rounding errors are independent.
+MAX_ROUNDING_SHARE = 0.25
 # A sampling error with a smaller share of the noise's variance is left alone.
 MIN_SAMPLING_SHARE = 1e-3
 
@@ -382,7 +384,8 @@ def _light(readout: Readout, ellipse: _Ellipse, others: list[_Ellipse], denoise_
         background_e = float(electrons[ring].mean())
         if np.count_nonzero(ring) >= MIN_RING_PIXELS:
             unlit = support & (electrons - background_e <= gate_e)
-            variance_e2[unlit] += _excess_variance(readout, readout.raw_e[roi][ring], float(variance_e2[ring].mean()))
+            excess_e2 = _excess_variance(readout, readout.raw_e[roi][ring], float(variance_e2[ring].mean()))
+            variance_e2[unlit] = np.maximum(variance_e2[unlit] + excess_e2, 0.0)
     signal_e = np.where(support, electrons - background_e, 0.0)
     return _Light(roi, u_px, v_px, electrons, support, signal_e, variance_e2)
 
@@ -393,10 +396,11 @@ def _excess_variance(readout: Readout, ring_e: NDArray[np.float32], model_e2: fl
     It is negative where the ADC's steps exceed the noise: neighbouring pixels are then rounded alike, while the model's
     rounding errors are independent. It is positive where the background has a structure.
     """
-    # The variance of n normal numbers has a relative standard deviation of sqrt(2 / n).
-    noise_e2 = STRUCTURE_SIGMA * np.sqrt(2 / ring_e.size) * model_e2
     excess_e2 = float(ring_e.var(ddof=1, dtype=np.float64)) - model_e2
-    return excess_e2 if excess_e2 > noise_e2 else max(min(excess_e2, 0.0), -readout.rounding_e2)
+    if readout.rounding_e2 > MAX_ROUNDING_SHARE * model_e2:
+        return excess_e2
+    # The variance of n normal numbers has a relative standard deviation of sqrt(2 / n).
+    return excess_e2 if excess_e2 > STRUCTURE_SIGMA * np.sqrt(2 / ring_e.size) * model_e2 else 0.0
 
 
 def _narrowed(readout: Readout, ellipse: _Ellipse, others: list[_Ellipse]) -> _Ellipse:
