@@ -317,3 +317,27 @@ def test_the_margin_holds_the_blur_that_the_smoothing_hides() -> None:
     (spot,) = detect([Readout(0, 0, exposed, exposed, none_full)], image.size, 0, lens=LensBlur(sharp=False))
     assert spot.u_px == pytest.approx((light * u).sum() / light.sum(), abs=1e-5)
     assert spot.v_px == pytest.approx((light * v).sum() / light.sum(), abs=1e-5)
+
+
+def blank(value_e: float, size_px: int = 60) -> Array:
+    return np.full((size_px, size_px), value_e)
+
+
+def test_a_frame_without_a_spot_says_what_was_seen() -> None:
+    """Nothing; a quarter of the frame; 147 e before 100 e a pixel, 1 sigma; a pixel in the frame's corner, which the
+    5 x 5 mean spreads over 9 px.
+    """
+    with pytest.raises(EstimationFailure, match=r"^detect: no spot found; no area is brighter than 100 e$"):
+        spots_of(blank(100.0))
+    walled = blank(100.0)
+    walled[:30, :30] = 1000.0
+    with pytest.raises(EstimationFailure, match=r"bright areas: 1 larger than 0.1 of the sensor$"):
+        spots_of(walled)
+    faint = blank(100.0)
+    faint[25:32, 20:27] += 3.0
+    with pytest.raises(EstimationFailure, match=r"bright areas: 1 fainter than 5 sigma$"):
+        spots_of(faint)
+    cornered = blank(100.0)
+    cornered[0, 0] = 200.0
+    with pytest.raises(EstimationFailure, match=r"bright areas: 1 smaller than 16 px$"):
+        spots_of(cornered)

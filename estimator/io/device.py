@@ -203,8 +203,8 @@ class Sensor(Row):
 
         Offsets of whole rows and columns are left out: subtracting a spot's local background removes most of them.
         """
-        adc_noise_e = self.adc_noise_dn * self.gain_e_per_dn
-        return self.dsnu_e**2 + self.read_noise_e**2 + adc_noise_e**2 + self.rounding_e2()
+        added = self.dsnu_e**2 + self.read_noise_e**2 + (self.adc_noise_dn * self.gain_e_per_dn) ** 2
+        return added + self.rounding_e2()
 
     def rounding_e2(self) -> float:
         """Variance of the ADC's rounding, electrons squared; 0 where whole electrons are counted."""

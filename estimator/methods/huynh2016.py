@@ -1,5 +1,8 @@
 """Huynh & Yoo, Sensors 2016: denoise, detect the LEDs, level by gravity, ranges from pairs, position from ranges.
 
+LEDs may be at unequal heights: they send three coordinates, though the paper's figures show one ceiling. What had to be
+filled in for them is in `estimator.solvers.ranging` and `estimator.solvers.trilateration`.
+
 Each stage can be chosen by name: `huynh2016:denoise=none,position=z-shift`. The default of every stage is the corrected
 one.
 """

@@ -25,9 +25,9 @@ def position_from_ranges(leds_m: Floats, ranges_m: Floats) -> Floats:
     Huynh & Yoo 2016, Eq. 4: differences of the spheres are linear in x and y and do not contain z if the LEDs are at
     one height. x and y follow by least squares, z from the spheres: `z = z_L - sqrt(mean(d^2 - rho^2))`. At unequal
     heights, with LEDs at z_L + e, a sphere is that of an LED at z_L with the squared range d^2 - 2 h e - e^2, where
-    h = z_L - z: x, y and h are then computed in turns.
-    Raises EstimationFailure for fewer than three LEDs, LEDs on one line in x and y, a negative mean, and LEDs whose
-    heights differ so much that the turns do not converge.
+    h = z_L - z: x, y and h are then computed in turns. Where the turns end in no position, as by a wrong map or below a
+    steep plane of LEDs, the position is that of `position_by_range_fit`.
+    Raises EstimationFailure for fewer than three LEDs, LEDs on one line in x and y, and ranges that no position fits.
     """
     check_pattern(leds_m, needed=3, flat=True)
     planar, heights_m = leds_m[:, :2], leds_m[:, 2]
@@ -41,11 +41,13 @@ def position_from_ranges(leds_m: Floats, ranges_m: Floats) -> Floats:
         solution, *_ = np.linalg.lstsq(2 * offsets, (offsets**2).sum(axis=1) - ranges2, rcond=None)
         height_m2 = float((ranges2 - ((offsets - solution) ** 2).sum(axis=1)).mean())
         if height_m2 < 0:
-            raise EstimationFailure("position", "the ranges are too short to reach the LEDs from below")
+            break
         before_m, height_m = height_m, float(np.sqrt(height_m2))
         if not above_m.any() or abs(height_m - before_m) < CONVERGED_M:
             return np.array([*(centre + solution), ceiling_m - height_m])
-    raise EstimationFailure("position", "the LEDs' heights differ too much for Eq. 4")
+    if above_m.any() and (ranges_m > 0).all():
+        return position_by_range_fit(leds_m, ranges_m)
+    raise EstimationFailure("position", "the ranges are too short to reach the LEDs from below")
 
 
 def position_by_shifted_leds(leds_m: Floats, ranges_m: Floats) -> Floats:

@@ -49,6 +49,8 @@ BACKGROUND_SIGMA = 3.0
 MIN_RING_PIXELS = 20
 # A ring whose variance exceeds the noise's by this many standard deviations has a structure.
 STRUCTURE_SIGMA = 4.0
+# Below this share of the variance, which noise of half a step exceeds, rounding errors are independent.
+MAX_ROUNDING_SHARE = 0.25
 # A sampling error with a smaller share of the noise's variance is left alone.
 MIN_SAMPLING_SHARE = 1e-3
 
@@ -125,6 +127,15 @@ class _Ellipse:
         return np.asarray(np.sqrt((self.axes**2) @ (self.semi_axes_px + padding_px) ** 2))
 
 
+@dataclass(frozen=True, eq=False)
+class _Measured:
+    """A spot before the correction for sampling; second moments along u and v, (2,), and their standard deviations."""
+
+    spot: Spot
+    moments_px2: NDArray[np.float64]
+    moment_sigmas_px2: NDArray[np.float64]
+
+
 def detect(
     readouts: Sequence[Readout],
     sensor_px: int,
@@ -140,32 +151,42 @@ def detect(
     a brighter light elsewhere does not hide them; without them, or if nothing was read out there, it is the image's
     maximum. `any_square` says that LEDs may be square: the ellipse for the centroid then encloses the square.
     `lens` says how sharp LED images are. `denoise_radius_px` is the radius of the box that the denoiser averaged over,
-    0 for raw images, whose centroids alone are corrected for sampling. An LED image that
-    may be cut by the border of its region is reported and flagged. Raises EstimationFailure if there is none at all.
+    0 for raw images, whose centroids alone are corrected for sampling. An LED image that may be cut by the border of
+    its region is reported and flagged. Raises EstimationFailure, which says what was seen in place of LEDs, if there is
+    none at all.
     """
     size = (SMOOTHING_PX, SMOOTHING_PX)
     smooth = [cv2.blur(readout.image_e, size, borderType=cv2.BORDER_REPLICATE) for readout in readouts]
     whole = sum(image.size for image in smooth) == sensor_px and len(smooth) == 1
     background_e, threshold_e = _levels(smooth, whole, _brightest(readouts, smooth, decoded_px, near_px))
-    spots: list[Spot] = []
+    measured: list[_Measured] = []
+    found, small, large = 0, 0, 0
     for readout, image in zip(readouts, smooth, strict=True):
         stretch = SQUARE_STRETCH if any_square else 1.0
-        ellipses = _ellipses(image, background_e, threshold_e, MAX_BLOB_OF_FRAME * sensor_px, stretch)
-        spots += _spots(readout, ellipses, denoise_radius_px, any_square, lens)
-    if not spots:
-        raise EstimationFailure("detect", "no spot found")
-    return tuple(spots)
+        ellipses, sizes = _ellipses(image, background_e, threshold_e, MAX_BLOB_OF_FRAME * sensor_px, stretch)
+        found, small, large = found + len(ellipses), small + sizes[0], large + sizes[1]
+        measured += _spots(readout, ellipses, denoise_radius_px)
+    if not measured:
+        causes = [
+            (small, f"smaller than {MIN_BLOB_PX} px"),
+            (large, f"larger than {MAX_BLOB_OF_FRAME:g} of the sensor"),
+            (found, f"fainter than {MIN_SIGNAL_TO_NOISE:g} sigma"),
+        ]
+        told = [f"{count} {cause}" for count, cause in causes if count]
+        why = f"bright areas: {', '.join(told)}" if told else f"no area is brighter than {threshold_e:.3g} e"
+        raise EstimationFailure("detect", f"no spot found; {why}")
+    if denoise_radius_px > 0:
+        return tuple(one.spot for one in measured)
+    return tuple(_corrected_for_sampling(measured, any_square, lens))
 
 
-def _spots(
-    readout: Readout, ellipses: Sequence[_Ellipse], denoise_radius_px: int, any_square: bool, lens: LensBlur
-) -> list[Spot]:
+def _spots(readout: Readout, ellipses: Sequence[_Ellipse], denoise_radius_px: int) -> list[_Measured]:
     """Measure each ellipse of a region, given those near it."""
     if denoise_radius_px == 0:
         narrowed = [_narrowed(readout, e, others) for e, others in _with_neighbours(ellipses, denoise_radius_px)]
         ellipses = narrowed
     measured = [
-        _measure(readout, ellipse, others, denoise_radius_px, any_square, lens)
+        _measure(readout, ellipse, others, denoise_radius_px)
         for ellipse, others in _with_neighbours(ellipses, denoise_radius_px)
     ]
     return [spot for spot in measured if spot is not None]
@@ -222,8 +243,11 @@ def _levels(smooth: Sequence[NDArray[np.float32]], whole: bool, brightest_e: flo
 
 def _ellipses(
     smooth: NDArray[np.float32], background_e: float, threshold_e: float, largest_px: float, stretch: float
-) -> list[_Ellipse]:
-    """Blobs above the threshold, cut at half of their own level, as ellipses with axes longer by `stretch`."""
+) -> tuple[list[_Ellipse], tuple[int, int]]:
+    """Blobs above the threshold, cut at half of their own level, as ellipses with axes longer by `stretch`.
+
+    Also returns how many blobs are too small, and too large.
+    """
     mask = (smooth > threshold_e).view(np.uint8)
     # Finding contours is a hundred times faster than labelling a large image.
     outlines, nesting = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
@@ -231,6 +255,7 @@ def _ellipses(
         [outline for outline, (*_, parent) in zip(outlines, nesting[0], strict=True) if parent < 0] if outlines else []
     )
     ellipses = []
+    small, large = 0, 0
     for outline in sorted(outer, key=len, reverse=True)[:MAX_BLOBS]:
         left, top, width, height = cv2.boundingRect(outline)
         roi = np.s_[top : top + height, left : left + width]
@@ -239,6 +264,7 @@ def _ellipses(
         own = labels == labels[row - top, column - left]
         values = smooth[roi][own]
         if not MIN_BLOB_PX <= len(values) <= largest_px:
+            small, large = small + (len(values) < MIN_BLOB_PX), large + (len(values) > largest_px)
             continue
         # The upper quartile is the plateau of an LED image; the maximum would be its noise.
         quartile = 3 * len(values) // 4
@@ -252,7 +278,7 @@ def _ellipses(
                 box = np.array([left, top]), np.array([left + width, top + height])
                 ellipse = replace(ellipse, fringe_px=_fringe_px(ellipse, *box))
             ellipses.append(ellipse)
-    return ellipses
+    return ellipses, (small, large)
 
 
 def _ellipse(core: NDArray[np.bool_], left: int, top: int, stretch: float) -> _Ellipse:
@@ -322,8 +348,8 @@ class _Light:
         return np.array([[uu, mixed], [mixed, vv]]) / self.flux_e
 
     def moment_sigmas_px2(self, centroid_px: NDArray[np.float64], moments: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Standard deviations (2,) of the second moments along u and v by the pixels' noise."""
-        along = (self.u_px - centroid_px[0]) ** 2 - moments[0, 0], (self.v_px - centroid_px[1]) ** 2 - moments[1, 1]
+        """Standard deviations (2,) of the second moments (2,) along u and v by the pixels' noise."""
+        along = (self.u_px - centroid_px[0]) ** 2 - moments[0], (self.v_px - centroid_px[1]) ** 2 - moments[1]
         noise = [float((np.where(self.support, one, 0.0) ** 2 * self.variance_e2).sum()) for one in along]
         return np.sqrt(noise) / self.flux_e
 
@@ -358,7 +384,8 @@ def _light(readout: Readout, ellipse: _Ellipse, others: list[_Ellipse], denoise_
         background_e = float(electrons[ring].mean())
         if np.count_nonzero(ring) >= MIN_RING_PIXELS:
             unlit = support & (electrons - background_e <= gate_e)
-            variance_e2[unlit] += _excess_variance(readout, readout.raw_e[roi][ring], float(variance_e2[ring].mean()))
+            excess_e2 = _excess_variance(readout, readout.raw_e[roi][ring], float(variance_e2[ring].mean()))
+            variance_e2[unlit] = np.maximum(variance_e2[unlit] + excess_e2, 0.0)
     signal_e = np.where(support, electrons - background_e, 0.0)
     return _Light(roi, u_px, v_px, electrons, support, signal_e, variance_e2)
 
@@ -369,10 +396,11 @@ def _excess_variance(readout: Readout, ring_e: NDArray[np.float32], model_e2: fl
     It is negative where the ADC's steps exceed the noise: neighbouring pixels are then rounded alike, while the model's
     rounding errors are independent. It is positive where the background has a structure.
     """
-    # The variance of n normal numbers has a relative standard deviation of sqrt(2 / n).
-    noise_e2 = STRUCTURE_SIGMA * np.sqrt(2 / ring_e.size) * model_e2
     excess_e2 = float(ring_e.var(ddof=1, dtype=np.float64)) - model_e2
-    return excess_e2 if excess_e2 > noise_e2 else max(min(excess_e2, 0.0), -readout.rounding_e2)
+    if readout.rounding_e2 > MAX_ROUNDING_SHARE * model_e2:
+        return excess_e2
+    # The variance of n normal numbers has a relative standard deviation of sqrt(2 / n).
+    return excess_e2 if excess_e2 > STRUCTURE_SIGMA * np.sqrt(2 / ring_e.size) * model_e2 else 0.0
 
 
 def _narrowed(readout: Readout, ellipse: _Ellipse, others: list[_Ellipse]) -> _Ellipse:
@@ -394,40 +422,38 @@ def _narrowed(readout: Readout, ellipse: _Ellipse, others: list[_Ellipse]) -> _E
     return ellipse
 
 
-def _corrected_for_sampling(
-    light: _Light,
-    centroid: NDArray[np.float64],
-    covariance_px2: NDArray[np.float64],
-    any_square: bool,
-    lens: LensBlur,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Centroid without its sampling error as far as it is known, and its covariance with the rest of that error.
+def _corrected_for_sampling(spots: Sequence[_Measured], any_square: bool, lens: LensBlur) -> list[Spot]:
+    """Spots without their sampling errors as far as these are known, the rest in the covariances.
 
     The image of a square depends on its orientation, that of a lens with blur on the blur: there the error is variance
-    alone, as over all positions.
+    alone, as over all positions. All spots at once: one by one takes fifty times as long.
     """
-    moments = light.moments_px2(centroid)
-    own_px2 = np.maximum(np.diag(moments) - PIXEL_VARIANCE, 0.0)
+    if not spots:
+        return []
+    centroids = np.array([(one.spot.u_px, one.spot.v_px) for one in spots])
+    covariances = np.array([one.spot.covariance_px2 for one in spots])
+    moments = np.array([one.moments_px2 for one in spots])
+    noise_px2 = np.diagonal(covariances, axis1=1, axis2=2)
     # A semi-ellipse of half extent a has the second moment a^2 / 4, a line a^2 / 3.
-    half_px = np.sqrt((3 if any_square else 4) * own_px2)
-    variance_px2 = lens.transfer**2 * sampling_variance_px2(half_px, any_square)
-    if (variance_px2 < MIN_SAMPLING_SHARE * np.diag(covariance_px2)).all():
-        return centroid, covariance_px2
-    if any_square or not lens.sharp:
-        return centroid, covariance_px2 + np.diag(variance_px2)
-    found = sampling_error(centroid, np.diag(moments), light.moment_sigmas_px2(centroid, moments))
-    corrected = covariance_px2 / np.outer(found.slope, found.slope) + np.diag(found.variance_px2)
-    return centroid - found.error_px, corrected
+    half_px = np.sqrt((3 if any_square else 4) * np.maximum(moments - PIXEL_VARIANCE, 0.0))
+    added_px2 = lens.transfer**2 * sampling_variance_px2(half_px.ravel(), any_square).reshape(-1, 2)
+    matters = (added_px2 >= MIN_SAMPLING_SHARE * noise_px2).any(axis=1)
+    added_px2[~matters] = 0.0
+    if lens.sharp and not any_square and matters.any():
+        sigmas = np.array([one.moment_sigmas_px2 for one in spots])
+        found = sampling_error(centroids[matters].ravel(), moments[matters].ravel(), sigmas[matters].ravel())
+        slope = found.slope.reshape(-1, 2)
+        centroids[matters] -= found.error_px.reshape(-1, 2)
+        covariances[matters] /= slope[:, :, None] * slope[:, None, :]
+        added_px2[matters] = found.variance_px2.reshape(-1, 2)
+    covariances += added_px2[:, :, None] * np.eye(2)
+    return [
+        replace(one.spot, u_px=float(u_px), v_px=float(v_px), covariance_px2=covariance)
+        for one, (u_px, v_px), covariance in zip(spots, centroids, covariances, strict=True)
+    ]
 
 
-def _measure(
-    readout: Readout,
-    ellipse: _Ellipse,
-    others: list[_Ellipse],
-    denoise_radius_px: int,
-    any_square: bool,
-    lens: LensBlur,
-) -> Spot | None:
+def _measure(readout: Readout, ellipse: _Ellipse, others: list[_Ellipse], denoise_radius_px: int) -> _Measured | None:
     """Centroid and covariance of one spot; None if its signal-to-noise ratio is too small."""
     height_px, width_px = readout.image_e.shape
     light = _light(readout, ellipse, others, denoise_radius_px)
@@ -439,14 +465,13 @@ def _measure(
     levers = np.stack([light.support * (u_px - centroid[0]), light.support * (v_px - centroid[1])]) / light.flux_e
     weights = np.stack([cv2.blur(lever, box, borderType=cv2.BORDER_CONSTANT).ravel() for lever in levers])
     covariance = (weights * light.variance_e2.ravel()) @ weights.T
-    if denoise_radius_px == 0:
-        centroid, covariance = _corrected_for_sampling(light, centroid, covariance, any_square, lens)
+    moments = np.diag(light.moments_px2(centroid))
 
     inside = ellipse.distance2(u_px, v_px, 0.0) <= 1
     brightest = np.unravel_index(np.argmax(np.where(inside, light.electrons, -np.inf)), inside.shape)
     margin_px = MARGIN_PX + max(denoise_radius_px, ellipse.fringe_px)
     low, high = ellipse.low_px - margin_px, ellipse.high_px + margin_px
-    return Spot(
+    spot = Spot(
         u_px=float(centroid[0]) + readout.column,
         v_px=float(centroid[1]) + readout.row,
         covariance_px2=covariance,
@@ -457,3 +482,4 @@ def _measure(
         touches_border=bool((low < 0).any() or high[0] > width_px or high[1] > height_px),
         saturated=bool(readout.clipped[light.roi][inside].any()),
     )
+    return _Measured(spot, moments, light.moment_sigmas_px2(centroid, moments))

@@ -63,7 +63,7 @@ def lens_blur(camera: Camera) -> LensBlur:
 
 @dataclass(frozen=True, eq=False)
 class SamplingError:
-    """Errors of a centroid along u and v by sampling, all (2,).
+    """Errors of coordinates of centroids by sampling, all (n,).
 
     `error_px` is the error to subtract, `variance_px2` the variance of the error that remains, `slope` the derivative
     of the centroid by the true one: noise in the centroid is noise of 1 / `slope` times that in the corrected one.
@@ -86,12 +86,12 @@ def sampling_variance_px2(half_extent_px: Floats, square: bool) -> Floats:
 
 
 def sampling_error(centroid_px: Floats, moments_px2: Floats, moment_sigmas_px2: Floats) -> SamplingError:
-    """Sampling error of a sharp, uniform ellipse along u and v, from its centroid and second moments by pixels, (2,).
+    """Sampling errors of sharp, uniform ellipses, from coordinates of centroids and second moments by pixels, (n,).
 
-    The half extents follow from the second moments about the centroid, whose standard deviations by noise are
-    `moment_sigmas_px2`. A standard deviation s of the half extent makes the phase of U(k) uncertain by 2 pi k s: the
-    expected error shrinks by the mean of a cosine, exp(-(2 pi k s)^2 / 2), and the rest is variance. If the pixels do
-    not determine position and size, the error is 0 and its variance that over all positions.
+    A coordinate is u or v; its second moment about the centroid, which has the standard deviation `moment_sigmas_px2`
+    by noise, gives the half extent along it. A standard deviation s of the half extent makes the phase of U(k)
+    uncertain by 2 pi k s: the expected error shrinks by the mean of a cosine, exp(-(2 pi k s)^2 / 2), and the rest is
+    variance. If the pixels do not determine position and size, the error is 0 and its variance that over all positions.
     """
     true_px, half_px, solved = _solve(centroid_px, moments_px2)
     step_px = 1e-3
@@ -113,7 +113,7 @@ def sampling_error(centroid_px: Floats, moments_px2: Floats, moment_sigmas_px2: 
 
 
 def _solve(centroid_px: Floats, moments_px2: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    """True centroids and half extents (2,) for sampled centroids and second moments, and whether they were found."""
+    """True centroids and half extents (n,) for sampled centroids and second moments, and whether they were found."""
     true_px = centroid_px
     half_px = 2 * np.sqrt(np.maximum(moments_px2 - PIXEL_VARIANCE, MIN_HALF_EXTENT_PX**2 / 4))
     for _ in range(MAX_ROUNDS):
@@ -131,9 +131,9 @@ def _solve(centroid_px: Floats, moments_px2: Floats) -> tuple[Floats, Floats, ND
 
 
 def _error(true_px: Floats, half_px: Floats, weights: Floats | float = 1.0) -> tuple[Floats, Floats]:
-    """Sampling error (2,) of ellipses at true centroids (2,), and the sampled centroid's slope by the true one, (2,).
+    """Sampling errors (n,) of ellipses at true centroids (n,), and slopes (n,) of the sampled centroids by the true.
 
-    `weights` (2, k) multiply the harmonics.
+    `weights` (n, k) multiply the harmonics.
     """
     x, phase = 2 * np.pi * HARMONICS * half_px[:, None], 2 * np.pi * HARMONICS * true_px[:, None]
     spectrum = weights * 2 * j1(x) / x
@@ -142,7 +142,7 @@ def _error(true_px: Floats, half_px: Floats, weights: Floats | float = 1.0) -> t
 
 
 def _moments(true_px: Floats, half_px: Floats) -> Floats:
-    """Second moments (2,), px^2, by pixels about the sampled centroid, of ellipses at true centroids (2,)."""
+    """Second moments (n,), px^2, by pixels about the sampled centroid, of ellipses at true centroids (n,)."""
     x, phase = 2 * np.pi * HARMONICS * half_px[:, None], 2 * np.pi * HARMONICS * true_px[:, None]
     spectrum, slopes = 2 * j1(x) / x, -4 * np.pi * half_px[:, None] * jv(2, x) / x
     excess = (np.cos(phase) * (spectrum / HARMONICS**2 - slopes / HARMONICS)).sum(axis=1) / np.pi**2
