@@ -1,11 +1,26 @@
-"""Robust fit: the pose that explains gravity and all spots, or else the largest consistent set of them (inliers)."""
+"""Robust fit: the pose that explains gravity and the spots, which spots it leaves out, and how large the errors are.
+
+Data snooping (Baarda 1968) finds outliers: each spot's displacement from where the other observations put it is tested
+against its own covariance, and the worst spot is left out until none is beyond OUTLIER_PROBABILITY. Where all spots pass
+with the errors that the device states, that fit is the result. Otherwise several explanations compete, each fitted to the
+spots that it leaves in, from poses that put most spots about right:
+
+- errors as stated, and outliers;
+- stated errors of camera and map that are larger or smaller by a common factor, estimated from the residuals;
+- where the map's errors are not stated: a further error of each centroid, of a size estimated from the residuals. A
+  camera that states nothing then has the errors of one as sold (`estimator.solvers.uncertainty`), because the
+  residuals hardly reveal a focal length;
+- each of them without gravity, where `gravity_optional`.
+
+The explanation with the largest restricted likelihood is taken; an outlier lies anywhere in OUTLIER_RADIUS.
+"""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.stats import chi2, f
 
 from estimator.camera.pose import Pose
 from estimator.camera.projection import projection_of
@@ -23,6 +38,17 @@ MODEL_ERROR_PX = 0.1
 MIN_SPOTS = 3
 MIN_INLIERS = 4
 MAX_ROBUST_STARTS = 3
+# Standard deviations about a rough pose within which spots take part in data snooping.
+START_GATE = 5.0
+# Median of chi-square with two degrees of freedom.
+CHI2_MEDIAN = 2 * np.log(2)
+# Repetitions that estimate the size of errors, by the median of spots with outliers and by all spots without, and the
+# largest change of its square in one.
+ROBUST_ROUNDS = 3
+MOMENT_ROUNDS = 3
+MAX_RATIO = 100.0
+# Share of the image's width within which an outlier may lie anywhere: as far as a decoded pixel may be from a spot.
+OUTLIER_RADIUS = 0.01
 # Poses closer than both lead to one minimum.
 SAME_MINIMUM_RAD = 0.01
 SAME_MINIMUM_M = 0.1
@@ -33,13 +59,15 @@ class Consensus:
     """A fitted pose and the spots it is based on.
 
     `best` is the best fit, `others` are fits of other local minima to the same spots, best first; `inliers` (n,) are
-    the spots used; `gravity` says whether the accelerometer was used.
+    the spots used; `gravity` says whether the accelerometer was used. `model` are the observations with the size of
+    errors that explains them, None where it is as stated.
     """
 
     best: Fit
     others: tuple[Fit, ...]
     inliers: NDArray[np.bool_]
     gravity: bool
+    model: Observations | None = None
 
     @property
     def covariance_m2(self) -> Floats:
@@ -54,46 +82,253 @@ class Consensus:
 
 
 def consensus(
-    observations: Observations, starts: Sequence[Pose], more_starts: Callable[[], Iterable[Pose]]
+    observations: Observations,
+    starts: Sequence[Pose],
+    more_starts: Callable[[], Iterable[Pose]],
+    gravity_optional: bool = False,
 ) -> Consensus:
-    """Fit from every initial pose; if the best fit does not explain all spots, find the inliers and fit those.
+    """Fit from every initial pose; if the best fit does not explain all spots, find the best explanation.
 
-    `more_starts` gives initial poses for observations with outliers. For a lens that bends straight lines the fit is
-    repeated with centroids corrected by the first pose. Raises EstimationFailure if too few spots agree, or no pose has
-    the LEDs in front of the camera and above it.
+    `more_starts` gives initial poses for observations with outliers. `gravity_optional` says that the accelerometer's
+    reading may be the outlier. For a lens that bends straight lines the fit is repeated with centroids corrected by the
+    first pose. Raises EstimationFailure if too few spots agree, or no pose has the LEDs in front of the camera and above
+    it.
     """
-    agreed = _consensus(observations, starts, more_starts)
+    agreed = _consensus(observations, starts, more_starts, gravity_optional)
     if projection_of(observations.camera).rectilinear:
         return agreed
     poses = [found.pose for found in (agreed.best, *agreed.others)]
-    return _consensus(corrected_for_eccentricity(observations, agreed.best.pose), poses, more_starts)
+    corrected = corrected_for_eccentricity(observations, agreed.best.pose)
+    return _consensus(corrected, poses, more_starts, gravity_optional)
 
 
 def _consensus(
     observations: Observations,
     starts: Sequence[Pose],
     more_starts: Callable[[], Iterable[Pose]],
+    gravity_optional: bool,
 ) -> Consensus:
-    gravity = bool(np.isfinite(observations.tilt_sigma_rad).all())
     everything = np.ones(len(observations.leds_m), dtype=bool)
     if len(everything) < MIN_SPOTS:
         raise EstimationFailure("position", f"LEDs identified: {len(everything)}, needed: {MIN_SPOTS}")
     fits = minima(observations, starts)
     if fits and _explains_all(fits[0], observations):
-        return Consensus(fits[0], fits[1:], everything, gravity)
-    for robust in minima(observations, [*starts, *more_starts()], robust=True)[:MAX_ROBUST_STARTS]:
+        return Consensus(fits[0], fits[1:], everything, _uses_gravity(observations))
+    more = list(more_starts())
+    found: list[_Explanation] = []
+    for with_or_without in [observations, *([observations.without_gravity()] if gravity_optional else [])]:
+        found += _explanations(with_or_without, starts, more)
+    if not found:
+        raise EstimationFailure("position", "no pose explains gravity and most of the spots")
+    return min(found, key=lambda one: one.score).consensus
+
+
+@dataclass(frozen=True, eq=False)
+class _Explanation:
+    """A consensus, and its score: minus twice the logarithm of its restricted likelihood."""
+
+    consensus: Consensus
+    score: float
+
+
+def _explanations(observations: Observations, starts: Sequence[Pose], more: Sequence[Pose]) -> list[_Explanation]:
+    """Explanations of the spots by errors as stated with outliers, and by errors of a size by the residuals."""
+    found: list[Consensus | None] = []
+    if not observations.correlated:
+        found.append(_exact_consensus(observations, starts, more))
+    poses = [*starts, *more]
+    assumed = observations.with_assumed_camera()
+    for adapted in (False, True):
+        found.append(_snooped_consensus(assumed, starts, poses, adapted))
+    return [_Explanation(one, _score(one, observations)) for one in found if one is not None]
+
+
+def _exact_consensus(observations: Observations, starts: Sequence[Pose], more: Sequence[Pose]) -> Consensus | None:
+    """The largest set of spots that one pose explains to the centroids' errors, if it holds most of them."""
+    for robust in minima(observations, [*starts, *more], robust=True)[:MAX_ROBUST_STARTS]:
         inliers = _explained(robust, observations)
-        while inliers.sum() >= MIN_INLIERS and 2 * inliers.sum() > len(inliers):
+        while _enough(inliers):
             chosen = observations.only(inliers)
             fits = minima(chosen, [robust.pose, *starts])
             if fits and _explains_all(fits[0], chosen):
-                return Consensus(fits[0], fits[1:], inliers, gravity)
+                return Consensus(fits[0], fits[1:], inliers, _uses_gravity(observations), observations)
             if not fits or _explained(fits[0], chosen).all():
                 break
             # Remove the worst spot alone: it pulls the fit, and with it the residuals of true spots.
             inliers = inliers.copy()
             inliers[np.flatnonzero(inliers)[np.argmax(fits[0].spots_chi2)]] = False
-    raise EstimationFailure("position", "no pose explains gravity and most of the spots")
+    return None
+
+
+def _enough(inliers: NDArray[np.bool_]) -> bool:
+    return bool(inliers.sum() >= MIN_INLIERS and 2 * inliers.sum() > len(inliers))
+
+
+def _snooped_consensus(
+    observations: Observations, starts: Sequence[Pose], poses: Sequence[Pose], adapted: bool
+) -> Consensus | None:
+    """Spots that pass data snooping, from the pose that puts most of them about right; None if too few do.
+
+    `adapted`: the size of the errors is estimated from the residuals.
+    """
+    for pose, distance_px in _ranked(observations, poses)[:MAX_ROBUST_STARTS]:
+        spread_px = _spread_px(distance_px)
+        inliers = distance_px <= np.maximum(START_GATE * spread_px, _gate_px(observations, pose))
+        trial = (
+            replace(observations, added_sigma_px=spread_px) if adapted and not _scalable(observations) else observations
+        )
+        found = _snooped(trial, pose, inliers, adapted)
+        if found is None:
+            continue
+        model, best, inliers = found
+        chosen = model.only(inliers)
+        fits = minima(chosen, [best.pose, *starts])
+        if fits and _passes(fits[0], chosen, adapted).all():
+            return Consensus(fits[0], fits[1:], inliers, _uses_gravity(observations), model)
+    return None
+
+
+def _ranked(observations: Observations, poses: Sequence[Pose]) -> list[tuple[Pose, Floats]]:
+    """Poses with the distances (n,) of the spots from where they put them, pixels; best half of the spots first.
+
+    The best ones are refitted to that half. A spot with its LED behind the camera is infinitely far.
+    """
+    half = len(observations.leds_m) // 2 + 1
+
+    def judged(pose: Pose) -> tuple[float, Pose, Floats]:
+        distance_px = _distance_px(observations, pose)
+        return float((np.sort(distance_px)[:half] ** 2).sum()), pose, distance_px
+
+    ranked = sorted((judged(pose) for pose in poses), key=lambda one: one[0])
+    ranked = [one for one in ranked if np.isfinite(one[0])][:MAX_ROBUST_STARTS]
+    refitted = []
+    for _, pose, distance_px in ranked:
+        nearest = np.zeros(len(distance_px), dtype=bool)
+        nearest[np.argsort(distance_px, kind="stable")[: max(half, MIN_SPOTS)]] = True
+        chosen = replace(observations.only(nearest), added_sigma_px=_spread_px(distance_px))
+        try:
+            found = fit(chosen, pose)
+        except EstimationFailure:
+            continue
+        if found.pose.position_m[2] < observations.leds_m[:, 2].min():
+            refitted.append(judged(found.pose))
+    both = sorted([*refitted, *ranked], key=lambda one: one[0])
+    return [(pose, distance_px) for cost, pose, distance_px in both if np.isfinite(cost)]
+
+
+def _distance_px(observations: Observations, pose: Pose) -> Floats:
+    image, depth_m = centroid_images(pose, observations.leds_m, observations.lift_m2)
+    offset = np.linalg.solve(observations.from_pixels, (observations.image - image)[:, :, None])[:, :, 0]
+    return np.where(depth_m > 0, np.linalg.norm(offset, axis=1), np.inf)
+
+
+def _spread_px(distance_px: Floats) -> float:
+    """Standard deviation of a coordinate, from the median of distances in the plane; at least MODEL_ERROR_PX."""
+    median = float(np.sort(distance_px)[len(distance_px) // 2])
+    return max(median / np.sqrt(2 * np.log(2)), MODEL_ERROR_PX)
+
+
+def _gate_px(observations: Observations, pose: Pose) -> Floats:
+    """Distances (n,) that errors as stated explain, with an upright pose: START_GATE standard deviations, pixels."""
+    count = len(observations.leds_m)
+    blocks = observations.covariance(pose).reshape(count, 2, count, 2)[np.arange(count), :, np.arange(count)]
+    of_tilt = observations.tilt_sigma_rad.max() if _uses_gravity(observations) else 0.0
+    variance = np.trace(blocks, axis1=1, axis2=2) + of_tilt**2
+    return np.asarray(START_GATE * np.sqrt(variance) / observations.camera.pixel_angle_rad)
+
+
+def _scalable(observations: Observations) -> bool:
+    """Whether the map's errors are stated, so that a common factor can explain larger residuals."""
+    return any(parameter.group == "map" for parameter in observations.uncertainty.parameters)
+
+
+def _snooped(
+    observations: Observations, pose: Pose, inliers: NDArray[np.bool_], adapted: bool
+) -> tuple[Observations, Fit, NDArray[np.bool_]] | None:
+    """Data snooping from a pose and the spots to begin with; the observations returned have the size of errors."""
+    model = observations
+    while _enough(inliers):
+        chosen = model.only(inliers)
+        try:
+            if adapted:
+                for _ in range(ROBUST_ROUNDS):
+                    found = fit(chosen, pose)
+                    ratio = float(np.median(found.outlier_chi2())) / CHI2_MEDIAN
+                    model = _with_errors(model, ratio)
+                    chosen = model.only(inliers)
+            found = fit(chosen, pose)
+        except EstimationFailure:
+            return None
+        pose = found.pose
+        depth_m = centroid_images(pose, chosen.leds_m, chosen.lift_m2)[1]
+        if not (pose.position_m[2] < chosen.leds_m[:, 2].min() and 2 * (depth_m > 0).sum() > len(depth_m)):
+            return None
+        passes = _passes(found, chosen, adapted)
+        if not passes.all():
+            inliers = inliers.copy()
+            inliers[np.flatnonzero(inliers)[np.argmax(found.outlier_chi2(_model_error(chosen)))]] = False
+            continue
+        if adapted:
+            model, found = _settled(model, found, inliers)
+        return model, found, inliers
+    return None
+
+
+def _settled(model: Observations, found: Fit, inliers: NDArray[np.bool_]) -> tuple[Observations, Fit]:
+    """The size of errors with which chi-square is its degrees of freedom, and the fit with it."""
+    for _ in range(MOMENT_ROUNDS):
+        freedom = max(_freedom(model.only(inliers)), 1)
+        model = _with_errors(model, found.chi2 / freedom)
+        found = fit(model.only(inliers), found.pose)
+    return model, found
+
+
+def _with_errors(observations: Observations, ratio: float) -> Observations:
+    """Observations whose adapted variance is larger by a ratio."""
+    ratio = min(max(ratio, 1 / MAX_RATIO), MAX_RATIO)
+    if _scalable(observations):
+        return replace(observations, scale=observations.scale * np.sqrt(ratio))
+    return replace(observations, added_sigma_px=observations.added_sigma_px * np.sqrt(ratio))
+
+
+def _uses_gravity(observations: Observations) -> bool:
+    return bool(np.isfinite(observations.tilt_sigma_rad).all())
+
+
+def _freedom(observations: Observations) -> int:
+    """Degrees of freedom: two numbers a spot and two of gravity, less six of the pose."""
+    return 2 * len(observations.leds_m) + (2 if _uses_gravity(observations) else 0) - 6
+
+
+def _passes(found: Fit, observations: Observations, adapted: bool) -> NDArray[np.bool_]:
+    """Spots (n,) that pass data snooping; with errors of a size by the residuals the test is Fisher's."""
+    freedom = _freedom(observations)
+    limit = 2 * f.isf(OUTLIER_PROBABILITY, 2, max(freedom, 1)) if adapted else chi2.isf(OUTLIER_PROBABILITY, 2)
+    return np.asarray(found.outlier_chi2(_model_error(observations)) <= limit)
+
+
+def _model_error(observations: Observations) -> float:
+    """MODEL_ERROR_PX in normalized coordinates."""
+    return MODEL_ERROR_PX * observations.camera.pixel_angle_rad
+
+
+def _score(agreed: Consensus, observations: Observations) -> float:
+    """Minus twice the logarithm of the restricted likelihood of all spots (in pixels) and gravity.
+
+    Restricted: of what the pose leaves open, so that few spots which a pose fits by chance do not win. An outlier is
+    anywhere within OUTLIER_RADIUS of the image's width, and a wrong reading of gravity in any direction.
+    """
+    model = agreed.model if agreed.model is not None else observations
+    chosen = model.only(agreed.inliers)
+    covariance = chosen.covariance(agreed.best.pose)
+    of_pixels = -2 * np.log(np.abs(np.linalg.det(chosen.from_pixels))).sum()
+    spots = float(np.linalg.slogdet(2 * np.pi * covariance)[1] + of_pixels)
+    radius_px = OUTLIER_RADIUS * observations.camera.width_px
+    outliers = 2 * np.log(np.pi * radius_px**2) * float((~agreed.inliers).sum())
+    tilts = (
+        2 * float(np.log(2 * np.pi * observations.tilt_sigma_rad).sum()) if agreed.gravity else 2 * np.log(2 * np.pi)
+    )
+    return float(agreed.best.chi2 + spots + agreed.best.log_determinant + outliers + tilts)
 
 
 def minima(observations: Observations, starts: Iterable[Pose], robust: bool = False) -> tuple[Fit, ...]:
@@ -128,7 +363,13 @@ def _same_minimum(one: Pose, other: Pose) -> bool:
 
 def _explains_all(found: Fit, observations: Observations) -> bool:
     """Whether a fit explains all spots and gravity."""
-    return found.tilt_chi2 <= chi2.isf(OUTLIER_PROBABILITY, 2) and bool(_explained(found, observations).all())
+    if found.tilt_chi2 > chi2.isf(OUTLIER_PROBABILITY, 2):
+        return False
+    if observations.correlated:
+        return found.chi2 <= chi2.isf(OUTLIER_PROBABILITY, max(_freedom(observations), 1)) and bool(
+            _passes(found, observations, adapted=False).all()
+        )
+    return bool(_explained(found, observations).all())
 
 
 def _explained(found: Fit, observations: Observations) -> NDArray[np.bool_]:
