@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.camera.pose import Pose
-from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame
 from estimator.methods.pnp import candidates, in_a_plane
 from estimator.methods.up2p import upright_pairs, upright_pose

@@ -3,8 +3,8 @@
 The weights are those of generalised least squares. What the device does not know exactly, but states how well it knows,
 moves spots together (`estimator.solvers.uncertainty`): with S the covariance of those errors and J the slopes of the
 spots by them, the spots have the covariance C = C_centroids + J S J^T, which is not block-diagonal. J depends on the
-pose, so the fit is repeated with C at its result. The position's covariance follows from C. Without such statements C is
-block-diagonal, and the fit is ordinary weighted least squares.
+pose, so the fit is repeated with C at its result. The position's covariance follows from C. Without such statements C
+is block-diagonal, and the fit is ordinary weighted least squares.
 
 The centroid of an LED's image differs from the image of the LED's centre; photogrammetry calls the difference
 eccentricity (Lenz & Fritsch 1990). Here it has a closed form. A face of uniform luminance, at X from the camera,
@@ -50,6 +50,9 @@ MAX_EVALUATIONS = 60
 # The slopes of a spot by the map change with the pose by a share of the error of the initial pose: the weights of the
 # second repetition are those at a pose that is good to the errors stated.
 RELINEARIZATIONS = 2
+# Poses closer than both have the same weights, but for a thousandth.
+NEAR_M = 3e-3
+NEAR_RAD = 1e-3
 # Share of the largest redundancy below which a spot's displacement is not controlled by other observations.
 MIN_REDUNDANCY = 1e-9
 
@@ -62,9 +65,9 @@ class Observations:
     `image` (n, 2) are centroids in normalized pinhole coordinates; `whitening` (n, 2, 2) maps an offset in them to one
     of unit covariance, by the centroids' own errors; `from_pixels` (n, 2, 2) maps an offset in pixels to one in them.
     `tilt_rad` (2,) is (tilt_x, tilt_y) by the accelerometer, `tilt_sigma_rad` (2,) its standard deviations, infinite if
-    gravity is not used. `uncertainty` are the errors of camera and map that the device states, whose standard deviations
-    count `scale` times; `added_sigma_px` is a further standard deviation of each centroid, for errors that it does not
-    state.
+    gravity is not used. `uncertainty` are the errors of camera and map that the device states, whose standard
+    deviations count `scale` times; `added_sigma_px` is a further standard deviation of each centroid, for errors that
+    the device does not state.
     """
 
     leds_m: Floats
@@ -133,13 +136,14 @@ class Fit:
     """Local minimum of the squared, whitened residuals.
 
     `cost` is the minimized sum of squares, or of a robust loss of them. `spots_chi2` (n,) is the share of each spot in
-    the sum of squares: its chi-square, of two degrees of freedom, where spots are not correlated. `tilt_chi2` is that of
-    gravity. `covariance_m2` (3, 3) is the position's, the first block of the inverse of the information matrix.
+    the sum of squares: its chi-square, of two degrees of freedom, where spots are not correlated. `tilt_chi2` is that
+    of gravity. `covariance_m2` (3, 3) is the position's, the first block of the inverse of the information matrix.
 
     `spots_score` (n, 2) and `spots_redundancy` (n, 2, 2) are of each spot q_i and P_ii, where P = C^-1 - C^-1 J (J^T
     C^-1 J + gravity)^-1 J^T C^-1 and q = P r with the residuals r (Baarda 1968): P_ii^-1 q_i is the displacement of the
     spot that the other observations say, and P_ii^-1 its covariance. `log_determinant` is that of the information
-    matrix.
+    matrix. `residuals` (2n + 2,) and `slopes` (2n + 2, 6), by the pose, are whitened, gravity last; `whitening` is that of
+    the spots.
     """
 
     pose: Pose
@@ -150,6 +154,14 @@ class Fit:
     spots_score: Floats = field(default_factory=lambda: np.zeros((0, 2)))
     spots_redundancy: Floats = field(default_factory=lambda: np.zeros((0, 2, 2)))
     log_determinant: float = 0.0
+    residuals: Floats = field(default_factory=lambda: np.zeros(0))
+    slopes: Floats = field(default_factory=lambda: np.zeros((0, 6)))
+    whitening: Floats = field(default_factory=lambda: np.zeros((0, 2, 2)))
+
+    def left_open(self, of_spots: Floats) -> Floats:
+        """Part of displacements of the spots (n, 2, k) that no change of the pose makes, whitened, (2n + 2, k)."""
+        white = np.vstack([_whitened(self.whitening, of_spots), np.zeros((2, of_spots.shape[2]))])
+        return np.asarray(white - self.slopes @ np.linalg.lstsq(self.slopes, white, rcond=None)[0])
 
     @property
     def chi2(self) -> float:
@@ -198,7 +210,7 @@ def observe(frame: DeviceFrame, correspondences: Sequence[Correspondence]) -> Ob
         camera=camera,
         image=image,
         whitening=np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)), dtype=np.float64),
-        from_pixels=from_pixels,
+        from_pixels=np.asarray(from_pixels, dtype=np.float64),
         tilt_rad=np.array(tilt),
         tilt_sigma_rad=tilt_sigmas(frame.accelerometer, tilt[1]),
         uncertainty=uncertainty(camera, [one.led for one in correspondences], frame.luminaires, frame.map_datum),
@@ -246,11 +258,21 @@ def fit(observations: Observations, start: Pose, loss: Literal["linear", "soft_l
     A robust loss disregards the correlation of spots. Raises EstimationFailure if the observations do not determine a
     pose there.
     """
-    found = _fit(observations, start, _whitening(observations, start, loss), loss)
-    if observations.correlated:
-        for _ in range(RELINEARIZATIONS if loss == "linear" else 0):
-            found = _fit(observations, found.pose, _whitening(observations, found.pose, loss), loss)
+    at = start
+    found = _fit(observations, at, _whitening(observations, at, loss), loss)
+    if observations.correlated and loss == "linear":
+        for _ in range(RELINEARIZATIONS):
+            if _near(found.pose, at):
+                break
+            at = found.pose
+            found = _fit(observations, at, _whitening(observations, at, loss), loss)
     return found
+
+
+def _near(one: Pose, other: Pose) -> bool:
+    """Whether the spots have the same covariance at both poses, but for a thousandth."""
+    moved_m = np.linalg.norm(one.position_m - other.position_m)
+    return bool(moved_m < NEAR_M and np.linalg.norm(one.R_cam_world - other.R_cam_world) < NEAR_RAD)
 
 
 def _whitening(observations: Observations, pose: Pose, loss: str) -> Floats:
@@ -344,6 +366,9 @@ def _fit(observations: Observations, start: Pose, whitening: Floats, loss: Liter
         spots_score=score,
         spots_redundancy=own - pulled @ covariance @ pulled.transpose(0, 2, 1),
         log_determinant=float(np.linalg.slogdet(information)[1]),
+        residuals=at_minimum,
+        slopes=slope,
+        whitening=whitening,
     )
 
 

@@ -1,16 +1,16 @@
 """Robust fit: the pose that explains gravity and the spots, which spots it leaves out, and how large the errors are.
 
 Data snooping (Baarda 1968) finds outliers: each spot's displacement from where the other observations put it is tested
-against its own covariance, and the worst spot is left out until none is beyond OUTLIER_PROBABILITY. Where all spots pass
-with the errors that the device states, that fit is the result. Otherwise several explanations compete, each fitted to the
-spots that it leaves in, from poses that put most spots about right:
+against its own covariance, and the worst spot is left out until none is beyond OUTLIER_PROBABILITY. Where all spots
+pass with the errors that the device states, that fit is the result. Otherwise several explanations compete, each fitted
+to the spots that it leaves in, from poses that put most spots about right:
 
 - errors as stated, and outliers;
 - stated errors of camera and map that are larger or smaller by a common factor, estimated from the residuals;
 - where the map's errors are not stated: a further error of each centroid, of a size estimated from the residuals. A
   camera that states nothing then has the errors of one as sold (`estimator.solvers.uncertainty`), because the
   residuals hardly reveal a focal length;
-- each of them without gravity, where `gravity_optional`.
+- each of them without gravity, if that is optional and contradicts the spots in all.
 
 The explanation with the largest restricted likelihood is taken; an outlier lies anywhere in OUTLIER_RADIUS.
 """
@@ -49,6 +49,12 @@ MOMENT_ROUNDS = 3
 MAX_RATIO = 100.0
 # Share of the image's width within which an outlier may lie anywhere: as far as a decoded pixel may be from a spot.
 OUTLIER_RADIUS = 0.01
+# Inliers, and their share, from which on a pose that they agree on is no chance: ten degrees of freedom.
+MIN_SURE_INLIERS = 8
+MIN_SURE_SHARE = 2 / 3
+# Standard deviations of an error of the camera's intrinsics, one of seven, beyond which the residuals reveal it: by
+# chance in one of 2000 frames.
+MAX_CAMERA_SIGMA = 4.0
 # Poses closer than both lead to one minimum.
 SAME_MINIMUM_RAD = 0.01
 SAME_MINIMUM_M = 0.1
@@ -60,7 +66,7 @@ class Consensus:
 
     `best` is the best fit, `others` are fits of other local minima to the same spots, best first; `inliers` (n,) are
     the spots used; `gravity` says whether the accelerometer was used. `model` are the observations with the size of
-    errors that explains them, None where it is as stated.
+    errors that explains them, None where all spots are explained as stated; `adapted` says that the residuals gave it.
     """
 
     best: Fit
@@ -68,17 +74,27 @@ class Consensus:
     inliers: NDArray[np.bool_]
     gravity: bool
     model: Observations | None = None
+    adapted: bool = False
 
     @property
     def covariance_m2(self) -> Floats:
         """Covariance of the position, (3, 3).
 
-        It is scaled by chi-square per degree of freedom if chi-square is too large by OUTLIER_PROBABILITY.
+        It is scaled by chi-square per degree of freedom if chi-square is too large by OUTLIER_PROBABILITY. With errors
+        of a size by the residuals, of n degrees of freedom, it is that of Student's distribution, n / (n - 2) times.
         """
         freedom = 2 * len(self.best.spots_chi2) + (2 if self.gravity else 0) - 6
+        if self.adapted:
+            return self.best.covariance_m2 * (max(freedom, 3) / (max(freedom, 3) - 2))
         total = self.best.chi2
         scale = total / freedom if freedom > 0 and total > chi2.isf(OUTLIER_PROBABILITY, freedom) else 1.0
         return self.best.covariance_m2 * scale
+
+    def of_inliers(self) -> Observations:
+        """The observations of the inliers, with the size of errors that explains them."""
+        if self.model is None:
+            raise ValueError("a consensus on all spots as stated has no model")
+        return self.model.only(self.inliers)
 
 
 def consensus(
@@ -91,8 +107,8 @@ def consensus(
 
     `more_starts` gives initial poses for observations with outliers. `gravity_optional` says that the accelerometer's
     reading may be the outlier. For a lens that bends straight lines the fit is repeated with centroids corrected by the
-    first pose. Raises EstimationFailure if too few spots agree, or no pose has the LEDs in front of the camera and above
-    it.
+    first pose. Raises EstimationFailure if too few spots agree, or no pose has the LEDs in front of the camera and
+    above it.
     """
     agreed = _consensus(observations, starts, more_starts, gravity_optional)
     if projection_of(observations.camera).rectilinear:
@@ -113,51 +129,68 @@ def _consensus(
         raise EstimationFailure("position", f"LEDs identified: {len(everything)}, needed: {MIN_SPOTS}")
     fits = minima(observations, starts)
     if fits and _explains_all(fits[0], observations):
-        return Consensus(fits[0], fits[1:], everything, _uses_gravity(observations))
-    more = list(more_starts())
-    found: list[_Explanation] = []
-    for with_or_without in [observations, *([observations.without_gravity()] if gravity_optional else [])]:
-        found += _explanations(with_or_without, starts, more)
+        agreed = Consensus(fits[0], fits[1:], everything, _uses_gravity(observations))
+        if _plausible(agreed, observations):
+            return agreed
+        rough = [one.pose for one in fits]
+    else:
+        rough = [*(one.pose for one in fits), *starts, *more_starts()]
+    found = _explanations(observations, rough)
+    limit = chi2.isf(OUTLIER_PROBABILITY, 2)
+    if gravity_optional and not any(one.best.tilt_chi2 <= limit for one in found):
+        found += _explanations(observations.without_gravity(), rough)
     if not found:
         raise EstimationFailure("position", "no pose explains gravity and most of the spots")
-    return min(found, key=lambda one: one.score).consensus
+    best = min(found, key=lambda one: _score(one, observations))
+    fits = minima(best.of_inliers(), [best.best.pose, *starts])
+    return replace(best, best=fits[0], others=fits[1:]) if fits else best
 
 
-@dataclass(frozen=True, eq=False)
-class _Explanation:
-    """A consensus, and its score: minus twice the logarithm of its restricted likelihood."""
+def _explanations(observations: Observations, rough: Sequence[Pose]) -> list[Consensus]:
+    """Explanations of the spots by errors as stated with outliers, and by errors of a size by the residuals.
 
-    consensus: Consensus
-    score: float
+    `rough` are poses to begin with. An explanation with many inliers and few outliers needs no other.
+    """
+    ranked, assumed = _ranked(observations, rough), observations.with_assumed_camera()
+    attempts = [(observations, False), (observations, True)]
+    if assumed is not observations:
+        attempts += [(assumed, False), (assumed, True)]
+    found = []
+    for model, adapted in attempts:
+        explained = _snooped_consensus(model, ranked, adapted)
+        if explained is None:
+            continue
+        # Errors larger than those of centroids are of the map or camera: one that states nothing is then not exact.
+        of_centroids = explained.model is None or explained.model.added_sigma_px <= MODEL_ERROR_PX
+        if adapted and model is not assumed and not of_centroids:
+            continue
+        found.append(explained)
+        count = len(explained.inliers)
+        sure = explained.inliers.sum() >= max(MIN_SURE_INLIERS, MIN_SURE_SHARE * count)
+        if sure and not adapted and _plausible(explained, model):
+            break
+    return found
 
 
-def _explanations(observations: Observations, starts: Sequence[Pose], more: Sequence[Pose]) -> list[_Explanation]:
-    """Explanations of the spots by errors as stated with outliers, and by errors of a size by the residuals."""
-    found: list[Consensus | None] = []
-    if not observations.correlated:
-        found.append(_exact_consensus(observations, starts, more))
-    poses = [*starts, *more]
-    assumed = observations.with_assumed_camera()
-    for adapted in (False, True):
-        found.append(_snooped_consensus(assumed, starts, poses, adapted))
-    return [_Explanation(one, _score(one, observations)) for one in found if one is not None]
+def _plausible(agreed: Consensus, observations: Observations) -> bool:
+    """Whether chi-square of the inliers and of gravity is as the errors say, and the spots do not contradict the camera.
 
-
-def _exact_consensus(observations: Observations, starts: Sequence[Pose], more: Sequence[Pose]) -> Consensus | None:
-    """The largest set of spots that one pose explains to the centroids' errors, if it holds most of them."""
-    for robust in minima(observations, [*starts, *more], robust=True)[:MAX_ROBUST_STARTS]:
-        inliers = _explained(robust, observations)
-        while _enough(inliers):
-            chosen = observations.only(inliers)
-            fits = minima(chosen, [robust.pose, *starts])
-            if fits and _explains_all(fits[0], chosen):
-                return Consensus(fits[0], fits[1:], inliers, _uses_gravity(observations), observations)
-            if not fits or _explained(fits[0], chosen).all():
-                break
-            # Remove the worst spot alone: it pulls the fit, and with it the residuals of true spots.
-            inliers = inliers.copy()
-            inliers[np.flatnonzero(inliers)[np.argmax(fits[0].spots_chi2)]] = False
-    return None
+    The camera is contradicted where one of the errors that are assumed of a camera as sold would explain the residuals
+    better by MAX_CAMERA_SIGMA standard deviations.
+    """
+    chosen, best = observations.only(agreed.inliers), agreed.best
+    freedom = _freedom(chosen)
+    if best.tilt_chi2 > chi2.isf(OUTLIER_PROBABILITY, 2) or best.chi2 > chi2.isf(OUTLIER_PROBABILITY, max(freedom, 1)):
+        return False
+    assumed = chosen.with_assumed_camera()
+    if assumed is chosen or chosen.correlated:
+        return True
+    of_pixels = assumed.uncertainty.slopes_px(best.pose)[:, :, : len(assumed.uncertainty.intrinsics)]
+    by_camera = best.left_open(chosen.from_pixels @ of_pixels)
+    size = np.linalg.norm(by_camera, axis=0)
+    visible = size * assumed.uncertainty.sigmas[: len(size)] > 1
+    sigmas = np.abs(by_camera.T @ best.residuals)[visible] / size[visible]
+    return bool((sigmas <= MAX_CAMERA_SIGMA).all())
 
 
 def _enough(inliers: NDArray[np.bool_]) -> bool:
@@ -165,26 +198,22 @@ def _enough(inliers: NDArray[np.bool_]) -> bool:
 
 
 def _snooped_consensus(
-    observations: Observations, starts: Sequence[Pose], poses: Sequence[Pose], adapted: bool
+    observations: Observations, ranked: Sequence[tuple[Pose, Floats]], adapted: bool
 ) -> Consensus | None:
     """Spots that pass data snooping, from the pose that puts most of them about right; None if too few do.
 
-    `adapted`: the size of the errors is estimated from the residuals.
+    `ranked` are poses and distances by `_ranked`. `adapted`: the size of the errors is estimated from the residuals.
     """
-    for pose, distance_px in _ranked(observations, poses)[:MAX_ROBUST_STARTS]:
+    for pose, distance_px in ranked[:MAX_ROBUST_STARTS]:
         spread_px = _spread_px(distance_px)
         inliers = distance_px <= np.maximum(START_GATE * spread_px, _gate_px(observations, pose))
-        trial = (
-            replace(observations, added_sigma_px=spread_px) if adapted and not _scalable(observations) else observations
-        )
+        trial = observations
+        if adapted and not _scalable(observations):
+            trial = replace(observations, added_sigma_px=spread_px)
         found = _snooped(trial, pose, inliers, adapted)
-        if found is None:
-            continue
-        model, best, inliers = found
-        chosen = model.only(inliers)
-        fits = minima(chosen, [best.pose, *starts])
-        if fits and _passes(fits[0], chosen, adapted).all():
-            return Consensus(fits[0], fits[1:], inliers, _uses_gravity(observations), model)
+        if found is not None:
+            model, best, inliers = found
+            return Consensus(best, (), inliers, _uses_gravity(observations), model, adapted)
     return None
 
 
@@ -246,20 +275,18 @@ def _snooped(
     observations: Observations, pose: Pose, inliers: NDArray[np.bool_], adapted: bool
 ) -> tuple[Observations, Fit, NDArray[np.bool_]] | None:
     """Data snooping from a pose and the spots to begin with; the observations returned have the size of errors."""
-    model = observations
+    model, rounds = observations, ROBUST_ROUNDS if adapted else 0
     while _enough(inliers):
         chosen = model.only(inliers)
         try:
-            if adapted:
-                for _ in range(ROBUST_ROUNDS):
-                    found = fit(chosen, pose)
-                    ratio = float(np.median(found.outlier_chi2())) / CHI2_MEDIAN
-                    model = _with_errors(model, ratio)
-                    chosen = model.only(inliers)
+            for _ in range(rounds):
+                found = fit(chosen, pose)
+                model = _with_errors(model, float(np.median(found.outlier_chi2())) / CHI2_MEDIAN)
+                chosen, pose = model.only(inliers), found.pose
             found = fit(chosen, pose)
         except EstimationFailure:
             return None
-        pose = found.pose
+        pose, rounds = found.pose, min(rounds, 1)
         depth_m = centroid_images(pose, chosen.leds_m, chosen.lift_m2)[1]
         if not (pose.position_m[2] < chosen.leds_m[:, 2].min() and 2 * (depth_m > 0).sum() > len(depth_m)):
             return None

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.camera.pose import Pose
-from estimator.camera.projection import project, projection_of
+from estimator.camera.projection import projection_of
 from estimator.io.device import INTRINSICS, Camera, CameraUncertainty, Led, Luminaire, MapDatum
 
 Floats = NDArray[np.float64]
@@ -89,12 +89,13 @@ class Uncertainty:
 
     def slopes_px(self, pose: Pose) -> Floats:
         """Derivatives (n, 2, k) of the centroids' pixels by the parameters; NaN for an LED without an image."""
-        projected = project(self.leds_m, pose, self.camera)
-        by_led = -projected.slopes[:, :, :3]
+        p_cam = pose.in_camera(self.leds_m)
+        image, by_point = projection_of(self.camera).project(p_cam)
+        by_led = self.camera.matrix()[:2, :2] @ by_point @ pose.R_cam_world
         offset = self.leds_m - pose.position_m
         lifted = self.lift_m2 * offset[:, 2] / (offset**2).sum(axis=1)
         of_map = by_led @ self.levers + by_led[:, :, 2:] * (lifted[:, None] * self.sizes)[:, None, :]
-        of_camera = intrinsic_slopes_px(projected.p_cam, self.camera)[:, :, self.intrinsics]
+        of_camera = _intrinsic_slopes_px(p_cam, image, self.camera)[:, :, self.intrinsics]
         return np.concatenate([of_camera, of_map], axis=2)
 
     def covariance_px2(self, pose: Pose) -> Floats:
@@ -246,22 +247,22 @@ def _add_leds(of_map: _MapParameters, leds: Sequence[Led]) -> None:
     of_map.add_sizes(ids, np.array([led.size_sigma_m or 0.0 for led in leds]), 2 / half_width_m)
 
 
-def intrinsic_slopes_px(p_cam: Floats, camera: Camera) -> Floats:
-    """Derivatives (n, 2, 7) of the pixels of points (n, 3) in camera axes, by the errors of INTRINSICS.
+def _intrinsic_slopes_px(p_cam: Floats, image: Floats, camera: Camera) -> Floats:
+    """Derivatives (n, 2, 7) of the pixels of points by the errors of INTRINSICS.
 
-    NaN for a point without an image. An equidistant lens has no k1, p1, p2: their slopes are 0.
+    `p_cam` (n, 3) are the points in camera axes, `image` (n, 2) their normalized image coordinates. An equidistant lens
+    has no k1, p1, p2: their slopes are 0.
     """
     K = camera.matrix()
-    x, y = projection_of(camera).project(p_cam)[0].T
-    zero, one = np.zeros_like(x), np.ones_like(x)
-    u, v = K[0, 0] * x, K[1, 1] * y
-    slopes = np.stack([np.stack([u, u / 2, one, zero], axis=1), np.stack([v, -v / 2, zero, one], axis=1)], axis=1)
-    of_lens = np.zeros((len(p_cam), 2, 3))
+    slopes = np.zeros((len(p_cam), 2, len(INTRINSICS)))
+    slopes[:, 0, 0], slopes[:, 1, 0] = K[0, 0] * image[:, 0], K[1, 1] * image[:, 1]
+    slopes[:, 0, 1], slopes[:, 1, 1] = slopes[:, 0, 0] / 2, -slopes[:, 1, 0] / 2
+    slopes[:, 0, 2] = slopes[:, 1, 3] = 1.0
     if camera.projection == "perspective":
         with np.errstate(all="ignore"):
             a, b = p_cam[:, 0] / p_cam[:, 2], p_cam[:, 1] / p_cam[:, 2]
         r2 = a * a + b * b
         along_x = np.stack([a * r2, 2 * a * b, r2 + 2 * a * a], axis=1)
         along_y = np.stack([b * r2, r2 + 2 * b * b, 2 * a * b], axis=1)
-        of_lens = np.einsum("ij,njk->nik", K[:2, :2], np.stack([along_x, along_y], axis=1))
-    return np.concatenate([slopes, of_lens], axis=2)
+        slopes[:, :, 4:] = K[:2, :2] @ np.stack([along_x, along_y], axis=1)
+    return slopes
