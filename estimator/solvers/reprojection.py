@@ -142,8 +142,8 @@ class Fit:
     `spots_score` (n, 2) and `spots_redundancy` (n, 2, 2) are of each spot q_i and P_ii, where P = C^-1 - C^-1 J (J^T
     C^-1 J + gravity)^-1 J^T C^-1 and q = P r with the residuals r (Baarda 1968): P_ii^-1 q_i is the displacement of the
     spot that the other observations say, and P_ii^-1 its covariance. `log_determinant` is that of the information
-    matrix. `residuals` (2n + 2,) and `slopes` (2n + 2, 6), by the pose, are whitened, gravity last; `whitening` is that of
-    the spots.
+    matrix. `residuals` (2n + 2,) and `slopes` (2n + 2, 6), by the pose, are whitened, gravity last; `whitening` is that
+    of the spots. `position_slopes` (3, 6) are those of the position by the parameters of the pose.
     """
 
     pose: Pose
@@ -157,11 +157,17 @@ class Fit:
     residuals: Floats = field(default_factory=lambda: np.zeros(0))
     slopes: Floats = field(default_factory=lambda: np.zeros((0, 6)))
     whitening: Floats = field(default_factory=lambda: np.zeros((0, 2, 2)))
+    position_slopes: Floats = field(default_factory=lambda: np.zeros((3, 6)))
 
-    def left_open(self, of_spots: Floats) -> Floats:
-        """Part of displacements of the spots (n, 2, k) that no change of the pose makes, whitened, (2n + 2, k)."""
+    def response(self, of_spots: Floats) -> tuple[Floats, Floats]:
+        """Response of the fit to displacements of the model's spots, (n, 2, k).
+
+        Returns the part that no change of the pose makes up for, whitened, (2n + 2, k), and the movements (3, k) of the
+        position by the changes that do.
+        """
         white = np.vstack([_whitened(self.whitening, of_spots), np.zeros((2, of_spots.shape[2]))])
-        return np.asarray(white - self.slopes @ np.linalg.lstsq(self.slopes, white, rcond=None)[0])
+        steps = -np.linalg.lstsq(self.slopes, white, rcond=None)[0]
+        return np.asarray(white + self.slopes @ steps), np.asarray(self.position_slopes @ steps)
 
     @property
     def chi2(self) -> float:
@@ -347,6 +353,7 @@ def _fit(observations: Observations, start: Pose, whitening: Floats, loss: Liter
     at_minimum = residuals(found.x)
     count = len(observations.leds_m)
     of_spots = at_minimum[: 2 * count]
+    position_slopes = _position_slopes(found.x)
     # At the minimum J^T C^-1 r with gravity's share is zero, and so q = C^-1 r.
     roots = whitening.reshape(2 * count, count, 2) if whitening.ndim == 2 else None
     if roots is None:
@@ -362,7 +369,8 @@ def _fit(observations: Observations, start: Pose, whitening: Floats, loss: Liter
         cost=2 * float(found.cost),
         spots_chi2=(of_spots.reshape(-1, 2) ** 2).sum(axis=1),
         tilt_chi2=float((at_minimum[2 * count :] ** 2).sum()),
-        covariance_m2=_position_covariance(found.x, covariance),
+        covariance_m2=position_slopes @ covariance @ position_slopes.T,
+        position_slopes=position_slopes,
         spots_score=score,
         spots_redundancy=own - pulled @ covariance @ pulled.transpose(0, 2, 1),
         log_determinant=float(np.linalg.slogdet(information)[1]),
@@ -393,9 +401,8 @@ def _tilt_jacobian(x: Floats, observations: Observations) -> Floats:
     return slopes / observations.tilt_sigma_rad[:, None]
 
 
-def _position_covariance(x: Floats, covariance: Floats) -> Floats:
-    """Covariance (3, 3) of `centre - R^T t` from the covariance (6, 6) of the rotation vector and t."""
+def _position_slopes(x: Floats) -> Floats:
+    """Derivatives (3, 6) of `centre - R^T t` by the rotation vector and t."""
     R_cam_world, by_vector = cv2.Rodrigues(x[:3])
     by_rotation = np.column_stack([-by_vector[k].reshape(3, 3).T @ x[3:] for k in range(3)])
-    slope = np.hstack([by_rotation, -R_cam_world.T])
-    return np.asarray(slope @ covariance @ slope.T)
+    return np.hstack([by_rotation, -R_cam_world.T])

@@ -16,7 +16,7 @@ The explanation with the largest restricted likelihood is taken; an outlier lies
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,9 +52,14 @@ OUTLIER_RADIUS = 0.01
 # Inliers, and their share, from which on a pose that they agree on is no chance: ten degrees of freedom.
 MIN_SURE_INLIERS = 8
 MIN_SURE_SHARE = 2 / 3
+# An exact camera has to be a hundred times as likely as one as sold, where it states nothing and errors are revealed.
+CAUTION_CHI2 = 2 * np.log(100)
 # Standard deviations of an error of the camera's intrinsics, one of seven, beyond which the residuals reveal it: by
 # chance in one of 2000 frames.
 MAX_CAMERA_SIGMA = 4.0
+# Relative error of an unstated focal length that the residuals have to be able to reveal for it to be taken as exact:
+# half the smallest that is said of real cameras, 0.1 %, so that one of 0.1 % is missed in one of 30 000 frames at most.
+CHECKED_FOCAL = 5e-4
 # Poses closer than both lead to one minimum.
 SAME_MINIMUM_RAD = 0.01
 SAME_MINIMUM_M = 0.1
@@ -67,6 +72,8 @@ class Consensus:
     `best` is the best fit, `others` are fits of other local minima to the same spots, best first; `inliers` (n,) are
     the spots used; `gravity` says whether the accelerometer was used. `model` are the observations with the size of
     errors that explains them, None where all spots are explained as stated; `adapted` says that the residuals gave it.
+    `unchecked_m2` (3, 3) is what a focal length that neither the device nor the residuals vouch for adds to the
+    position's covariance.
     """
 
     best: Fit
@@ -75,20 +82,21 @@ class Consensus:
     gravity: bool
     model: Observations | None = None
     adapted: bool = False
+    unchecked_m2: Floats = field(default_factory=lambda: np.zeros((3, 3)))
 
     @property
     def covariance_m2(self) -> Floats:
-        """Covariance of the position, (3, 3).
+        """Covariance of the position, (3, 3), with `unchecked_m2`.
 
         It is scaled by chi-square per degree of freedom if chi-square is too large by OUTLIER_PROBABILITY. With errors
         of a size by the residuals, of n degrees of freedom, it is that of Student's distribution, n / (n - 2) times.
         """
         freedom = 2 * len(self.best.spots_chi2) + (2 if self.gravity else 0) - 6
         if self.adapted:
-            return self.best.covariance_m2 * (max(freedom, 3) / (max(freedom, 3) - 2))
+            return self.best.covariance_m2 * (max(freedom, 3) / (max(freedom, 3) - 2)) + self.unchecked_m2
         total = self.best.chi2
         scale = total / freedom if freedom > 0 and total > chi2.isf(OUTLIER_PROBABILITY, freedom) else 1.0
-        return self.best.covariance_m2 * scale
+        return self.best.covariance_m2 * scale + self.unchecked_m2
 
     def of_inliers(self) -> Observations:
         """The observations of the inliers, with the size of errors that explains them."""
@@ -131,7 +139,7 @@ def _consensus(
     if fits and _explains_all(fits[0], observations):
         agreed = Consensus(fits[0], fits[1:], everything, _uses_gravity(observations))
         if _plausible(agreed, observations):
-            return agreed
+            return replace(agreed, unchecked_m2=_unchecked_focal_m2(observations, fits[0]))
         rough = [one.pose for one in fits]
     else:
         rough = [*(one.pose for one in fits), *starts, *more_starts()]
@@ -143,7 +151,9 @@ def _consensus(
         raise EstimationFailure("position", "no pose explains gravity and most of the spots")
     best = min(found, key=lambda one: _score(one, observations))
     fits = minima(best.of_inliers(), [best.best.pose, *starts])
-    return replace(best, best=fits[0], others=fits[1:]) if fits else best
+    if fits:
+        best = replace(best, best=fits[0], others=fits[1:])
+    return replace(best, unchecked_m2=_unchecked_focal_m2(best.of_inliers(), best.best))
 
 
 def _explanations(observations: Observations, rough: Sequence[Pose]) -> list[Consensus]:
@@ -152,17 +162,15 @@ def _explanations(observations: Observations, rough: Sequence[Pose]) -> list[Con
     `rough` are poses to begin with. An explanation with many inliers and few outliers needs no other.
     """
     ranked, assumed = _ranked(observations, rough), observations.with_assumed_camera()
-    attempts = [(observations, False), (observations, True)]
-    if assumed is not observations:
-        attempts += [(assumed, False), (assumed, True)]
+    models = [observations] if assumed is observations else [observations, assumed]
+    attempts = [(model, adapted) for adapted in (False, True) for model in models]
     found = []
     for model, adapted in attempts:
         explained = _snooped_consensus(model, ranked, adapted)
         if explained is None:
             continue
-        # Errors larger than those of centroids are of the map or camera: one that states nothing is then not exact.
-        of_centroids = explained.model is None or explained.model.added_sigma_px <= MODEL_ERROR_PX
-        if adapted and model is not assumed and not of_centroids:
+        # Larger errors than those of centroids are of the map or camera: one that states nothing is then not exact.
+        if model is not assumed and explained.model is not None and explained.model.added_sigma_px > MODEL_ERROR_PX:
             continue
         found.append(explained)
         count = len(explained.inliers)
@@ -173,7 +181,7 @@ def _explanations(observations: Observations, rough: Sequence[Pose]) -> list[Con
 
 
 def _plausible(agreed: Consensus, observations: Observations) -> bool:
-    """Whether chi-square of the inliers and of gravity is as the errors say, and the spots do not contradict the camera.
+    """Whether chi-square of inliers and gravity is as the errors say, and the spots do not contradict the camera.
 
     The camera is contradicted where one of the errors that are assumed of a camera as sold would explain the residuals
     better by MAX_CAMERA_SIGMA standard deviations.
@@ -182,15 +190,42 @@ def _plausible(agreed: Consensus, observations: Observations) -> bool:
     freedom = _freedom(chosen)
     if best.tilt_chi2 > chi2.isf(OUTLIER_PROBABILITY, 2) or best.chi2 > chi2.isf(OUTLIER_PROBABILITY, max(freedom, 1)):
         return False
-    assumed = chosen.with_assumed_camera()
-    if assumed is chosen or chosen.correlated:
+    if chosen.correlated or chosen.camera.uncertainty is not None:
         return True
-    of_pixels = assumed.uncertainty.slopes_px(best.pose)[:, :, : len(assumed.uncertainty.intrinsics)]
-    by_camera = best.left_open(chosen.from_pixels @ of_pixels)
-    size = np.linalg.norm(by_camera, axis=0)
-    visible = size * assumed.uncertainty.sigmas[: len(size)] > 1
-    sigmas = np.abs(by_camera.T @ best.residuals)[visible] / size[visible]
-    return bool((sigmas <= MAX_CAMERA_SIGMA).all())
+    found, errors, priors, _ = _camera_errors(chosen, best)
+    visible = errors < priors
+    return bool((np.abs(found) <= MAX_CAMERA_SIGMA * errors)[visible].all())
+
+
+def _camera_errors(observations: Observations, best: Fit) -> tuple[Floats, Floats, Floats, Floats]:
+    """Errors of the intrinsics (k,) that each by itself explain the residuals of a fit best.
+
+    Also their standard deviations by the residuals, (k,), and as assumed of a camera as sold, (k,), and the derivatives
+    (3, k) of the fitted position by them. The first is the focal length's.
+    """
+    assumed = observations.with_assumed_camera().uncertainty
+    count = len(assumed.intrinsics)
+    slopes = observations.from_pixels @ assumed.slopes_px(best.pose)[:, :, :count]
+    # Residuals are those of the model minus the image: an error of the camera adds its slopes to them.
+    left_open, moved = best.response(slopes)
+    size2 = np.maximum((left_open**2).sum(axis=0), np.finfo(float).tiny)
+    return -(left_open.T @ best.residuals) / size2, 1 / np.sqrt(size2), assumed.sigmas[:count], moved
+
+
+def _unchecked_focal_m2(observations: Observations, best: Fit) -> Floats:
+    """Covariance (3, 3) of the position by the focal length of a camera that states nothing, where it is not checked.
+
+    Residuals that would reveal an error of CHECKED_FOCAL check it, and it is taken as exact: zero. Otherwise it has the
+    mean square error that residuals leave and the camera as sold has.
+    """
+    if observations.correlated or observations.camera.uncertainty is not None:
+        return np.zeros((3, 3))
+    found, errors, priors, moved = _camera_errors(observations, best)
+    if MAX_CAMERA_SIGMA * errors[0] <= CHECKED_FOCAL:
+        return np.zeros((3, 3))
+    weight = priors[0] ** 2 / (priors[0] ** 2 + errors[0] ** 2)
+    mean_square = weight * errors[0] ** 2 + (weight * found[0]) ** 2
+    return np.asarray(mean_square * np.outer(moved[:, 0], moved[:, 0]))
 
 
 def _enough(inliers: NDArray[np.bool_]) -> bool:
@@ -355,7 +390,9 @@ def _score(agreed: Consensus, observations: Observations) -> float:
     tilts = (
         2 * float(np.log(2 * np.pi * observations.tilt_sigma_rad).sum()) if agreed.gravity else 2 * np.log(2 * np.pi)
     )
-    return float(agreed.best.chi2 + spots + agreed.best.log_determinant + outliers + tilts)
+    # Of two explanations that are about as likely, the one that trusts an unstated camera is the bolder.
+    bold = CAUTION_CHI2 if model.camera.uncertainty is None and not model.correlated else 0.0
+    return float(bold + agreed.best.chi2 + spots + agreed.best.log_determinant + outliers + tilts)
 
 
 def minima(observations: Observations, starts: Iterable[Pose], robust: bool = False) -> tuple[Fit, ...]:

@@ -32,9 +32,9 @@ Floats = NDArray[np.float64]
 Group = Literal["device", "shot", "map"]
 AXES = ("x", "y", "z")
 AS_SOLD = {"focal": 0.01, "aspect": 3e-4, "principal_point_um": 54.0, "radial_um": 6.0, "decentering_um": 1.2}
-"""Standard deviations of a camera as sold: relative, and micrometres on the sensor. `radial_um` and `decentering_um` are
-displacements at the sensor's corner by k1, and by p1 or p2. The principal point is that of a device, 48 um, and of a
-shot, 24 um, together."""
+"""Standard deviations of a camera as sold: relative, and micrometres on the sensor. `radial_um` and `decentering_um`
+are displacements at the sensor's corner by k1, and by p1 or p2. The principal point is that of a device, 48 um, and of
+a shot, 24 um, together."""
 
 
 class Parameter(NamedTuple):
