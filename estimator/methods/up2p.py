@@ -2,9 +2,10 @@
 
 `up2p` is PoseLib's upright two-point solver (Kukelova, Bujnak & Pajdla 2010) inside a RANSAC of this package, because
 PoseLib's Python interface has the solver alone. The solver assumes gravity to be exact, so the error of the reading
-displaces the other spots under the pose of a pair; the gate for inliers includes that displacement. The refinement then
-fits position and orientation to the inliers without gravity. If the inliers do not determine the orientation (fewer
-than four, or on one line), gravity is used as a prior.
+displaces the other spots under the pose of a pair; the gate for inliers includes that displacement, and that by the
+errors of camera and map that the device states. The refinement then fits position and orientation to the inliers
+without gravity. If the inliers do not determine the orientation (fewer than four, or on one line), or the device states
+errors of camera or map, beside which gravity counts, gravity is used as a prior.
 """
 
 from collections.abc import Sequence
@@ -52,9 +53,9 @@ def fit_correspondences(frame: DeviceFrame, correspondences: Sequence[Correspond
     """The estimate from identified spots; of the frame, camera and accelerometer are used."""
     observations = observe(frame, correspondences)
     starts = _from_pairs(observations)
-    if determine_orientation(observations.leds_m):
+    if determine_orientation(observations.leds_m) and not observations.correlated:
         observations = observations.without_gravity()
-    agreed = consensus(observations, starts[:1], lambda: starts[1:])
+    agreed = consensus(observations, starts[:1], lambda: [*starts[1:], *upright_pairs(observations)])
     return Estimate(agreed.best.pose.position_m, covariance_m2=agreed.covariance_m2)
 
 
@@ -68,6 +69,8 @@ def _from_pairs(observations: Observations) -> list[Pose]:
         generator = np.random.Generator(np.random.Philox(key=len(pairs)))
         pairs = [pairs[k] for k in generator.choice(len(pairs), MAX_PAIRS, replace=False)]
     gate = GATE_SIGMA * float(observations.tilt_sigma_rad.max()) + GATE_PX * observations.camera.pixel_angle_rad
+    if observations.correlated and (pose := upright_pose(observations)) is not None:
+        gate += GATE_SIGMA * float(np.sqrt(np.diag(observations.covariance(pose)).max()))
     ranked: list[tuple[float, int, Pose]] = []
     for pair in pairs:
         found = poselib.up2p(level[list(pair)] @ Y_UP.T, observations.leds_m[list(pair)] @ Y_UP.T)

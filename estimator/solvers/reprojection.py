@@ -234,6 +234,19 @@ def centroid_images(pose: Pose, leds_m: Floats, lift_m2: Floats) -> tuple[Floats
     return p_cam[:, :2] / depth[:, None], p_cam[:, 2]
 
 
+def pose_slopes(observations: Observations, pose: Pose) -> tuple[Floats, Floats]:
+    """Derivatives by six parameters of a pose: of spots in normalized coordinates (n, 2, 6), of the position (3, 6).
+
+    The parameters are a rotation vector and a translation of the LEDs about their mean.
+    """
+    centre = observations.leds_m.mean(axis=0)
+    vector = Rotation.from_matrix(pose.R_cam_world).as_rotvec()
+    x = np.concatenate([vector, pose.R_cam_world @ (centre - pose.position_m)])
+    model = np.ascontiguousarray(observations.leds_m - centre)
+    of_image = cv2.projectPoints(model, x[:3], x[3:], np.eye(3), None)[1][:, :6].reshape(-1, 2, 6)
+    return of_image, _position_slopes(x)
+
+
 def corrected_for_eccentricity(observations: Observations, pose: Pose) -> Observations:
     """Observations with centroids as a lens that does not bend the images would have them, of the size by a pose.
 

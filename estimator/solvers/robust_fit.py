@@ -6,7 +6,7 @@ pass with the errors that the device states, that fit is the result. Otherwise s
 to the spots that it leaves in, from poses that put most spots about right:
 
 - errors as stated, and outliers;
-- stated errors of camera and map that are larger or smaller by a common factor, estimated from the residuals;
+- stated errors of camera, map and gravity that are larger or smaller by a common factor, estimated from the residuals;
 - where the map's errors are not stated: a further error of each centroid, of a size estimated from the residuals. A
   camera that states nothing then has the errors of one as sold (`estimator.solvers.uncertainty`), because the
   residuals hardly reveal a focal length;
@@ -349,7 +349,8 @@ def _with_errors(observations: Observations, ratio: float) -> Observations:
     """Observations whose adapted variance is larger by a ratio."""
     ratio = min(max(ratio, 1 / MAX_RATIO), MAX_RATIO)
     if _scalable(observations):
-        return replace(observations, scale=observations.scale * np.sqrt(ratio))
+        tilt_sigma_rad = observations.tilt_sigma_rad * np.sqrt(ratio)
+        return replace(observations, scale=observations.scale * np.sqrt(ratio), tilt_sigma_rad=tilt_sigma_rad)
     return replace(observations, added_sigma_px=observations.added_sigma_px * np.sqrt(ratio))
 
 
@@ -388,11 +389,13 @@ def _score(agreed: Consensus, observations: Observations) -> float:
     radius_px = OUTLIER_RADIUS * observations.camera.width_px
     outliers = 2 * np.log(np.pi * radius_px**2) * float((~agreed.inliers).sum())
     tilts = (
-        2 * float(np.log(2 * np.pi * observations.tilt_sigma_rad).sum()) if agreed.gravity else 2 * np.log(2 * np.pi)
+        2 * float(np.log(model.tilt_sigma_rad).sum()) + 2 * np.log(2 * np.pi)
+        if agreed.gravity
+        else 2 * np.log(2 * np.pi)
     )
     # Of two explanations that are about as likely, the one that trusts an unstated camera is the bolder.
     bold = CAUTION_CHI2 if model.camera.uncertainty is None and not model.correlated else 0.0
-    return float(bold + agreed.best.chi2 + spots + agreed.best.log_determinant + outliers + tilts)
+    return bold + float(agreed.best.chi2 + spots + agreed.best.log_determinant + outliers + tilts)
 
 
 def minima(observations: Observations, starts: Iterable[Pose], robust: bool = False) -> tuple[Fit, ...]:
