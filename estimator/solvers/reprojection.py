@@ -193,10 +193,13 @@ class Fit:
         return float(np.abs(self.spots_redundancy).max(initial=0.0))
 
 
-def observe(frame: DeviceFrame, correspondences: Sequence[Correspondence]) -> Observations:
+def observe(
+    frame: DeviceFrame, correspondences: Sequence[Correspondence], centroid_sigma_px: float = 0.0
+) -> Observations:
     """Observations of a frame; spots that cannot be undistorted are left out.
 
-    Raises EstimationFailure if the accelerometer reads zero or no spot is left.
+    `centroid_sigma_px` is a standard deviation of each centroid's coordinates beside that by the pixels' noise. Raises
+    EstimationFailure if the accelerometer reads zero or no spot is left.
     """
     camera = frame.camera
     usable = has_pinhole_image(centroids_px(correspondences), camera)
@@ -204,11 +207,12 @@ def observe(frame: DeviceFrame, correspondences: Sequence[Correspondence]) -> Ob
         correspondences = [one for one, use in zip(correspondences, usable, strict=True) if use]
     image = pinhole_image(centroids_px(correspondences), camera)
     covariance_px2 = np.array([one.spot.covariance_px2 for one in correspondences]).reshape(-1, 2, 2)
+    added_px2 = MIN_CENTROID_SIGMA_PX**2 + centroid_sigma_px**2
     # At depth 1 the projection's Jacobian by x and y is that from pinhole coordinates to the lens's.
     rays = np.column_stack([image, np.ones(len(image))])
     to_pixels = camera.matrix()[:2, :2] @ projection_of(camera).project(rays)[1][:, :, :2]
     from_pixels = np.linalg.inv(to_pixels)
-    covariance = from_pixels @ (covariance_px2 + MIN_CENTROID_SIGMA_PX**2 * np.eye(2)) @ from_pixels.transpose(0, 2, 1)
+    covariance = from_pixels @ (covariance_px2 + added_px2 * np.eye(2)) @ from_pixels.transpose(0, 2, 1)
     tilt = tilt_from_gravity(frame.accelerometer_m_s2)
     return Observations(
         leds_m=led_positions_m(correspondences),

@@ -1,7 +1,7 @@
 """Robust fit: the pose that explains gravity and the spots, which spots it leaves out, and how large the errors are.
 
 Data snooping (Baarda 1968) finds outliers: each spot's displacement from where the other observations put it is tested
-against its own covariance, and the worst spot is left out until none is beyond OUTLIER_PROBABILITY. Where all spots
+against its own covariance, and the worst spots are left out until none is beyond OUTLIER_PROBABILITY. Where all spots
 pass with the errors that the device states, that fit is the result. Otherwise several explanations compete, each fitted
 to the spots that it leaves in, from poses that put most spots about right:
 
@@ -42,6 +42,9 @@ MAX_ROBUST_STARTS = 3
 START_GATE = 5.0
 # Median of chi-square with two degrees of freedom.
 CHI2_MEDIAN = 2 * np.log(2)
+# Spots beyond the limit that are excluded together have at least this share of the largest chi-square: a wrong spot
+# pulls the fit, and with it the residuals of true spots.
+MIN_EXCLUDED_SHARE = 0.5
 # Repetitions that estimate the size of errors, by the median of spots with outliers and by all spots without, and the
 # largest change of its square in one.
 ROBUST_ROUNDS = 3
@@ -283,13 +286,13 @@ def _ranked(observations: Observations, poses: Sequence[Pose]) -> list[tuple[Pos
 def _distance_px(observations: Observations, pose: Pose) -> Floats:
     image, depth_m = centroid_images(pose, observations.leds_m, observations.lift_m2)
     offset = np.linalg.solve(observations.from_pixels, (observations.image - image)[:, :, None])[:, :, 0]
-    return np.where(depth_m > 0, np.linalg.norm(offset, axis=1), np.inf)
+    return np.asarray(np.where(depth_m > 0, np.linalg.norm(offset, axis=1), np.inf))
 
 
 def _spread_px(distance_px: Floats) -> float:
     """Standard deviation of a coordinate, from the median of distances in the plane; at least MODEL_ERROR_PX."""
     median = float(np.sort(distance_px)[len(distance_px) // 2])
-    return max(median / np.sqrt(2 * np.log(2)), MODEL_ERROR_PX)
+    return max(median / float(np.sqrt(2 * np.log(2))), MODEL_ERROR_PX)
 
 
 def _gate_px(observations: Observations, pose: Pose) -> Floats:
@@ -326,9 +329,12 @@ def _snooped(
         if not (pose.position_m[2] < chosen.leds_m[:, 2].min() and 2 * (depth_m > 0).sum() > len(depth_m)):
             return None
         passes = _passes(found, chosen, adapted)
+        if 2 * passes.sum() < len(passes):
+            return None
         if not passes.all():
+            displaced = np.where(passes, 0.0, found.outlier_chi2(_model_error(chosen)))
             inliers = inliers.copy()
-            inliers[np.flatnonzero(inliers)[np.argmax(found.outlier_chi2(_model_error(chosen)))]] = False
+            inliers[np.flatnonzero(inliers)[displaced >= MIN_EXCLUDED_SHARE * displaced.max()]] = False
             continue
         if adapted:
             model, found = _settled(model, found, inliers)
