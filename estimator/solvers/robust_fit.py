@@ -10,7 +10,7 @@ to the spots that it leaves in, from poses that put most spots about right:
 - where the map's errors are not stated: a further error of each centroid, of a size estimated from the residuals. A
   camera that states nothing then has the errors of one as sold (`estimator.solvers.uncertainty`), because the
   residuals hardly reveal a focal length;
-- each of them without gravity, if that is optional and contradicts the spots in all.
+- errors as stated without gravity, where that is optional and contradicts the spots.
 
 The explanation with the largest restricted likelihood is taken; an outlier lies anywhere in OUTLIER_RADIUS.
 """
@@ -148,8 +148,8 @@ def _consensus(
         rough = [*(one.pose for one in fits), *starts, *more_starts()]
     found = _explanations(observations, rough)
     limit = chi2.isf(OUTLIER_PROBABILITY, 2)
-    if gravity_optional and not any(one.best.tilt_chi2 <= limit for one in found):
-        found += _explanations(observations.without_gravity(), rough)
+    if gravity_optional and not any(one.best.tilt_chi2 <= limit and not one.adapted for one in found):
+        found += _explanations(observations.without_gravity(), rough, sizes=(False,))
     if not found:
         raise EstimationFailure("position", "no pose explains gravity and most of the spots")
     best = min(found, key=lambda one: _score(one, observations))
@@ -159,14 +159,17 @@ def _consensus(
     return replace(best, unchecked_m2=_unchecked_focal_m2(best.of_inliers(), best.best))
 
 
-def _explanations(observations: Observations, rough: Sequence[Pose]) -> list[Consensus]:
+def _explanations(
+    observations: Observations, rough: Sequence[Pose], sizes: Sequence[bool] = (False, True)
+) -> list[Consensus]:
     """Explanations of the spots by errors as stated with outliers, and by errors of a size by the residuals.
 
-    `rough` are poses to begin with. An explanation with many inliers and few outliers needs no other.
+    `sizes` says which: False for as stated, True for by the residuals. `rough` are poses to begin with. An explanation
+    with many inliers and few outliers needs no other.
     """
     ranked, assumed = _ranked(observations, rough), observations.with_assumed_camera()
     models = [observations] if assumed is observations else [observations, assumed]
-    attempts = [(model, adapted) for adapted in (False, True) for model in models]
+    attempts = [(model, adapted) for adapted in sizes for model in models]
     found = []
     for model, adapted in attempts:
         explained = _snooped_consensus(model, ranked, adapted)
@@ -245,6 +248,10 @@ def _snooped_consensus(
     for pose, distance_px in ranked[:MAX_ROBUST_STARTS]:
         spread_px = _spread_px(distance_px)
         inliers = distance_px <= np.maximum(START_GATE * spread_px, _gate_px(observations, pose))
+        if adapted and not _enough(inliers):
+            # No majority agrees to the best ones' errors: all spots have errors of one size.
+            inliers = np.isfinite(distance_px)
+            spread_px = float(np.sqrt((distance_px[inliers] ** 2).mean() / 2))
         trial = observations
         if adapted and not _scalable(observations):
             trial = replace(observations, added_sigma_px=spread_px)
