@@ -9,8 +9,7 @@ an LED at P of a luminaire with centre C is at
 with the small rotation w of the luminaire. This module has the derivatives of these two sentences.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -183,8 +182,3 @@ def _small_rotation(axis: int, angle_rad: float) -> Array:
     angles = [0.0, 0.0, 0.0]
     angles[axis] = float(np.degrees(angle_rad))
     return rotation_cam_world(*angles)
-
-
-def without(uncertainty: Uncertainty, names: Sequence[str]) -> Uncertainty:
-    """The uncertainty with some of its fields 0."""
-    return replace(uncertainty, **{name: np.multiply(getattr(uncertainty, name), 0.0) for name in names})
