@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from estimator.evaluate.score import Scores, score
     from estimator.io.dataset import Dataset, read_dataset, read_frame
     from estimator.io.device import DeviceFrame, frame
-    from estimator.methods.registry import estimate, variants
+    from estimator.methods.registry import estimate, estimate_device, variants
     from estimator.methods.variant import Estimate, Variant
 
     __version__: str
@@ -35,6 +35,7 @@ __all__ = [
     "Variant",
     "__version__",
     "estimate",
+    "estimate_device",
     "frame",
     "read_dataset",
     "read_frame",
@@ -52,6 +53,7 @@ _MODULES = {
     "Scores": "estimator.evaluate.score",
     "Variant": "estimator.methods.variant",
     "estimate": "estimator.methods.registry",
+    "estimate_device": "estimator.methods.registry",
     "frame": "estimator.io.device",
     "read_dataset": "estimator.io.dataset",
     "read_frame": "estimator.io.dataset",
