@@ -8,6 +8,7 @@ from estimator.methods.maximum_likelihood import ML
 from estimator.methods.nakazawa2013 import NAKAZAWA2013
 from estimator.methods.pnp import IPPE, PNP, SQPNP
 from estimator.methods.rahman2011 import RAHMAN2011
+from estimator.methods.self_calibrated import SELF_CALIBRATED
 from estimator.methods.up2p import UP2P
 from estimator.methods.variant import Variant
 from estimator.methods.yoshino2008 import YOSHINO2008
@@ -26,6 +27,7 @@ VARIANTS = {
         SQPNP,
         UP2P,
         GRAVITY_FIT,
+        SELF_CALIBRATED,
         ML,
     )
 }

@@ -16,6 +16,11 @@ unknowns that no frame determines keep their priors and cannot spoil it. An LED 
 unknown: its error adds to its centroid's covariance. The covariance of a position is that of the frame by itself, plus
 that of the common unknowns propagated to it; correlations within and between the frames are in it. Spots that disagree
 are found by data snooping (Baarda 1968): each residual by the covariance that the adjustment gives it.
+
+Stated standard deviations may be wrong. The adjustment estimates the variance of each kind of unknown (Foerstner 1979):
+the sum of squares of its values in units of their priors is, to first order, chi-square with as many degrees of freedom
+as the frames determine of them, `count - trace` of their covariance. A kind whose sum of squares is as improbable as an
+outlier has its standard deviations multiplied by the root of the ratio, and the frames are fitted again.
 """
 
 from collections import Counter
@@ -44,8 +49,11 @@ CONVERGED_CHI2 = 1e-6
 OUTLIER_PROBABILITY = 1e-6
 # Upper limit of centroid errors that the image model leaves out (`estimator.solvers.robust_fit`).
 MODEL_ERROR_PX = 0.1
-# Each round of snooping leaves out the worst spot of every frame.
+# Each round leaves out the worst spot of every frame, or corrects standard deviations.
 MAX_ROUNDS = 12
+MAX_RATIO = 100.0
+# Degrees of freedom from which on a kind's variance is estimated.
+MIN_FREEDOM = 8.0
 MIN_SPOTS = 4
 FACE = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
 
@@ -96,7 +104,8 @@ class Adjustment:
     """Result of `adjust`: a frame each, None for a frame that too few spots agree on, and the common unknowns.
 
     `chi2` is the minimized sum of squares, `freedom` its degrees of freedom. `unknowns` gives each common unknown's
-    value and standard deviation by (kind, key, component): kind "camera" with the index of the camera and one of
+    value and standard deviation by (kind, key, component); `scales` are the factors, by kind, of the stated standard
+    deviations. Kind "camera" with the index of the camera and one of
     INTRINSICS, "gravity" with the index of the camera and 0 or 1, "luminaire" with an id and 0 to 5 (x, y, z in metres,
     rotations about them in radians), "led" with an id and 0 to 2 (metres), "datum" with 0 and 0 to 3 (metres, then the
     relative scale).
@@ -106,16 +115,19 @@ class Adjustment:
     chi2: float
     freedom: int
     unknowns: dict[tuple[str, int, int], tuple[float, float]]
+    scales: dict[str, float]
 
 
 class Unknowns:
     """The common unknowns of a device: those whose stated standard deviation is not zero.
 
-    The vector of all of them, (count,), is in units of their standard deviations `sigma` (count,).
+    The vector of all of them, (count,), is in units of their standard deviations `sigma` (count,), which are the stated
+    ones times the factor of their kind in `scales`.
     """
 
-    def __init__(self, views: Sequence[DeviceView]) -> None:
+    def __init__(self, views: Sequence[DeviceView], scales: Mapping[str, float]) -> None:
         """Collect the unknowns of cameras, gravity, luminaires, LEDs and datum that the frames of a device show."""
+        self.scales = scales
         self.cameras: list[Camera] = []
         self._index: dict[tuple[str, int], Indices] = {}
         self.names: list[tuple[str, int, int]] = []
@@ -128,7 +140,7 @@ class Unknowns:
                     places.append(len(sigma) if one > 0 else -1)
                     if one > 0:
                         self.names.append((kind, key, component))
-                        sigma.append(float(one))
+                        sigma.append(float(one) * scales.get(kind, 1.0))
                 self._index[kind, key] = np.array(places, dtype=np.intp)
 
         frames_of_led = Counter(led.id for view in views for led in view.leds)
@@ -150,6 +162,7 @@ class Unknowns:
                 if frames_of_led[led.id] > 1:
                     add("led", led.id, led_sigmas_m(led))
         self.sigma: Floats = np.array(sigma, dtype=np.float64)
+        self.kinds = np.array([kind for kind, _, _ in self.names])
         self.frames_of_led = frames_of_led
 
     @property
@@ -162,11 +175,10 @@ class Unknowns:
         return self._index.get((kind, key), np.full(size, -1, dtype=np.intp))
 
     def values(self, places: Indices, vector: Floats) -> Floats:
-        """Values, in their own units, of the unknowns at some places; 0 for a known one."""
-        found = np.zeros(len(places))
-        there = places >= 0
-        found[there] = vector[places[there]] * self.sigma[places[there]]
-        return found
+        """Values, in their own units, of the unknowns at places of any shape; 0 for a known one."""
+        if not self.count:
+            return np.zeros(places.shape)
+        return np.where(places >= 0, (vector * self.sigma)[places], 0.0)
 
 
 def led_sigmas_m(led: Led) -> Floats:
@@ -216,7 +228,7 @@ class _Frame:
         stated = view.camera.uncertainty
         shot_sigma = np.zeros(len(INTRINSICS)) if stated is None else stated.shot_sigmas()
         self.shot_places = np.flatnonzero(shot_sigma > 0)
-        self.shot_sigma = shot_sigma[self.shot_places]
+        self.shot_sigma = shot_sigma[self.shot_places] * unknowns.scales.get("shot", 1.0)
         self.with_gravity = bool(np.isfinite(view.tilt_shot_sigma_rad).all())
         self.extent_m = np.sqrt([2 * led.mean_square_extent_m2 for led in view.leds])
         self.told_m: Floats = np.array([led.position_m for led in view.leds], dtype=np.float64).reshape(-1, 3)
@@ -227,21 +239,23 @@ class _Frame:
         parts = [unknowns.places("camera", self.camera_index, len(INTRINSICS))]
         parts += [unknowns.places("gravity", self.camera_index, 2), unknowns.places("datum", 0, 4)]
         parts += [unknowns.places("luminaire", one.id, 6) for one, _ in self.luminaires]
-        parts += [unknowns.places("led", led.id, 3) for led in view.leds]
-        places = np.concatenate(parts)
+        self.led_places = np.array([unknowns.places("led", led.id, 3) for led in view.leds], dtype=np.intp).reshape(
+            -1, 3
+        )
+        places = np.concatenate([*parts, self.led_places.ravel()])
         self.present = places >= 0
         self.columns: Indices = places[self.present]
 
     def _whitening(self) -> Floats:
         """Matrices (n, 2, 2) that make the spots' errors unit ones, with those of LEDs that no other frame shows."""
-        covariance = self.view.covariance_px2.copy()
+        covariance = self.view.covariance_px2 * self.unknowns.scales.get("spots", 1.0) ** 2
         slopes: Floats | None = None
         for k, led in enumerate(self.view.leds):
             if self.unknowns.frames_of_led[led.id] > 1 or not led_sigmas_m(led).any():
                 continue
             if slopes is None:
                 slopes = project(self.told_m, self.view.pose, self.view.camera).slopes[:, :, :3]
-            by_led = slopes[k] * led_sigmas_m(led)
+            by_led = slopes[k] * led_sigmas_m(led) * self.unknowns.scales.get("led", 1.0)
             covariance[k] += by_led @ by_led.T
         return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))
 
@@ -252,8 +266,7 @@ class _Frame:
             error = self.unknowns.values(self.unknowns.places("luminaire", luminaire.id, 6), common)
             arm_m = positions_m[member] - luminaire.position_m
             positions_m[member] += error[:3] + Rotation.from_rotvec(error[3:]).apply(arm_m) - arm_m
-        for k, led in enumerate(self.view.leds):
-            positions_m[k] += self.unknowns.values(self.unknowns.places("led", led.id, 3), common)
+        positions_m += self.unknowns.values(self.led_places, common)
         datum = self.unknowns.values(self.unknowns.places("datum", 0, 4), common)
         return np.asarray((1 + datum[3]) * positions_m + datum[:3])
 
@@ -378,55 +391,74 @@ def _centroids_px(positions_m: Floats, extent_m: Floats, pose: Pose, camera: Cam
     return np.asarray((weights[..., None] * seen.pixels.reshape(-1, 4, 2)).sum(axis=1))
 
 
-def adjust(views: Sequence[DeviceView]) -> Adjustment:
+def adjust(views: Sequence[DeviceView], scale: float = 1.0) -> Adjustment:
     """Fit all frames of a device and its common unknowns; spots that disagree are left out.
 
-    A frame is left out, None in the result, where fewer than MIN_SPOTS spots agree, or no more than half of them.
+    A frame is left out, None in the result, where fewer than MIN_SPOTS spots agree, or no more than half of them. The
+    stated standard deviations of camera and map count `scale` times to begin with.
     """
     used = [np.ones(len(view.leds), dtype=bool) for view in views]
     starts = [view.pose for view in views]
     taken = [len(view.leds) > 0 for view in views]
+    scales = {kind: scale for kind in ("camera", "shot", "luminaire", "led")}
+    common: dict[tuple[str, int, int], tuple[float, float]] = {}
     for round_ in range(MAX_ROUNDS):
         frames = [k for k, use in enumerate(taken) if use]
         chosen = [replace(views[k].only(used[k]), pose=starts[k]) for k in frames]
         try:
-            solution = _Solution(chosen)
+            solution = _Solution(chosen, scales, common)
         except LinAlgError:
-            return Adjustment((None,) * len(views), 0.0, 0, {})
+            return Adjustment((None,) * len(views), 0.0, 0, {}, scales)
+        common = solution.named()
         for k, pose in zip(frames, solution.state.poses, strict=True):
             starts[k] = pose
+        if round_ == MAX_ROUNDS - 1:
+            break
         clean = True
         for k, test in zip(frames, solution.tests(), strict=True):
-            if not len(test) or test.max() <= chi2.isf(OUTLIER_PROBABILITY, 2):
+            if test.max() <= chi2.isf(OUTLIER_PROBABILITY, 2):
                 continue
             clean = False
             used[k] = used[k].copy()
             used[k][np.flatnonzero(used[k])[int(np.argmax(test))]] = False
-            taken[k] = used[k].sum() >= MIN_SPOTS and 2 * used[k].sum() > len(used[k])
-        if clean or round_ == MAX_ROUNDS - 1:
+            taken[k] = bool(used[k].sum() >= MIN_SPOTS and 2 * used[k].sum() > len(used[k]))
+        if not clean:
+            continue
+        ratios = solution.variance_ratios()
+        if not ratios:
             break
+        scales = {**scales, **{kind: scales.get(kind, 1.0) * np.sqrt(ratio) for kind, ratio in ratios.items()}}
+        # Spots that disagreed by the former standard deviations may agree by these.
+        used = [np.ones(len(view.leds), dtype=bool) for view in views]
+        taken = [len(view.leds) > 0 for view in views]
     results: list[Adjusted | None] = [None] * len(views)
     for k, pose, covariance_m2 in zip(frames, solution.state.poses, solution.position_covariances(), strict=True):
-        results[k] = Adjusted(pose, covariance_m2, used[k])
-    return Adjustment(tuple(results), solution.chi2, solution.freedom, solution.named())
+        results[k] = Adjusted(pose, covariance_m2, used[k]) if taken[k] else None
+    return Adjustment(tuple(results), solution.chi2, solution.freedom, solution.named(), scales)
 
 
 class _Solution:
     """The minimum for a set of frames; raises LinAlgError if there is none."""
 
-    def __init__(self, views: Sequence[DeviceView]) -> None:
-        self.unknowns = Unknowns(views)
+    def __init__(
+        self,
+        views: Sequence[DeviceView],
+        scales: Mapping[str, float],
+        start: Mapping[tuple[str, int, int], tuple[float, float]],
+    ) -> None:
+        self.unknowns = Unknowns(views, scales)
         self.frames = [_Frame(view, self.unknowns) for view in views]
         shots = tuple(np.zeros(len(INTRINSICS)) for _ in views)
-        self.state = _State(tuple(view.pose for view in views), shots, np.zeros(self.unknowns.count))
+        common = np.array([start.get(name, (0.0, 0.0))[0] for name in self.unknowns.names]) / self.unknowns.sigma
+        self.state = _State(tuple(view.pose for view in views), shots, common)
         self.chi2 = self._cost(self.state)
         for _ in range(MAX_STEPS):
             promised = self._step()
             if promised < CONVERGED_CHI2:
                 break
-        self.lines, self.factor, _ = self._equations()
+        self.lines, factor, _ = self._equations()
         identity = np.eye(self.unknowns.count)
-        self.covariance = cho_solve(self.factor, identity) if self.unknowns.count else identity
+        self.covariance = cho_solve(factor, identity, overwrite_b=True) if self.unknowns.count else identity
 
     @property
     def freedom(self) -> int:
@@ -502,6 +534,23 @@ class _Solution:
             found.append(np.einsum("ni,ni->n", residuals, np.linalg.solve(own, residuals[:, :, None])[:, :, 0]))
         return found
 
+    def variance_ratios(self) -> dict[str, float]:
+        """Estimated over assumed variance by kind of unknown, of those that are improbable by OUTLIER_PROBABILITY."""
+        found = {}
+        redundancy = 1 - np.diag(self.covariance)
+        for kind in ("camera", "gravity", "luminaire", "led"):
+            of_kind = self.unknowns.kinds == kind
+            total = float((self.state.common[of_kind] ** 2).sum())
+            found[kind] = total, float(redundancy[of_kind].sum())
+        total = freedom = 0.0
+        for frame, shot, line in zip(self.frames, self.state.shots, self.lines, strict=True):
+            of_common = self.covariance[np.ix_(line.columns, line.columns)]
+            own = (line.own + line.G @ of_common @ line.G.T)[POSE_PARAMETERS:, POSE_PARAMETERS:]
+            total += float(((shot[frame.shot_places] / frame.shot_sigma) ** 2).sum())
+            freedom += float((1 - np.diag(own) / frame.shot_sigma**2).sum())
+        found["shot"] = total, freedom
+        return {kind: ratio for kind, one in found.items() if (ratio := _ratio(*one)) is not None}
+
     def named(self) -> dict[tuple[str, int, int], tuple[float, float]]:
         """Value and standard deviation of each common unknown by its name."""
         sigma = np.sqrt(np.diag(self.covariance)) * self.unknowns.sigma
@@ -510,3 +559,13 @@ class _Solution:
             name: (float(one), float(spread))
             for name, one, spread in zip(self.unknowns.names, value, sigma, strict=True)
         }
+
+
+def _ratio(total: float, freedom: float) -> float | None:
+    """A sum of squares over its degrees of freedom; None where it is probable or there are fewer than MIN_FREEDOM."""
+    if freedom < MIN_FREEDOM:
+        return None
+    half = OUTLIER_PROBABILITY / 2
+    if chi2.ppf(half, freedom) <= total <= chi2.isf(half, freedom):
+        return None
+    return float(np.clip(total / freedom, 1 / MAX_RATIO, MAX_RATIO))
