@@ -49,8 +49,10 @@ CONVERGED_CHI2 = 1e-6
 OUTLIER_PROBABILITY = 1e-6
 # Upper limit of centroid errors that the image model leaves out (`estimator.solvers.robust_fit`).
 MODEL_ERROR_PX = 0.1
-# Each round leaves out the worst spot of every frame, or corrects standard deviations.
-MAX_ROUNDS = 12
+# Each round leaves out spots, or corrects standard deviations.
+MAX_ROUNDS = 20
+# Ratio of chi-squares up to which outliers are left out in one round.
+SIMILAR = 10.0
 MAX_RATIO = 100.0
 # Degrees of freedom from which on a kind's variance is estimated.
 MIN_FREEDOM = 8.0
@@ -299,7 +301,7 @@ class _Frame:
         by_camera = intrinsic_slopes(seen.p_cam, camera)
         own = np.concatenate([seen.slopes, by_camera[:, :, self.shot_places]], axis=2)
         own = np.einsum("nij,njk->nik", self.whitening, own).reshape(2 * n, -1)
-        by_common = np.einsum("nij,njk->nik", self.whitening, self._by_common(seen.slopes, by_camera, positions_m))
+        by_common = np.einsum("nij,njk->nik", self.whitening, self._by_common(seen.slopes, by_camera, common))
         shared = by_common.reshape(2 * n, -1)[:, self.present]
         gravity = 2 if self.with_gravity else 0
         below = np.zeros((gravity + len(self.shot_places), own.shape[1]))
@@ -329,15 +331,17 @@ class _Frame:
             projector=spots @ spots.T,
         )
 
-    def _by_common(self, slopes: Floats, by_camera: Floats, positions_m: Floats) -> Floats:
+    def _by_common(self, slopes: Floats, by_camera: Floats, common: Floats) -> Floats:
         """Derivatives (n, 2, all) of the pixels by the common unknowns of the frame, in the order of the columns."""
+        positions_m = self.positions_m(common)
         n = len(positions_m)
         by_position = -slopes[:, :, :3]
         by_scale = np.einsum("nij,nj->ni", by_position, positions_m)[:, :, None]
         parts = [by_camera, np.zeros((n, 2, 2)), by_position, by_scale]
         zero = np.zeros(n)
         for luminaire, member in self.luminaires:
-            x, y, z = (positions_m - luminaire.position_m).T
+            turn = self.unknowns.values(self.unknowns.places("luminaire", luminaire.id, 6), common)[3:]
+            x, y, z = Rotation.from_rotvec(turn).apply(self.told_m - luminaire.position_m).T
             turned = np.array([[zero, z, -y], [-z, zero, x], [y, -x, zero]]).transpose(2, 0, 1)
             parts.append(np.concatenate([by_position, by_position @ turned], axis=2) * member[:, None, None])
         of_leds = np.zeros((n, 2, n, 3))
@@ -414,15 +418,13 @@ def adjust(views: Sequence[DeviceView], scale: float = 1.0) -> Adjustment:
             starts[k] = pose
         if round_ == MAX_ROUNDS - 1:
             break
-        clean = True
-        for k, test in zip(frames, solution.tests(), strict=True):
-            if test.max() <= chi2.isf(OUTLIER_PROBABILITY, 2):
-                continue
-            clean = False
+        outliers = _outliers(solution.tests())
+        for place, chosen_spots in outliers.items():
+            k = frames[place]
             used[k] = used[k].copy()
-            used[k][np.flatnonzero(used[k])[int(np.argmax(test))]] = False
+            used[k][np.flatnonzero(used[k])[chosen_spots]] = False
             taken[k] = bool(used[k].sum() >= MIN_SPOTS and 2 * used[k].sum() > len(used[k]))
-        if not clean:
+        if outliers:
             continue
         ratios = solution.variance_ratios()
         if not ratios:
@@ -435,6 +437,22 @@ def adjust(views: Sequence[DeviceView], scale: float = 1.0) -> Adjustment:
     for k, pose, covariance_m2 in zip(frames, solution.state.poses, solution.position_covariances(), strict=True):
         results[k] = Adjusted(pose, covariance_m2, used[k]) if taken[k] else None
     return Adjustment(tuple(results), solution.chi2, solution.freedom, solution.named(), scales)
+
+
+def _outliers(tests: Sequence[Floats]) -> dict[int, Indices]:
+    """Spots to leave out next, by the place of their frame: the worst of each frame that has about the worst of all.
+
+    An outlier pulls the true spots of its frame, and a frame of outliers other frames: both are judged without it. The
+    worst frame is left out whole if most of its spots disagree.
+    """
+    limit = float(chi2.isf(OUTLIER_PROBABILITY, 2))
+    largest = max(float(test.max()) for test in tests)
+    found = {}
+    for place, test in enumerate(tests):
+        if test.max() > max(limit, largest / SIMILAR):
+            whole = test.max() == largest and np.median(test) > limit
+            found[place] = np.arange(len(test)) if whole else np.array([np.argmax(test)])
+    return found
 
 
 class _Solution:
