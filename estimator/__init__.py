@@ -21,13 +21,14 @@ if TYPE_CHECKING:
     from estimator.io.dataset import Dataset, read_dataset, read_frame
     from estimator.io.device import DeviceFrame, frame
     from estimator.methods.registry import estimate, estimate_device, variants
-    from estimator.methods.variant import Estimate, Variant
+    from estimator.methods.variant import DeviceMethod, Estimate, Variant
 
     __version__: str
 
 __all__ = [
     "Dataset",
     "DeviceFrame",
+    "DeviceMethod",
     "Estimate",
     "EstimationFailure",
     "InputError",
@@ -47,6 +48,7 @@ __all__ = [
 _MODULES = {
     "Dataset": "estimator.io.dataset",
     "DeviceFrame": "estimator.io.device",
+    "DeviceMethod": "estimator.methods.variant",
     "Estimate": "estimator.methods.variant",
     "EstimationFailure": "estimator.errors",
     "InputError": "estimator.errors",
