@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.camera.pose import Pose
-from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame
 from estimator.methods.pnp import candidates, in_a_plane
-from estimator.methods.up2p import upright_pose
+from estimator.methods.up2p import upright_pairs, upright_pose
 from estimator.methods.variant import Estimate, Variant
 from estimator.solvers.reprojection import Observations, centroid_images, observe
 from estimator.solvers.robust_fit import Consensus, consensus
@@ -51,14 +50,12 @@ def fit_correspondences(frame: DeviceFrame, correspondences: Sequence[Correspond
 
 def agreement(observations: Observations) -> Consensus:
     """Consensus of spots and gravity, or of the spots alone if gravity disagrees; raises EstimationFailure."""
-    starts = _starts(observations)
-    try:
-        return consensus(observations, starts, lambda: _from_triples(observations))
-    except EstimationFailure:
-        if not determine_orientation(observations.leds_m):
-            raise
-        # The accelerometer's reading may be the outlier.
-        return consensus(observations.without_gravity(), starts, lambda: _from_triples(observations))
+
+    def more_starts() -> list[Pose]:
+        return [*upright_pairs(observations), *_from_triples(observations)]
+
+    gravity_optional = determine_orientation(observations.leds_m)
+    return consensus(observations, _starts(observations), more_starts, gravity_optional)
 
 
 def ambiguous(agreed: Consensus) -> bool:

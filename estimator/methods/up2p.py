@@ -86,9 +86,13 @@ def upright_pose(observations: Observations) -> Pose | None:
     With LEDs at one height, the leveled image is the LEDs' plane rotated by the yaw, scaled by the height and shifted,
     which is linear in complex numbers. The position is then the point nearest to all lines of sight.
     """
-    level, above = _leveled(observations)
-    if above.sum() < 2:
-        return None
+    above = _leveled(observations)[1]
+    return _upright(observations, above) if above.sum() >= 2 else None
+
+
+def _upright(observations: Observations, above: NDArray[np.bool_]) -> Pose | None:
+    """Upright pose by least squares over spots above the horizon, (n,); None if they do not determine one."""
+    level = _leveled(observations)[0]
     rays, leds_m = level[above], observations.leds_m[above]
     image = (rays[:, 0] + 1j * rays[:, 1]) / rays[:, 2]
     planar = leds_m[:, 0] + 1j * leds_m[:, 1]
@@ -107,6 +111,24 @@ def upright_pose(observations: Observations) -> Pose | None:
     except np.linalg.LinAlgError:
         return None
     return Pose(position_m, R_cam_world)
+
+
+def upright_pairs(observations: Observations) -> list[Pose]:
+    """Upright poses by pairs of spots, at most MAX_PAIRS: initial values for observations with outliers."""
+    _, above = _leveled(observations)
+    pairs = np.array(list(combinations(np.flatnonzero(above).tolist(), 2))).reshape(-1, 2)
+    if len(pairs) > MAX_PAIRS:
+        generator = np.random.Generator(np.random.Philox(key=len(pairs)))
+        pairs = pairs[generator.choice(len(pairs), MAX_PAIRS, replace=False)]
+    chosen = np.zeros(len(above), dtype=bool)
+    poses = []
+    for pair in pairs:
+        chosen[:] = False
+        chosen[pair] = True
+        pose = _upright(observations, chosen)
+        if pose is not None:
+            poses.append(pose)
+    return poses
 
 
 def _leveled(observations: Observations) -> tuple[Floats, NDArray[np.bool_]]:
