@@ -283,6 +283,18 @@ def test_scores_by_device_map_and_good_leds_by_hand() -> None:
     assert [(row.device, row.map, row.good_leds) for row in score.rows][:2] == [(3, 1, 5), (4, 0, 2)]
 
 
+def test_one_of_several_devices_has_no_interval() -> None:
+    """Its frames share errors, and nothing tells how devices differ. One device in all has independent frames."""
+    sure = {"covariance_m2": (1e-6, 0.0, 0.0, 0.0, 1e-6, 0.0, 0.0, 0.0, 1e-6)}
+    rows = [*(ok(k, TRUTH).model_copy(update=sure) for k in range(3)), failed(3, "a: b")]
+    several = score_variant("x", rows, truths(4), LEDS, devices=[0, 0, 0, 1])
+    assert (several.median_interval, several.rmse_interval, several.nees) == (None, None, None)
+    assert several.by_device[0].nees == 0.0
+    alone = score_variant("x", rows, truths(4), LEDS, devices=[0, 0, 0, 0])
+    assert alone.median_interval is not None
+    assert alone.nees is not None
+
+
 def test_both_bounds_are_compared_where_they_differ() -> None:
     """Error 4 mm, bounds of 2 mm and, for a device that knows all, 1 mm: efficiencies 0.5 and 0.25."""
     x, y, z = TRUTH

@@ -258,8 +258,11 @@ def score_variant(
         score_frame(row, true, leds, device) for row, true, device in zip(estimates, truth, of_frame, strict=True)
     )
     good = [row for row in rows if row.status == "ok"]
-    groups = groups_of(good)
     sure = [row for row in good if row.nees is not None]
+    groups = groups_of(good)
+    # Of frames that share errors and are of one device, no interval can be made.
+    dependent = groups_of(rows).devices > 1
+    unsure, one_device = dependent and groups.devices < 2, dependent and groups_of(sure).devices < 2
     squares = [row.nees for row in sure if row.nees is not None]
     errors_m = [row.error_3d_m for row in good if row.error_3d_m is not None]
     range_errors_m = [error.error_m for row in rows for error in row.range_errors]
@@ -273,15 +276,15 @@ def score_variant(
         failures=dict(Counter(row.reason for row in rows if row.status == "failed").most_common()),
         of_all=of_all([row.error_3d_m for row in rows]),
         error_3d=summary(errors_m),
-        median_interval=median_interval(errors_m, groups),
-        rmse_interval=rmse_interval(errors_m, groups),
+        median_interval=None if unsure else median_interval(errors_m, groups),
+        rmse_interval=None if unsure else rmse_interval(errors_m, groups),
         horizontal=summary([row.horizontal_error_m for row in good if row.horizontal_error_m is not None]),
         vertical=summary([row.vertical_error_m for row in good if row.vertical_error_m is not None]),
         ranges=len(range_errors_m),
         range_error=summary(range_errors_m),
         against_bound=_against(good, "bound_m"),
         against_exact_bound=None if _same_bounds(rows) else _against(good, "bound_exact_m"),
-        nees=nees(squares, groups_of(sure)),
+        nees=None if one_device else nees(squares, groups_of(sure)),
         nees_by_map=nees_by_map(squares, groups_of(sure)),
         by_device=_by_device(rows),
         by_map=_by_map(rows),

@@ -27,8 +27,8 @@ VARIANTS = {
         SQPNP,
         UP2P,
         GRAVITY_FIT,
-        SELF_CALIBRATED,
         ML,
+        SELF_CALIBRATED,
     )
 }
 STAGED = {"huynh2016": huynh2016_with}
