@@ -193,10 +193,13 @@ class Fit:
         return float(np.abs(self.spots_redundancy).max(initial=0.0))
 
 
-def observe(frame: DeviceFrame, correspondences: Sequence[Correspondence]) -> Observations:
+def observe(
+    frame: DeviceFrame, correspondences: Sequence[Correspondence], centroid_sigma_px: float = 0.0
+) -> Observations:
     """Observations of a frame; spots that cannot be undistorted are left out.
 
-    Raises EstimationFailure if the accelerometer reads zero or no spot is left.
+    `centroid_sigma_px` is a standard deviation of each centroid's coordinates beside that by the pixels' noise. Raises
+    EstimationFailure if the accelerometer reads zero or no spot is left.
     """
     camera = frame.camera
     usable = has_pinhole_image(centroids_px(correspondences), camera)
@@ -204,11 +207,12 @@ def observe(frame: DeviceFrame, correspondences: Sequence[Correspondence]) -> Ob
         correspondences = [one for one, use in zip(correspondences, usable, strict=True) if use]
     image = pinhole_image(centroids_px(correspondences), camera)
     covariance_px2 = np.array([one.spot.covariance_px2 for one in correspondences]).reshape(-1, 2, 2)
+    added_px2 = MIN_CENTROID_SIGMA_PX**2 + centroid_sigma_px**2
     # At depth 1 the projection's Jacobian by x and y is that from pinhole coordinates to the lens's.
     rays = np.column_stack([image, np.ones(len(image))])
     to_pixels = camera.matrix()[:2, :2] @ projection_of(camera).project(rays)[1][:, :, :2]
     from_pixels = np.linalg.inv(to_pixels)
-    covariance = from_pixels @ (covariance_px2 + MIN_CENTROID_SIGMA_PX**2 * np.eye(2)) @ from_pixels.transpose(0, 2, 1)
+    covariance = from_pixels @ (covariance_px2 + added_px2 * np.eye(2)) @ from_pixels.transpose(0, 2, 1)
     tilt = tilt_from_gravity(frame.accelerometer_m_s2)
     return Observations(
         leds_m=led_positions_m(correspondences),
@@ -232,6 +236,19 @@ def centroid_images(pose: Pose, leds_m: Floats, lift_m2: Floats) -> tuple[Floats
     # An LED behind the camera has no image; here it only has to be far off, and finite.
     depth = np.where(np.abs(p_cam[:, 2]) < 1e-9, 1e-9, p_cam[:, 2])
     return p_cam[:, :2] / depth[:, None], p_cam[:, 2]
+
+
+def pose_slopes(observations: Observations, pose: Pose) -> tuple[Floats, Floats]:
+    """Derivatives by six parameters of a pose: of spots in normalized coordinates (n, 2, 6), of the position (3, 6).
+
+    The parameters are a rotation vector and a translation of the LEDs about their mean.
+    """
+    centre = observations.leds_m.mean(axis=0)
+    vector = Rotation.from_matrix(pose.R_cam_world).as_rotvec()
+    x = np.concatenate([vector, pose.R_cam_world @ (centre - pose.position_m)])
+    model = np.ascontiguousarray(observations.leds_m - centre)
+    of_image = cv2.projectPoints(model, x[:3], x[3:], np.eye(3), None)[1][:, :6].reshape(-1, 2, 6)
+    return of_image, _position_slopes(x)
 
 
 def corrected_for_eccentricity(observations: Observations, pose: Pose) -> Observations:

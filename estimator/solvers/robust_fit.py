@@ -1,16 +1,16 @@
 """Robust fit: the pose that explains gravity and the spots, which spots it leaves out, and how large the errors are.
 
 Data snooping (Baarda 1968) finds outliers: each spot's displacement from where the other observations put it is tested
-against its own covariance, and the worst spot is left out until none is beyond OUTLIER_PROBABILITY. Where all spots
+against its own covariance, and the worst spots are left out until none is beyond OUTLIER_PROBABILITY. Where all spots
 pass with the errors that the device states, that fit is the result. Otherwise several explanations compete, each fitted
 to the spots that it leaves in, from poses that put most spots about right:
 
 - errors as stated, and outliers;
-- stated errors of camera and map that are larger or smaller by a common factor, estimated from the residuals;
+- stated errors of camera, map and gravity that are larger or smaller by a common factor, estimated from the residuals;
 - where the map's errors are not stated: a further error of each centroid, of a size estimated from the residuals. A
   camera that states nothing then has the errors of one as sold (`estimator.solvers.uncertainty`), because the
   residuals hardly reveal a focal length;
-- each of them without gravity, if that is optional and contradicts the spots in all.
+- errors as stated without gravity, where that is optional and contradicts the spots.
 
 The explanation with the largest restricted likelihood is taken; an outlier lies anywhere in OUTLIER_RADIUS.
 """
@@ -42,6 +42,9 @@ MAX_ROBUST_STARTS = 3
 START_GATE = 5.0
 # Median of chi-square with two degrees of freedom.
 CHI2_MEDIAN = 2 * np.log(2)
+# Spots beyond the limit that are excluded together have at least this share of the largest chi-square: a wrong spot
+# pulls the fit, and with it the residuals of true spots.
+MIN_EXCLUDED_SHARE = 0.5
 # Repetitions that estimate the size of errors, by the median of spots with outliers and by all spots without, and the
 # largest change of its square in one.
 ROBUST_ROUNDS = 3
@@ -145,8 +148,8 @@ def _consensus(
         rough = [*(one.pose for one in fits), *starts, *more_starts()]
     found = _explanations(observations, rough)
     limit = chi2.isf(OUTLIER_PROBABILITY, 2)
-    if gravity_optional and not any(one.best.tilt_chi2 <= limit for one in found):
-        found += _explanations(observations.without_gravity(), rough)
+    if gravity_optional and not any(one.best.tilt_chi2 <= limit and not one.adapted for one in found):
+        found += _explanations(observations.without_gravity(), rough, sizes=(False,))
     if not found:
         raise EstimationFailure("position", "no pose explains gravity and most of the spots")
     best = min(found, key=lambda one: _score(one, observations))
@@ -156,14 +159,17 @@ def _consensus(
     return replace(best, unchecked_m2=_unchecked_focal_m2(best.of_inliers(), best.best))
 
 
-def _explanations(observations: Observations, rough: Sequence[Pose]) -> list[Consensus]:
+def _explanations(
+    observations: Observations, rough: Sequence[Pose], sizes: Sequence[bool] = (False, True)
+) -> list[Consensus]:
     """Explanations of the spots by errors as stated with outliers, and by errors of a size by the residuals.
 
-    `rough` are poses to begin with. An explanation with many inliers and few outliers needs no other.
+    `sizes` says which: False for as stated, True for by the residuals. `rough` are poses to begin with. An explanation
+    with many inliers and few outliers needs no other.
     """
     ranked, assumed = _ranked(observations, rough), observations.with_assumed_camera()
     models = [observations] if assumed is observations else [observations, assumed]
-    attempts = [(model, adapted) for adapted in (False, True) for model in models]
+    attempts = [(model, adapted) for adapted in sizes for model in models]
     found = []
     for model, adapted in attempts:
         explained = _snooped_consensus(model, ranked, adapted)
@@ -242,6 +248,10 @@ def _snooped_consensus(
     for pose, distance_px in ranked[:MAX_ROBUST_STARTS]:
         spread_px = _spread_px(distance_px)
         inliers = distance_px <= np.maximum(START_GATE * spread_px, _gate_px(observations, pose))
+        if adapted and not _enough(inliers):
+            # No majority agrees to the best ones' errors: all spots have errors of one size.
+            inliers = np.isfinite(distance_px)
+            spread_px = float(np.sqrt((distance_px[inliers] ** 2).mean() / 2))
         trial = observations
         if adapted and not _scalable(observations):
             trial = replace(observations, added_sigma_px=spread_px)
@@ -283,13 +293,13 @@ def _ranked(observations: Observations, poses: Sequence[Pose]) -> list[tuple[Pos
 def _distance_px(observations: Observations, pose: Pose) -> Floats:
     image, depth_m = centroid_images(pose, observations.leds_m, observations.lift_m2)
     offset = np.linalg.solve(observations.from_pixels, (observations.image - image)[:, :, None])[:, :, 0]
-    return np.where(depth_m > 0, np.linalg.norm(offset, axis=1), np.inf)
+    return np.asarray(np.where(depth_m > 0, np.linalg.norm(offset, axis=1), np.inf))
 
 
 def _spread_px(distance_px: Floats) -> float:
     """Standard deviation of a coordinate, from the median of distances in the plane; at least MODEL_ERROR_PX."""
     median = float(np.sort(distance_px)[len(distance_px) // 2])
-    return max(median / np.sqrt(2 * np.log(2)), MODEL_ERROR_PX)
+    return max(median / float(np.sqrt(2 * np.log(2))), MODEL_ERROR_PX)
 
 
 def _gate_px(observations: Observations, pose: Pose) -> Floats:
@@ -326,9 +336,12 @@ def _snooped(
         if not (pose.position_m[2] < chosen.leds_m[:, 2].min() and 2 * (depth_m > 0).sum() > len(depth_m)):
             return None
         passes = _passes(found, chosen, adapted)
+        if 2 * passes.sum() < len(passes):
+            return None
         if not passes.all():
+            displaced = np.where(passes, 0.0, found.outlier_chi2(_model_error(chosen)))
             inliers = inliers.copy()
-            inliers[np.flatnonzero(inliers)[np.argmax(found.outlier_chi2(_model_error(chosen)))]] = False
+            inliers[np.flatnonzero(inliers)[displaced >= MIN_EXCLUDED_SHARE * displaced.max()]] = False
             continue
         if adapted:
             model, found = _settled(model, found, inliers)
@@ -349,7 +362,8 @@ def _with_errors(observations: Observations, ratio: float) -> Observations:
     """Observations whose adapted variance is larger by a ratio."""
     ratio = min(max(ratio, 1 / MAX_RATIO), MAX_RATIO)
     if _scalable(observations):
-        return replace(observations, scale=observations.scale * np.sqrt(ratio))
+        tilt_sigma_rad = observations.tilt_sigma_rad * np.sqrt(ratio)
+        return replace(observations, scale=observations.scale * np.sqrt(ratio), tilt_sigma_rad=tilt_sigma_rad)
     return replace(observations, added_sigma_px=observations.added_sigma_px * np.sqrt(ratio))
 
 
@@ -388,11 +402,13 @@ def _score(agreed: Consensus, observations: Observations) -> float:
     radius_px = OUTLIER_RADIUS * observations.camera.width_px
     outliers = 2 * np.log(np.pi * radius_px**2) * float((~agreed.inliers).sum())
     tilts = (
-        2 * float(np.log(2 * np.pi * observations.tilt_sigma_rad).sum()) if agreed.gravity else 2 * np.log(2 * np.pi)
+        2 * float(np.log(model.tilt_sigma_rad).sum()) + 2 * np.log(2 * np.pi)
+        if agreed.gravity
+        else 2 * np.log(2 * np.pi)
     )
     # Of two explanations that are about as likely, the one that trusts an unstated camera is the bolder.
     bold = CAUTION_CHI2 if model.camera.uncertainty is None and not model.correlated else 0.0
-    return float(bold + agreed.best.chi2 + spots + agreed.best.log_determinant + outliers + tilts)
+    return bold + float(agreed.best.chi2 + spots + agreed.best.log_determinant + outliers + tilts)
 
 
 def minima(observations: Observations, starts: Iterable[Pose], robust: bool = False) -> tuple[Fit, ...]:
