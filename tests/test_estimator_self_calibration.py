@@ -22,9 +22,9 @@ from estimator.solvers.self_calibration import (
     _Frame,
     adjust,
     erred,
-    intrinsic_slopes,
     led_sigmas_m,
 )
+from estimator.solvers.uncertainty import intrinsic_slopes_px
 
 SIZE = (1600, 1200, 3000.0)
 SIGMA_PX = 0.02
@@ -215,7 +215,7 @@ def test_a_frame_by_itself_has_the_covariance_of_generalised_least_squares(rng: 
     twice = Unknowns([view, view], {})  # so that each LED is an unknown
     frame = _Frame(replace(view, pose=found.pose), twice)
     at = project(frame.told_m, found.pose, view.camera)
-    by_camera = intrinsic_slopes(at.p_cam, view.camera)
+    by_camera = intrinsic_slopes_px(at.p_cam, view.camera.normalized(at.pixels), view.camera)
     n = len(view.leds)
     everything = frame._by_common(at.slopes, by_camera, np.zeros(twice.count)).reshape(2 * n, -1)[:, frame.present]
     known = everything * twice.sigma[frame.columns]
@@ -240,7 +240,7 @@ def test_two_frames_have_the_covariance_of_one_dense_system(rng: np.random.Gener
         assert one is not None
         frame = _Frame(replace(view, pose=one.pose), unknowns)
         at = project(frame.told_m, one.pose, view.camera)
-        by_camera = intrinsic_slopes(at.p_cam, view.camera)
+        by_camera = intrinsic_slopes_px(at.p_cam, view.camera.normalized(at.pixels), view.camera)
         n = len(view.leds)
         A = np.zeros((2 * n + 2 + 3, sum(sizes)))
         first = 9 * k
@@ -393,7 +393,8 @@ def test_the_intrinsics_errors_are_those_of_the_format(rng: np.random.Generator)
     assert (true.distortion.k1, true.distortion.k2, true.distortion.p1, true.distortion.p2) == (0.1, 0.0, 0.01, -0.02)
     p_cam = np.column_stack([rng.uniform(-0.3, 0.3, (20, 2)), np.ones(20)])
     pose = Pose(np.zeros(3), np.eye(3))
-    slopes = intrinsic_slopes(p_cam, true)
+    at = project(p_cam, pose, true)
+    slopes = intrinsic_slopes_px(p_cam, true.normalized(at.pixels), true)
     for k in range(7):
         step = 1e-6 * np.eye(7)[k]
         # An error on top of an error: the relative ones are to first order of (1 + focal), within 1 %.

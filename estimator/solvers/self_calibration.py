@@ -20,7 +20,8 @@ are found by data snooping (Baarda 1968): each residual by the covariance that t
 Stated standard deviations may be wrong. The adjustment estimates the variance of each kind of unknown (Foerstner 1979):
 the sum of squares of its values in units of their priors is, to first order, chi-square with as many degrees of freedom
 as the frames determine of them, `count - trace` of their covariance. A kind whose sum of squares is as improbable as an
-outlier has its standard deviations multiplied by the root of the ratio, and the frames are fitted again.
+outlier has its standard deviations multiplied by the root of the ratio, and the frames are fitted again. A kind that the
+frames determine too little of keeps the factor that `adjust` was given.
 """
 
 from collections import Counter
@@ -34,8 +35,9 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from estimator.camera.pose import POSE_PARAMETERS, Pose
-from estimator.camera.projection import project, projection_of
+from estimator.camera.projection import project
 from estimator.io.device import INTRINSICS, Camera, Distortion, Led, Luminaire, MapDatum
+from estimator.solvers.uncertainty import intrinsic_slopes_px
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -231,6 +233,7 @@ class _Frame:
         shot_sigma = np.zeros(len(INTRINSICS)) if stated is None else stated.shot_sigmas()
         self.shot_places = np.flatnonzero(shot_sigma > 0)
         self.shot_sigma = shot_sigma[self.shot_places] * unknowns.scales.get("shot", 1.0)
+        self.tilt_sigma_rad = view.tilt_shot_sigma_rad * unknowns.scales.get("reading", 1.0)
         self.with_gravity = bool(np.isfinite(view.tilt_shot_sigma_rad).all())
         self.extent_m = np.sqrt([2 * led.mean_square_extent_m2 for led in view.leds])
         self.told_m: Floats = np.array([led.position_m for led in view.leds], dtype=np.float64).reshape(-1, 3)
@@ -290,7 +293,7 @@ class _Frame:
             return np.zeros(0)
         bias = self.unknowns.values(self.unknowns.places("gravity", self.camera_index, 2), common)
         off = self.view.tilt_rad - pose.rig_angles(self.view.camera)[:2] - self.view.tilt_lever * bias
-        return np.asarray(((off + np.pi) % (2 * np.pi) - np.pi) / self.view.tilt_shot_sigma_rad)
+        return np.asarray(((off + np.pi) % (2 * np.pi) - np.pi) / self.tilt_sigma_rad)
 
     def linear(self, pose: Pose, shot: Floats, common: Floats) -> _Linear:
         """The equations of a step from here, the frame's own unknowns eliminated; raises LinAlgError."""
@@ -298,7 +301,7 @@ class _Frame:
         positions_m = self.positions_m(common)
         camera = self.camera(shot, common)
         seen = project(positions_m, pose, camera)
-        by_camera = intrinsic_slopes(seen.p_cam, camera)
+        by_camera = intrinsic_slopes_px(seen.p_cam, camera.normalized(seen.pixels), camera)
         own = np.concatenate([seen.slopes, by_camera[:, :, self.shot_places]], axis=2)
         own = np.einsum("nij,njk->nik", self.whitening, own).reshape(2 * n, -1)
         by_common = np.einsum("nij,njk->nik", self.whitening, self._by_common(seen.slopes, by_camera, common))
@@ -307,9 +310,9 @@ class _Frame:
         below = np.zeros((gravity + len(self.shot_places), own.shape[1]))
         shared_below = np.zeros((len(below), len(self.present)))
         if gravity:
-            below[:2, 3:5] = np.diag(1 / view.tilt_shot_sigma_rad)
+            below[:2, 3:5] = np.diag(1 / self.tilt_sigma_rad)
             first = len(INTRINSICS)
-            shared_below[:2, first : first + 2] = np.diag(view.tilt_lever / view.tilt_shot_sigma_rad)
+            shared_below[:2, first : first + 2] = np.diag(view.tilt_lever / self.tilt_sigma_rad)
         below[gravity:, POSE_PARAMETERS:] = np.diag(1 / self.shot_sigma)
         own = np.vstack([own, below])
         shared = np.vstack([shared, shared_below[:, self.present]]) * self.unknowns.sigma[self.columns]
@@ -363,25 +366,6 @@ def erred(camera: Camera, error: Floats) -> Camera:
     return camera.model_copy(update={"K": K, "distortion": distortion})
 
 
-def intrinsic_slopes(p_cam: Floats, camera: Camera) -> Floats:
-    """Derivatives (n, 2, 7) of the pixels of points (n, 3) in camera axes by errors of the intrinsics.
-
-    Those by distortion are of a perspective lens; other lenses have none.
-    """
-    slopes = np.zeros((len(p_cam), 2, len(INTRINSICS)))
-    (fx, skew, _), (_, fy, _), _ = camera.K
-    x, y = projection_of(camera).project(p_cam)[0].T
-    slopes[:, 0, 0], slopes[:, 1, 0] = fx * x, fy * y
-    slopes[:, 0, 1], slopes[:, 1, 1] = fx * x / 2, -fy * y / 2
-    slopes[:, 0, 2] = slopes[:, 1, 3] = 1.0
-    if camera.projection == "perspective":
-        a, b = (p_cam[:, :2] / p_cam[:, 2:]).T
-        r2 = a * a + b * b
-        bent = np.array([[a * r2, 2 * a * b, r2 + 2 * a * a], [b * r2, r2 + 2 * b * b, 2 * a * b]]).transpose(2, 0, 1)
-        slopes[:, :, 4:] = np.array([[fx, skew], [0.0, fy]]) @ bent
-    return slopes
-
-
 def _centroids_px(positions_m: Floats, extent_m: Floats, pose: Pose, camera: Camera) -> Floats:
     """Centroids (n, 2) of the images of horizontal faces, pixels, by four points of each that have its mean squares.
 
@@ -399,12 +383,12 @@ def adjust(views: Sequence[DeviceView], scale: float = 1.0) -> Adjustment:
     """Fit all frames of a device and its common unknowns; spots that disagree are left out.
 
     A frame is left out, None in the result, where fewer than MIN_SPOTS spots agree, or no more than half of them. The
-    stated standard deviations of camera and map count `scale` times to begin with.
+    stated standard deviations of camera, map and accelerometer count `scale` times to begin with.
     """
     used = [np.ones(len(view.leds), dtype=bool) for view in views]
     starts = [view.pose for view in views]
     taken = [len(view.leds) > 0 for view in views]
-    scales = {kind: scale for kind in ("camera", "shot", "luminaire", "led")}
+    scales = dict.fromkeys(("camera", "shot", "luminaire", "led", "gravity", "reading"), scale)
     common: dict[tuple[str, int, int], tuple[float, float]] = {}
     for round_ in range(MAX_ROUNDS):
         frames = [k for k, use in enumerate(taken) if use]
