@@ -20,8 +20,8 @@ are found by data snooping (Baarda 1968): each residual by the covariance that t
 Stated standard deviations may be wrong. The adjustment estimates the variance of each kind of unknown (Foerstner 1979):
 the sum of squares of its values in units of their priors is, to first order, chi-square with as many degrees of freedom
 as the frames determine of them, `count - trace` of their covariance. A kind whose sum of squares is as improbable as an
-outlier has its standard deviations multiplied by the root of the ratio, and the frames are fitted again. A kind of which
-too little is determined keeps the factor that `adjust` was given.
+outlier has its standard deviations multiplied by the root of the ratio, and the frames are fitted again. A kind of
+which too little is determined keeps the factor that `adjust` was given.
 """
 
 from collections import Counter
