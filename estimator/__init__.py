@@ -20,14 +20,15 @@ if TYPE_CHECKING:
     from estimator.evaluate.score import Scores, score
     from estimator.io.dataset import Dataset, read_dataset, read_frame
     from estimator.io.device import DeviceFrame, frame
-    from estimator.methods.registry import estimate, variants
-    from estimator.methods.variant import Estimate, Variant
+    from estimator.methods.registry import estimate, estimate_device, variants
+    from estimator.methods.variant import DeviceMethod, Estimate, Variant
 
     __version__: str
 
 __all__ = [
     "Dataset",
     "DeviceFrame",
+    "DeviceMethod",
     "Estimate",
     "EstimationFailure",
     "InputError",
@@ -35,6 +36,7 @@ __all__ = [
     "Variant",
     "__version__",
     "estimate",
+    "estimate_device",
     "frame",
     "read_dataset",
     "read_frame",
@@ -46,12 +48,14 @@ __all__ = [
 _MODULES = {
     "Dataset": "estimator.io.dataset",
     "DeviceFrame": "estimator.io.device",
+    "DeviceMethod": "estimator.methods.variant",
     "Estimate": "estimator.methods.variant",
     "EstimationFailure": "estimator.errors",
     "InputError": "estimator.errors",
     "Scores": "estimator.evaluate.score",
     "Variant": "estimator.methods.variant",
     "estimate": "estimator.methods.registry",
+    "estimate_device": "estimator.methods.registry",
     "frame": "estimator.io.device",
     "read_dataset": "estimator.io.dataset",
     "read_frame": "estimator.io.dataset",

@@ -1,4 +1,4 @@
-"""Command line `estimator variants | run | score | compare | report`, a thin client of the package's functions.
+"""Command line `estimator variants | run | score | compare | report | levels`, a thin client of the package.
 
 Errors are one line on stderr and exit code 2. A command loads the modules that it needs when it runs, so that
 `estimator --help` loads neither OpenCV nor SciPy.
@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from io import TextIOWrapper
 from pathlib import Path
@@ -23,7 +23,7 @@ from estimator.errors import InputError
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from estimator.evaluate.score import Scores
+    from estimator.evaluate.score import Scores, VariantScore
 
 INTERNAL_ERROR = 1
 USER_ERROR = 2
@@ -190,6 +190,33 @@ def report(*datasets: Annotated[Path, Parameter(required=True)], out: Path) -> N
     print(out)
 
 
+@app.command
+def levels(*datasets: Annotated[Path, Parameter(required=True)], out: Path) -> None:
+    """Plot every variant's RMSE against the bound of each dataset, scoring them if needed, as SVG.
+
+    The datasets are levels of difficulty, such as the accuracy of the map. The plot also says how many frames failed.
+
+    Parameters
+    ----------
+    datasets
+        Folders of datasets with estimates, whose recipes have `bound = true`.
+    out
+        The SVG to write.
+    """
+    from estimator.evaluate.levels import LEVEL_NOTE, level_cells, levels_of
+    from estimator.evaluate.score import read_or_score
+    from estimator.io.atomic import write_atomically
+    from estimator.report.levels import level_picture
+
+    if out.is_dir():
+        raise InputError(f"--out {out}: is a folder, needed the name of a file")
+    found = levels_of([(folder, read_or_score(folder)) for folder in datasets])
+    headers, rows = level_cells(found)
+    write_atomically(out, level_picture(found).encode())
+    _print_table("RMSE by level", headers, rows, LEVEL_NOTE)
+    print(out)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code; an error is one line on stderr, without a traceback."""
     for stream in (sys.stdout, sys.stderr):
@@ -242,46 +269,75 @@ def _log_on_stderr() -> Iterator[None]:
 
 
 def _print_scores(scores: Scores) -> None:
-    from estimator.evaluate.score_table import (
-        ERROR_HEADERS,
-        ERROR_NOTE,
-        LIMIT_HEADERS,
-        LIMIT_NOTE,
-        error_cells,
-        limit_cells,
-    )
+    from estimator.evaluate import score_table as cells
 
-    rows = [(of_variant.variant, error_cells(of_variant), limit_cells(of_variant)) for of_variant in scores.variants]
-    errors = _table(f"{scores.dataset}: errors", ERROR_HEADERS, [(name, *cells) for name, cells, _ in rows])
-    _print_table(errors, ERROR_NOTE)
-    if any(of_variant.against_bound or of_variant.nees or of_variant.ambiguous for of_variant in scores.variants):
+    variants = scores.variants
+    tables: list[tuple[str, Sequence[str], Callable[[VariantScore], tuple[str, ...]], str]]
+    tables = [(f"{scores.dataset}: errors", cells.ERROR_HEADERS, cells.error_cells, cells.ERROR_NOTE)]
+    if any(of_variant.against_bound or of_variant.nees or of_variant.ambiguous for of_variant in variants):
         title = "Cramér-Rao bound and covariance consistency"
-        limits = _table(title, LIMIT_HEADERS, [(name, *cells) for name, _, cells in rows])
-        _print_table(limits, LIMIT_NOTE)
-    for of_variant in scores.variants:
-        for reason, count in of_variant.failures.items():
-            print(f"{of_variant.variant}: {count} x {reason}")
+        tables.append((title, cells.LIMIT_HEADERS, cells.limit_cells, cells.LIMIT_NOTE))
+    if any(map(cells.has_groups, variants)):
+        tables.append(("by device and map", cells.GROUP_HEADERS, cells.group_cells, cells.GROUP_NOTE))
+    if any(of_variant.failed for of_variant in variants):
+        tables.append(("failed frames by good LEDs", cells.LOST_HEADERS, cells.lost_cells, cells.LOST_NOTE))
+    for title, headers, of_variant, note in tables:
+        rows = [(variant.variant, *of_variant(variant)) for variant in variants]
+        _print_table(title, ["variant", *headers], rows, note)
+    for variant in variants:
+        for reason, count in variant.failures.items():
+            print(f"{variant.variant}: {count} x {reason}")
+
+
+def _print_table(title: str, headers: Sequence[str], rows: Sequence[Sequence[str]], note: str) -> None:
+    """Print a table and its note; on a terminal that is too narrow, some columns at a time."""
+    from rich.console import Console
+
+    console = Console()
+    if not console.is_terminal:
+        # A file or pipe has no width to fit into.
+        whole = _table(title, headers, rows)
+        console = Console(width=Console(width=10_000).measure(whole).maximum)
+    for columns in _fitting(headers, rows, console.width):
+        part = [[row[column] for column in columns] for row in rows]
+        console.print(_table(title, [headers[column] for column in columns], part))
+        title = ""
+    console.print(note, markup=False, highlight=False)
+
+
+def _fitting(headers: Sequence[str], rows: Sequence[Sequence[str]], width: int) -> list[list[int]]:
+    """Columns of each of the tables, no wider than `width` where possible, that together have all; all have the first.
+
+    A header may wrap between its words, a cell does not. An interval stays beside the column that it belongs to.
+    """
+    from rich.cells import cell_len
+
+    border = 3
+    sizes = [
+        border + max([cell_len(row[column]) for row in rows] + [cell_len(word) for word in header.split()])
+        for column, header in enumerate(headers)
+    ]
+    tables = [[0]]
+    column = 1
+    while column < len(headers):
+        end = column + 1
+        while end < len(headers) and headers[end].endswith("interval"):
+            end += 1
+        together = list(range(column, end))
+        if len(tables[-1]) > 1 and 1 + sum(sizes[one] for one in [*tables[-1], *together]) > width:
+            tables.append([0])
+        tables[-1] += together
+        column = end
+    return tables
 
 
 def _table(title: str, headers: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
     from rich.markup import escape
     from rich.table import Table
 
-    table = Table(title=escape(title), title_justify="left")
-    table.add_column("variant", no_wrap=True)
-    for header in headers:
-        table.add_column(header, justify="right")
+    table = Table(title=escape(title) if title else None, title_justify="left")
+    for column, header in enumerate(headers):
+        table.add_column(header, justify="right" if column else "left", no_wrap=column == 0)
     for row in rows:
         table.add_row(*map(escape, row))
     return table
-
-
-def _print_table(table: Table, note: str) -> None:
-    from rich.console import Console
-
-    console = Console()
-    if not console.is_terminal:
-        # A file or pipe has no width to fit into.
-        console = Console(width=Console(width=10_000).measure(table).maximum)
-    console.print(table)
-    console.print(note, markup=False, highlight=False)

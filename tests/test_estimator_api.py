@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -92,6 +93,28 @@ def test_an_estimate_takes_a_name_options_or_a_variant(folder: Path) -> None:
         est.estimate(frame, "best")
     with pytest.raises(est.EstimationFailure, match="stereo: no second camera"):
         est.estimate(frame, "kim")
+
+
+def test_frames_of_a_device_are_estimated_together(folder: Path) -> None:
+    """As by `run`, to the last bit, from a generator. Where nothing is stated, one frame alone gives the same."""
+    dataset = est.read_dataset(folder)
+    found = est.estimate_device(est.read_frame(dataset, k) for k in range(3))
+    rows = est.run(folder, ["self-calibrated"])["self-calibrated"]
+    assert [tuple(one.position_m.tolist()) for one in found if isinstance(one, est.Estimate)] == [
+        row.position_m for row in rows
+    ]
+    alone = est.estimate(est.read_frame(dataset, 1), "self-calibrated")
+    assert alone.position_m == pytest.approx(np.array(rows[1].position_m), abs=1e-8)
+    each = est.estimate_device((est.read_frame(dataset, k) for k in range(2)), "kim")
+    assert [str(one) for one in each] == ["stereo: no second camera took this shot"] * 2
+    (folder / "estimates/self-calibrated.parquet").unlink()
+
+
+def test_frames_of_several_devices_are_not_estimated_together(folder: Path) -> None:
+    dataset = est.read_dataset(folder)
+    frames = [replace(est.read_frame(dataset, k), device=k) for k in range(2)]
+    with pytest.raises(est.InputError, match=r"frames: of the devices 0, 1; needed the frames of one device"):
+        est.estimate_device(frames)
 
 
 def test_a_frame_that_does_not_exist_is_refused(folder: Path) -> None:

@@ -1,6 +1,7 @@
 """Rows of a batch: what a variant returns or raises, and the frames that it sees."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,12 +10,12 @@ import pytest
 from estimator_synthetic import small_dataset
 
 from estimator.errors import EstimationFailure
-from estimator.evaluate.batch import estimate_dataset, estimate_frame, estimate_shot, shots
+from estimator.evaluate.batch import Observed, estimate_dataset, estimate_device, estimate_frame, estimate_shot, shots
 from estimator.io.dataset import Dataset, read_dataset, read_frame
 from estimator.io.device import DeviceFrame
 from estimator.io.estimates import EstimateRow
 from estimator.io.records import MAX_NUMBER
-from estimator.methods.variant import Estimate, Variant
+from estimator.methods.variant import DeviceMethod, Estimate, Variant
 
 HERE = np.array([1.0, 2.0, 0.5])
 
@@ -127,7 +128,7 @@ def test_a_frame_that_cannot_be_read_fails_and_is_no_other_camera(dataset: Datas
         others.append(len(frame.other_cameras))
         return Estimate(HERE)
 
-    rows = estimate_shot(dataset, (dataset.frames[0], lost), [Variant("a", "", counts)])["a"]
+    rows = estimate_shot(dataset, (dataset.frames[0], lost), [Variant("a", "", counts)]).rows["a"]
     assert [row.status for row in rows] == ["ok", "failed"]
     assert rows[1].reason.startswith("read: frames/none.exr: ")
     assert rows[1].time_s == 0
@@ -152,3 +153,84 @@ def test_the_time_of_a_frame_is_from_the_numbers_to_the_position(
 
     for result in (None, EstimationFailure("a", "b"), ValueError("c")):
         assert row_of(frame, slow(result)).time_s == 2.0
+
+
+def interleaved(dataset: Dataset) -> Dataset:
+    """Frames 0 and 2 of device 7, frame 1 of device 3."""
+    frames = [record.model_copy(update={"device": 3 if record.frame == 1 else 7}) for record in dataset.frames]
+    return replace(dataset, frames=tuple(frames))
+
+
+def test_frames_of_a_device_are_solved_together_in_order(dataset: Dataset) -> None:
+    """Each frame's x is the number of frames of its device, y its place among them, z what was observed of it."""
+    heights = {record.accelerometer_m_s2: float(record.frame) for record in dataset.frames}
+
+    def solve(observed: Sequence[float]) -> list[Estimate]:
+        return [Estimate(np.array([len(observed), k, z])) for k, z in enumerate(observed)]
+
+    method = DeviceMethod(lambda frame: heights[frame.accelerometer_m_s2], solve)
+    done: list[None] = []
+    variants = [Variant.over_device("joint", "", method), Variant("each", "", lambda _: Estimate(HERE))]
+    rows = estimate_dataset(interleaved(dataset), variants, lambda: done.append(None))
+    assert [row.frame for row in rows["joint"]] == [row.frame for row in rows["each"]] == [0, 1, 2]
+    assert [row.position_m for row in rows["joint"]] == [(2.0, 0.0, 0.0), (1.0, 0.0, 1.0), (2.0, 1.0, 2.0)]
+    assert len(done) == 6  # a frame has two steps
+    alone = variants[0].estimate(read_frame(dataset, 2))
+    assert alone.position_m.tolist() == [1.0, 0.0, 2.0]
+
+
+def test_a_frame_that_is_not_observed_fails_alone(dataset: Dataset) -> None:
+    """Frame 0 fails in `observe`, frame 2 by the common solution; frame 1, of the other device, is not touched."""
+
+    def observe(frame: DeviceFrame) -> float:
+        if frame.accelerometer_m_s2 == dataset.frames[0].accelerometer_m_s2:
+            raise EstimationFailure("spots", "none", {10: 3.25})
+        return frame.exposure_s
+
+    def solve(observed: Sequence[float]) -> list[Estimate | EstimationFailure]:
+        return [EstimationFailure("joint", "too few") for _ in observed]
+
+    method = DeviceMethod(observe, solve)
+    rows = estimate_dataset(interleaved(dataset), [Variant.over_device("x", "", method)], lambda: None)["x"]
+    assert [row.reason for row in rows] == ["spots: none", "joint: too few", "joint: too few"]
+    assert [(one.led, one.range_m) for one in rows[0].ranges] == [(10, 3.25)]
+    with pytest.raises(EstimationFailure, match="joint: too few"):
+        method.alone(read_frame(dataset, 2))
+
+
+def failing(_: Sequence[object]) -> list[Estimate]:
+    raise EstimationFailure("joint", "no minimum")
+
+
+BROKEN: dict[str, tuple[Callable[[Sequence[object]], object], str]] = {
+    "fewer": (lambda observed: [Estimate(HERE)] * (len(observed) - 1), "another number of results than of frames"),
+    "nothing": (lambda _: None, "variant: crashed (TypeError)"),
+    "numbers": (lambda observed: [1.0] * len(observed), "variant: returned no Estimate"),
+    "failure": (failing, "joint: no minimum"),
+    "not finite": (lambda observed: [Estimate(HERE * np.nan)] * len(observed), "not a finite number"),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_what_goes_wrong_with_a_device_is_the_reason_of_each_of_its_frames(dataset: Dataset, case: str) -> None:
+    solve, reason = BROKEN[case]
+    variant = Variant.over_device("x", "", DeviceMethod(lambda _: 0, solve))  # type: ignore[arg-type]
+    rows = estimate_dataset(dataset, [variant], lambda: None)["x"]
+    assert [reason in row.reason for row in rows] == [True, True, True]
+
+
+def test_the_time_of_a_frame_of_a_device_is_its_own_and_its_share(
+    dataset: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Observed in 1 s and 3 s, solved together in 8 s: 5 s and 7 s. A frame that was not observed has no share."""
+    clock = [0.0]
+    monkeypatch.setattr("estimator.evaluate.batch.time.perf_counter", lambda: clock[0])
+
+    def solve(observed: Sequence[object]) -> list[Estimate]:
+        clock[0] += 8.0
+        return [Estimate(HERE) for _ in observed]
+
+    observed = [Observed(4, 0, "a", 1.0), Observed(5, 0, EstimationFailure("a", "b"), 2.0), Observed(9, 0, "b", 3.0)]
+    variant = Variant.over_device("x", "", DeviceMethod(lambda _: 0, solve))
+    rows = estimate_device(dataset, {"x": observed}, [variant])["x"]
+    assert [(row.frame, row.status, row.time_s) for row in rows] == [(4, "ok", 5.0), (5, "failed", 2.0), (9, "ok", 7.0)]

@@ -9,8 +9,15 @@ from html_text import texts
 from test_estimator_score import LEDS, TRUTH, failed, ok, truths
 
 from estimator.evaluate.score import Scores, VariantScore, score_variant
-from estimator.evaluate.score_table import ERROR_HEADERS, ERROR_NOTE, error_cells, interval_text
-from estimator.report.figures import Decades, distribution_plot, error_plot
+from estimator.evaluate.score_table import (
+    ERROR_HEADERS,
+    ERROR_NOTE,
+    LOST_HEADERS,
+    LOST_NOTE,
+    error_cells,
+    interval_text,
+)
+from estimator.report.figures import Decades, device_plot, distribution_plot, error_plot
 from estimator.report.report import page
 from estimator.report.svg import COLOURS, DASHES, MARKS, mark, style_of_variants
 
@@ -115,7 +122,7 @@ def test_the_table_of_bounds_is_left_out_if_it_is_empty(tmp_path: Path) -> None:
 
 
 def test_the_text_of_a_page_by_hand(tmp_path: Path) -> None:
-    """One frame 100 mm off and one failed, in order: title, table of scores, failures, the two plots, floor plan."""
+    """One frame 100 mm off and one failed, in order: title, scores, failures, the two plots, floor plan."""
     found = texts(page([(tmp_path, scores_of([scored([0.1, None])]))]))
     cells = ["1", "1", "50 %", "100 mm", "∞", *["100 mm"] * 6, "0 µm", "–", "100 ms"]
     row = ["x", *cells]
@@ -127,6 +134,7 @@ def test_the_text_of_a_page_by_hand(tmp_path: Path) -> None:
         "No frame is dropped: failed frames are counted beside the errors of the others, and count as infinite errors "
         "in the columns “of all”.",
         *("set", "2 frames · 1 LEDs · room 4 × 5 × 3.5 m", "Scores", "variant", *ERROR_HEADERS, *row, ERROR_NOTE),
+        *("Failed frames by good LEDs", "variant", *LOST_HEADERS, "x", "1 of 2", *["–"] * 4, LOST_NOTE),
         *("Failures", "variant", "frames", "reason", "x", "1", "a: b"),
         *("3D error of each frame", "Crosses: failed frames.", "x", "100 mm", "1 m", "0", "1", "frame", "failed"),
         *(f"x, {tip}" for tip in tips),
@@ -152,8 +160,8 @@ def test_names_and_reasons_are_text_and_never_markup(tmp_path: Path) -> None:
     assert """alt="000&#39;&lt;i&gt;" src="data:image/png;base64,UE5H">""" in html
     found = texts(html)
     assert f"Positioning report: {hostile}" in found
-    # The set's name once; the first variant's in two tables, two legends and a caption; the reason of either.
-    assert found.count(hostile) == 1 + 5 + 2
+    # The set's name once; the first variant's in three tables, two legends and a caption; the reason of either.
+    assert found.count(hostile) == 1 + 6 + 2
     assert f"Frame by frame against {hostile}" in found
     assert "frame 000'<i>" in found
     assert ":<wbr>c,<wbr>d</td>" in html  # lines may break before options
@@ -184,3 +192,48 @@ def test_failures_stand_out_and_zero_failures_do_not(tmp_path: Path) -> None:
     """One mark: the cell of the variant that failed once, and neither the header nor the other's 0."""
     html = page([(tmp_path, scores_of([scored([0.1, None]), scored([0.1, 0.1], "y")]))])
     assert re.findall(r'<t[dh] class="failed">([^<]*)</t[dh]>', html) == ["1"]
+
+
+def of_devices(errors_m: Sequence[float | None], devices: Sequence[int], name: str = "x") -> VariantScore:
+    """Frames of devices, each in the map of its parity; the covariance is that of 1 mm along each axis."""
+    x, y, z = TRUTH
+    sure = {"covariance_m2": (1e-6, 0.0, 0.0, 0.0, 1e-6, 0.0, 0.0, 0.0, 1e-6)}
+    rows = [
+        failed(k, "a: b") if e is None else ok(k, (x + e, y, z)).model_copy(update=sure) for k, e in enumerate(errors_m)
+    ]
+    truth = [
+        one.model_copy(update={"map": device % 2})
+        for one, device in zip(truths(len(rows), BOUND), devices, strict=True)
+    ]
+    return score_variant(name, rows, truth, LEDS, devices)
+
+
+def test_devices_are_shown_by_map_with_their_rmse_and_nees() -> None:
+    """Devices 0 and 2 of map 0 stand before device 1 of map 1; a device without an estimate has no mark."""
+    variant = of_devices([1e-3, 2e-3, None, 3e-3], [0, 1, 2, 2])
+    svg = device_plot([variant], nees=False)
+    places = re.findall(r'cx="([\d.]+)"[^>]*><title>x, device (\d), map \d: ([^<]*)<', svg)
+    assert [(device, size) for _, device, size in sorted(places, key=lambda one: float(one[0]))] == [
+        ("0", "1 mm"),
+        ("2", "3 mm"),
+        ("1", "2 mm"),
+    ]
+    assert re.findall(r"device (\d), map \d: ([^<]*)<", device_plot([variant], nees=True)) == [
+        ("0", "1"),
+        ("1", "4"),
+        ("2", "9"),
+    ]
+    assert device_plot([of_devices([None], [0])], nees=True).count("<title>") == 0
+
+
+def test_the_page_shows_devices_levels_and_failures_where_there_are_some() -> None:
+    several = scores_of([of_devices([1e-3, 2e-3, None, 3e-3], [0, 1, 2, 2])])
+    one = scores_of([scored([0.1, 0.2])])
+    html = page([(Path("a"), several)])
+    for title in ("By device and map", "Failed frames by good LEDs"):
+        assert title in html
+        assert title not in page([(Path("a"), one)])
+    assert html.count("device 2, map 0") == 2
+    assert "Error against level" not in html
+    assert "Error against level" in page([(Path("a"), several), (Path("b"), several)])
+    assert "Error against level" not in page([(Path("a"), several), (Path("b"), one)])

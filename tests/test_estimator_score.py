@@ -13,7 +13,7 @@ from estimator.errors import InputError
 from estimator.evaluate.score import Scores, read_or_score, score, score_variant
 from estimator.io.device import DiscLed
 from estimator.io.estimates import EstimateRow, LedRange, write_estimates
-from estimator.io.truth import TruthRow
+from estimator.io.truth import TrueLed, TruthRow
 
 LEDS = {10: DiscLed(id=10, position_m=(1.0, 2.0, 3.5), radius_m=0.01)}
 TRUTH = (1.0, 2.0, 0.5)
@@ -240,3 +240,87 @@ def test_the_bound_of_a_frame_is_the_root_of_its_trace() -> None:
     bound_m2 = (4e-6, 1e-6, 2e-6, 1e-6, 9e-6, 3e-6, 2e-6, 3e-6, 36e-6)
     (row,) = score_variant("x", [ok(0, TRUTH)], truths(1, bound_m2), LEDS).rows
     assert row.bound_m == pytest.approx(0.007)
+
+
+def test_scores_by_device_map_and_good_leds_by_hand() -> None:
+    """Devices 3 and 5 are in map 1, device 4 in map 0. Errors 3 and 4 mm of device 3: RMSE sqrt(12.5) mm, NEES 12.5."""
+    x, y, z = TRUTH
+    sure = {"covariance_m2": (1e-6, 0.0, 0.0, 0.0, 1e-6, 0.0, 0.0, 0.0, 1e-6)}
+    rows = [
+        ok(0, (x + 3e-3, y, z)).model_copy(update=sure),
+        ok(1, (x, y + 1e-3, z)),
+        ok(2, (x, y, z + 4e-3)).model_copy(update=sure),
+        failed(3, "a: b"),
+        failed(4, "a: b"),
+    ]
+    shares = ([1.0] * 5, [1.0, 1.0, 0.4], [1.0] * 4, [1.0, 1.0, 0.999], [1.0, 1.0, 1.0, 1 - 1e-9])
+    truth = [
+        one.model_copy(
+            update={
+                "map": of_map,
+                "leds": tuple(TrueLed(led=k, visible_fraction=share) for k, share in enumerate(of_frame)),
+            }
+        )
+        for one, of_map, of_frame in zip(truths(5), (1, 0, 1, 1, 0), shares, strict=True)
+    ]
+    score = score_variant("x", rows, truth, LEDS, devices=[3, 4, 3, 5, 4])
+    table = [(d.device, d.map, d.frames, d.failed, d.rmse_m, d.nees) for d in score.by_device]
+    rmse = pytest.approx(12.5**0.5 * 1e-3)
+    assert table == [
+        (3, 1, 2, 0, rmse, pytest.approx(12.5)),
+        (4, 0, 2, 1, pytest.approx(1e-3), None),
+        (5, 1, 1, 1, None, None),
+    ]
+    by_map = [(m.map, m.devices, m.frames, m.failed, m.rmse_m, m.nees) for m in score.by_map]
+    assert by_map == [(0, 1, 2, 1, pytest.approx(1e-3), None), (1, 2, 3, 1, rmse, pytest.approx(12.5))]
+    assert [(g.good_leds, g.frames, g.failed) for g in score.by_good_leds] == [
+        (0, 0, 0),
+        (1, 0, 0),
+        (2, 2, 1),
+        (3, 0, 0),
+        (4, 3, 1),
+    ]
+    assert [(row.device, row.map, row.good_leds) for row in score.rows][:2] == [(3, 1, 5), (4, 0, 2)]
+
+
+def test_one_of_several_devices_has_no_interval() -> None:
+    """Its frames share errors, and nothing tells how devices differ. One device in all has independent frames."""
+    sure = {"covariance_m2": (1e-6, 0.0, 0.0, 0.0, 1e-6, 0.0, 0.0, 0.0, 1e-6)}
+    rows = [*(ok(k, TRUTH).model_copy(update=sure) for k in range(3)), failed(3, "a: b")]
+    several = score_variant("x", rows, truths(4), LEDS, devices=[0, 0, 0, 1])
+    assert (several.median_interval, several.rmse_interval, several.nees) == (None, None, None)
+    assert several.by_device[0].nees == 0.0
+    alone = score_variant("x", rows, truths(4), LEDS, devices=[0, 0, 0, 0])
+    assert alone.median_interval is not None
+    assert alone.nees is not None
+
+
+def test_both_bounds_are_compared_where_they_differ() -> None:
+    """Error 4 mm, bounds of 2 mm and, for a device that knows all, 1 mm: efficiencies 0.5 and 0.25."""
+    x, y, z = TRUTH
+    bound = (4e-6 / 3, 0.0, 0.0, 0.0, 4e-6 / 3, 0.0, 0.0, 0.0, 4e-6 / 3)
+    exact = tuple(value / 4 for value in bound)
+    rows = [ok(0, (x + 4e-3, y, z))]
+    (truth,) = truths(1, bound)
+    both = score_variant("x", rows, [truth.model_copy(update={"bound_exact_m2": exact})], LEDS)
+    assert both.against_bound is not None
+    assert both.against_exact_bound is not None
+    assert both.against_bound.efficiency == pytest.approx(0.5)
+    assert both.against_exact_bound.efficiency == pytest.approx(0.25)
+    for same in (truth, truth.model_copy(update={"bound_exact_m2": bound})):
+        alone = score_variant("x", rows, [same], LEDS)
+        assert alone.against_exact_bound is None
+        assert alone.against_bound == both.against_bound
+
+
+def test_the_devices_and_maps_of_a_set_are_scored(synthetic_set: Path, tmp_path: Path) -> None:
+    """The column `device` of the frames and `map` of the truth; the truth of an older set has no `map`."""
+    folder = copy_of(synthetic_set, tmp_path / "set")
+    for name, column, values in (("frames", "device", [0, 1, 0]), ("truth", "map", [2, 3, 2])):
+        table = pq.read_table(folder / f"{name}.parquet")
+        table = table.drop_columns([column]) if column in table.column_names else table
+        pq.write_table(table.append_column(column, pa.array(values, pa.int64())), folder / f"{name}.parquet")
+    write_estimates(folder, "x", [ok(k, TRUTH) for k in range(3)])
+    (variant,) = score(folder).variants
+    assert [(one.device, one.map, one.frames) for one in variant.by_device] == [(0, 2, 2), (1, 3, 1)]
+    assert sum(one.frames for one in variant.by_good_leds if one.good_leds == 4) == 3

@@ -6,12 +6,17 @@ from estimator.evaluate.comparison import compare
 from estimator.evaluate.score import VariantScore, score_variant
 from estimator.evaluate.score_table import (
     ERROR_HEADERS,
+    GROUP_HEADERS,
     LIMIT_HEADERS,
+    LOST_HEADERS,
     PAIR_HEADERS,
     error_cells,
+    group_cells,
+    has_groups,
     interval_text,
     length_text,
     limit_cells,
+    lost_cells,
     pair_cells,
     share_text,
 )
@@ -100,3 +105,30 @@ def test_errors_and_bounds_stand_in_the_columns_of_their_names() -> None:
     limits = dict(zip(LIMIT_HEADERS, limit_cells(score), strict=True))
     assert (limits["frames with a bound"], limits["bound"], limits["RMSE there"]) == ("1", "65 mm", "130 mm")
     assert (limits["efficiency"], limits["NEES"], limits["of"], limits["ambiguous"]) == ("0.5", "–", "0", "0")
+
+
+def test_cells_by_device_and_map() -> None:
+    """Devices 0 and 1 in maps 0 and 1, off by 3 and 4 mm with a sigma of 1 mm: NEES 9 and 16, 12.5 by map."""
+    x, y, z = TRUTH
+    sure = {"covariance_m2": (1e-6, 0.0, 0.0, 0.0, 1e-6, 0.0, 0.0, 0.0, 1e-6)}
+    rows = [ok(0, (x + 3e-3, y, z)).model_copy(update=sure), ok(1, (x + 4e-3, y, z)).model_copy(update=sure)]
+    truth = [one.model_copy(update={"map": one.frame}) for one in truths(2)]
+    score = score_variant("x", rows, truth, LEDS, devices=[0, 1])
+    assert has_groups(score)
+    cells = dict(zip(GROUP_HEADERS, group_cells(score), strict=True))
+    assert (cells["devices"], cells["maps"], cells["RMSE by device"]) == ("2", "2", "3 to 4 mm")
+    assert (cells["NEES by device"], cells["NEES by map"]) == ("9 to 16", "12.5")
+    alone = score_variant("x", rows[:1], truth[:1], LEDS)
+    assert not has_groups(alone)
+    assert group_cells(alone)[4:] == ("–", "–")
+    lost = score_variant("x", [failed(0, "a: b"), failed(1, "a: b")], truth, LEDS, devices=[0, 1])
+    assert group_cells(lost)[2:4] == ("–", "–")
+
+
+def test_failed_frames_by_good_leds_as_cells() -> None:
+    """One frame of two without any good LED failed; no frame has more."""
+    cells = lost_cells(score_variant("x", [ok(0, TRUTH), failed(1, "a: b")], truths(2), LEDS))
+    assert dict(zip(LOST_HEADERS, cells, strict=True)) == {
+        "no good LED": "1 of 2",
+        **dict.fromkeys(("1", "2", "3", "4 or more"), "–"),
+    }

@@ -6,13 +6,18 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from scipy.stats import binom, chi2, norm
 
 from estimator.evaluate.statistics import (
     RESAMPLES,
+    Groups,
+    _medians,
+    _root_mean_squares,
     against_bound,
     median_interval,
     nees,
+    nees_by_map,
     of_all,
     rmse_interval,
     squared_in_sigmas,
@@ -213,3 +218,144 @@ def test_an_efficiency_is_finite_or_none_for_errors_of_any_size(error_m: float) 
     assert found is not None
     assert (found.efficiency is None) == (error_m < 1e-162)
     assert found.efficiency is None or found.efficiency == pytest.approx(3e100**0.5 / found.rmse_m)
+
+
+DEVICES, MAPS, FRAMES = 20, 4, 20
+
+
+def nested_groups() -> Groups:
+    device = [frame % DEVICES for frame in range(DEVICES * FRAMES)]
+    return Groups.of(device, [one % MAPS for one in device])
+
+
+def nested_errors(rng: np.random.Generator, by_device: float, by_map: float) -> NDArray[np.float64]:
+    """Errors (frames, 3) of unit variance, of which devices and maps have the given shares in common."""
+    groups = nested_groups()
+    own = rng.normal(size=(len(groups.device), 3))
+    of_device, of_map = rng.normal(size=(DEVICES, 3)), rng.normal(size=(MAPS, 3))
+    shared = sqrt(by_device) * of_device[groups.device] + sqrt(by_map) * of_map[groups.map]
+    return np.asarray(shared + sqrt(1 - by_device - by_map) * own)
+
+
+@pytest.mark.parametrize(("by_device", "by_map"), [(0.2, 0.0), (0.2, 0.1), (0.4, 0.0)])
+def test_the_nees_interval_by_devices_holds_for_frames_that_share_errors(by_device: float, by_map: float) -> None:
+    """Of 300 consistent sets at least 94 % lie within the 99 % interval, by chi-square of independent frames fewer.
+
+    300 draws of a probability of 0.97 give less than 0.94 once in 200, by the binomial distribution. With a
+    share r in common the mean over n frames of a device has the variance 6 (1 + (n - 1) r^2) / n and not 6 / n.
+    """
+    rng, groups = np.random.default_rng(8), nested_groups()
+    assert binom.cdf(0.94 * 300, 300, 0.97) < 5e-3
+    held, by_frames = 0, 0
+    for _ in range(300):
+        squares = (nested_errors(rng, by_device, by_map) ** 2).sum(axis=1).tolist()
+        found, independent = nees(squares, groups), nees(squares)
+        assert found is not None
+        assert independent is not None
+        assert (found.frames, found.devices, found.maps) == (400, DEVICES, MAPS)
+        assert found.mean == independent.mean
+        held += found.within
+        by_frames += independent.within
+    assert held >= 0.94 * 300
+    assert by_frames < held
+
+
+def test_the_nees_interval_by_devices_finds_a_covariance_that_is_off() -> None:
+    """Covariances too small by 2: the mean is 6 and the devices' relative scatter unchanged. Too large by 2: 1.5.
+
+    With 20 devices that scatter by a third of their mean the interval is 3 (1 +- 2.86 / 3 / sqrt(20)), 0.64 wide.
+    """
+    rng, groups = np.random.default_rng(9), nested_groups()
+    squares = (nested_errors(rng, 0.2, 0.0) ** 2).sum(axis=1)
+    for factor, where in ((1.0, 0), (2.0, 1), (0.5, -1)):
+        found = nees((factor * squares).tolist(), groups)
+        assert found is not None
+        assert (found.mean > found.high) - (found.mean < found.low) == where
+        assert found.within == (where == 0)
+
+
+def test_the_nees_interval_of_two_devices_by_hand() -> None:
+    """Means 2 and 4: the standard error is 1, Student's quantile with one degree of freedom 63.657 at 99.5 %.
+
+    By maps: the same two, so the same; with one device in each of two maps both tell one story.
+    """
+    groups = Groups.of([5, 5, 9, 9], [0, 0, 1, 1])
+    found = nees([1.0, 3.0, 4.0, 4.0], groups)
+    assert found is not None
+    assert (found.devices, found.maps, found.mean, found.low) == (2, 2, 3.0, 0.0)
+    assert found.high == pytest.approx(3 + 3 * 63.657 * 1 / 3, abs=2e-3)
+    assert nees_by_map([1.0, 3.0, 4.0, 4.0], groups) == found
+    assert nees_by_map([1.0, 3.0], groups.only(np.array([True, True, False, False]))) is None
+    one = nees([1.0, 3.0], groups.only(np.array([True, True, False, False])))
+    assert one == nees([1.0, 3.0])
+
+
+def test_devices_that_agree_where_their_maps_do_not_are_counted_by_maps() -> None:
+    """Four devices in two maps: means 2, 2, 4, 4. By devices the error is sqrt(4 / 3) / 2 = 0.577, by maps 1.
+
+    The larger counts, with the devices' three degrees of freedom: 5.8409 at 99.5 %.
+    """
+    groups = Groups.of([0, 1, 2, 3], [0, 0, 1, 1])
+    found = nees([2.0, 2.0, 4.0, 4.0], groups)
+    assert found is not None
+    assert found.high == pytest.approx(3 + 5.8409, abs=1e-4)
+
+
+@pytest.mark.slow
+def test_intervals_by_devices_are_as_wide_as_frames_that_share_errors_make_them() -> None:
+    """95 % intervals of the RMSE hold the true one in at least 88 % of 200 sets; by independent frames in fewer.
+
+    Below 0.88 are 200 draws of a probability of 0.93 once in 70. The true RMSE is sqrt(3).
+    """
+    rng, groups = np.random.default_rng(10), nested_groups()
+    held, by_frames = 0, 0
+    assert binom.cdf(0.88 * 200, 200, 0.93) < 1.5e-2
+    for _ in range(200):
+        errors = np.linalg.norm(nested_errors(rng, 0.3, 0.1), axis=1).tolist()
+        found, independent = rmse_interval(errors, groups), rmse_interval(errors)
+        assert found is not None
+        assert independent is not None
+        held += found.low_m <= sqrt(3) <= found.high_m
+        by_frames += independent.low_m <= sqrt(3) <= independent.high_m
+    assert held >= 0.88 * 200
+    assert by_frames < 0.8 * 200
+
+
+def test_a_resample_draws_whole_devices() -> None:
+    """Two devices of equal errors, 1 and 3: an RMSE of a resample is 1, sqrt(5) or 3, so the limits are 1 and 3.
+
+    In two maps with one device each as well. One device of many frames is resampled by frames.
+    """
+    for of_map in ([0, 0, 0, 0], [0, 0, 1, 1]):
+        found = rmse_interval([1.0, 1.0, 3.0, 3.0], Groups.of([0, 0, 1, 1], of_map))
+        assert found is not None
+        assert (found.low_m, found.high_m) == (pytest.approx(1.0), pytest.approx(3.0))
+        assert median_interval([1.0, 1.0, 3.0, 3.0], Groups.of([0, 0, 1, 1], of_map)) == found
+    values = np.random.default_rng(3).normal(size=30).tolist()
+    assert rmse_interval(values, Groups.of([4] * 30, [0] * 30)) == rmse_interval(values)
+
+
+def test_devices_are_drawn_within_their_map() -> None:
+    """Map 0 with two devices, map 1 with one of three frames: a resample has two maps, never a part of a device.
+
+    Map 1 twice are six frames, map 0 twice eight, both seven. Each map is drawn once in two, each device of map 0 too:
+    4 sigma of 1999 resamples are 4 sqrt(2 x 1/2 x 1/2 / 1999) = 0.063 for the times of a map.
+    """
+    groups = Groups.of([0, 0, 1, 1, 2, 2, 2], [0, 0, 0, 0, 1, 1, 1])
+    counts = groups.resampled(np.random.default_rng(1))
+    assert set(np.unique(counts.sum(axis=1)).tolist()) == {6, 7, 8}
+    for device in (0, 1, 2):
+        of_device = counts[:, groups.device == device]
+        assert (of_device == of_device[:, :1]).all()
+    assert counts[:, 0].mean() == pytest.approx(1.0, abs=0.09)  # given its map's times, as many draws again
+    assert counts[:, 4].mean() == pytest.approx(1.0, abs=0.063)
+    assert (counts[:, 0] + counts[:, 2] + 2 * counts[:, 4] == 4).all()
+
+
+def test_statistics_of_resamples_are_those_of_their_values() -> None:
+    """Each value as often as it is counted, written out, and then NumPy's median and root mean square."""
+    rng = np.random.default_rng(2)
+    values, counts = rng.normal(size=9), rng.integers(0, 4, (200, 9))
+    written = [np.repeat(values, row) for row in counts]
+    assert _medians(values, counts) == pytest.approx([np.median(one) for one in written])
+    assert _root_mean_squares(values, counts) == pytest.approx([np.sqrt(np.mean(one**2)) for one in written])

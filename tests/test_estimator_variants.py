@@ -211,6 +211,6 @@ def test_failures_carry_their_stage(noisy: Path) -> None:
 
 def test_the_catalogue_keys_are_the_names() -> None:
     rivals = ["yoshino2008", "nakazawa2013", "rahman2011", "kim"]
-    fits = ["pnp", "ippe", "sqpnp", "up2p", "gravity-fit", "ml"]
+    fits = ["pnp", "ippe", "sqpnp", "up2p", "gravity-fit", "ml", "self-calibrated"]
     assert list(VARIANTS) == ["huynh2016", "huynh2016-as-printed", *rivals, *fits]
     assert all(variant.name == name and "\n" not in variant.summary for name, variant in VARIANTS.items())

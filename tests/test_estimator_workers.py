@@ -40,7 +40,7 @@ def test_any_number_of_workers_gives_the_same_answers_in_order(folder: Path, wor
     shared = estimate_with_workers(dataset, list(VARIANTS), workers, on_frame=lambda: done.append(None))
     assert without_times(shared) == without_times(alone)
     assert [row.frame for row in shared["pnp"]] == [0, 1, 2]
-    assert len(done) == 3
+    assert len(done) == 2 * 3  # a variant of all frames of a device is among them
 
 
 def test_an_unknown_name_is_refused_before_a_process_starts(folder: Path) -> None:

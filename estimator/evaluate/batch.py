@@ -1,9 +1,12 @@
-"""Batch estimation: variants over the frames of a dataset, shot by shot, timed. Every frame gets a row."""
+"""Batch estimation: variants over the frames of a dataset, shot by shot and then device by device, timed.
+
+Every frame gets a row.
+"""
 
 import operator
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import groupby
 
 import numpy as np
@@ -13,26 +16,54 @@ from estimator.io.dataset import Dataset, FrameRecord, read_frame
 from estimator.io.device import DeviceFrame, Led
 from estimator.io.estimates import EstimateRow, LedRange
 from estimator.io.records import MAX_NUMBER, is_covariance
-from estimator.methods.variant import Estimate, Variant
+from estimator.methods.variant import DeviceMethod, Estimate, Variant
 
 Rows = dict[str, list[EstimateRow]]
 """Rows by variant name, one a frame."""
 
 
+@dataclass(frozen=True, eq=False)
+class Observed:
+    """A frame as the method of a device observed it: `value`, or why it could not; and the time that it took."""
+
+    frame: int
+    device: int
+    value: object | EstimationFailure
+    time_s: float
+
+
+@dataclass(frozen=True, eq=False)
+class ShotResult:
+    """Result of a shot: `rows` of the variants that are done with it, and frames `observed`, by name, of the others."""
+
+    rows: Rows
+    observed: dict[str, list[Observed]]
+
+
 def estimate_dataset(
     dataset: Dataset, variants: Sequence[Variant], on_frame: Callable[[], None]
 ) -> dict[str, tuple[EstimateRow, ...]]:
-    """Rows of every variant, one a frame; each image is read once, and `on_frame` is called after each frame.
+    """Rows of every variant, one a frame; each image is read once, and `on_frame` is called after each step of a frame.
 
-    A frame whose image cannot be read fails for every variant, with the reason `read: ...`.
+    A frame has one step, and a second one if a variant uses all frames of a device: they are estimated together, after
+    all images. A frame whose image cannot be read fails for every variant, with the reason `read: ...`.
     """
-    rows: Rows = {variant.name: [] for variant in variants}
+    results = []
     for records in shots(dataset):
-        for name, of_shot in estimate_shot(dataset, records, variants).items():
-            rows[name] += of_shot
+        results.append(estimate_shot(dataset, records, variants))
         for _ in records:
             on_frame()
-    return {name: tuple(of_variant) for name, of_variant in rows.items()}
+    solved = []
+    for device in devices(results):
+        solved.append(estimate_device(dataset, device, variants))
+        for _ in next(iter(device.values())):
+            on_frame()
+    return in_order(dataset, variants, [*(result.rows for result in results), *solved])
+
+
+def steps(variants: Iterable[Variant]) -> int:
+    """Steps of a frame, as `estimate_dataset` counts them."""
+    return 1 if all(variant.of_device is None for variant in variants) else 2
 
 
 def shots(dataset: Dataset) -> list[tuple[FrameRecord, ...]]:
@@ -40,21 +71,104 @@ def shots(dataset: Dataset) -> list[tuple[FrameRecord, ...]]:
     return [tuple(records) for _, records in groupby(dataset.frames, lambda record: record.shot)]
 
 
-def estimate_shot(dataset: Dataset, records: Sequence[FrameRecord], variants: Sequence[Variant]) -> Rows:
-    """Rows of every variant for the frames of one shot."""
-    rows: Rows = {variant.name: [] for variant in variants}
+def devices(results: Iterable[ShotResult]) -> list[dict[str, list[Observed]]]:
+    """Observed frames by variant name of each device, devices and frames in order; none without such a variant."""
+    found: dict[int, dict[str, list[Observed]]] = {}
+    for result in results:
+        for name, of_shot in result.observed.items():
+            for one in of_shot:
+                found.setdefault(one.device, {}).setdefault(name, []).append(one)
+    return [found[device] for device in sorted(found)]
+
+
+def in_order(
+    dataset: Dataset, variants: Sequence[Variant], parts: Iterable[Rows]
+) -> dict[str, tuple[EstimateRow, ...]]:
+    """All rows of every variant, in the order of the frames."""
+    rows: dict[str, dict[int, EstimateRow]] = {variant.name: {} for variant in variants}
+    for part in parts:
+        for name, of_part in part.items():
+            rows[name].update((row.frame, row) for row in of_part)
+    return {name: tuple(by_frame[record.frame] for record in dataset.frames) for name, by_frame in rows.items()}
+
+
+def estimate_shot(dataset: Dataset, records: Sequence[FrameRecord], variants: Sequence[Variant]) -> ShotResult:
+    """Rows for the frames of one shot, and the frames observed for variants that use all frames of a device."""
+    result = ShotResult({}, {})
     shot = [(record, _read(dataset, record)) for record in records]
     for record, frame in shot:
+        whole = frame
+        if isinstance(frame, DeviceFrame):
+            others = tuple(other for _, other in shot if isinstance(other, DeviceFrame) and other is not frame)
+            whole = replace(frame, other_cameras=others)
         for variant in variants:
-            if isinstance(frame, EstimationFailure):
-                row = _failed(record.frame, frame, dataset.leds, time_s=0.0)
+            if variant.of_device is not None:
+                observed = _observed(variant.of_device, whole, record)
+                result.observed.setdefault(variant.name, []).append(observed)
+                continue
+            if isinstance(whole, EstimationFailure):
+                row = _failed(record.frame, whole, dataset.leds, time_s=0.0)
             else:
-                other_cameras = tuple(
-                    other for _, other in shot if isinstance(other, DeviceFrame) and other is not frame
-                )
-                row = estimate_frame(variant, replace(frame, other_cameras=other_cameras), record.frame)
-            rows[variant.name].append(row)
+                row = estimate_frame(variant, whole, record.frame)
+            result.rows.setdefault(variant.name, []).append(row)
+    return result
+
+
+def estimate_device(dataset: Dataset, observed: Mapping[str, Sequence[Observed]], variants: Sequence[Variant]) -> Rows:
+    """Rows for the frames of one device, observed by every variant that uses all frames of a device.
+
+    A row's `time_s` is the time in which its frame was observed, and its share of the common solution's.
+    """
+    rows: Rows = {}
+    for variant in variants:
+        if variant.of_device is not None and variant.name in observed:
+            rows[variant.name] = _solved(variant.of_device, observed[variant.name], dataset.leds)
     return rows
+
+
+def _observed(method: DeviceMethod, frame: DeviceFrame | EstimationFailure, record: FrameRecord) -> Observed:
+    start = time.perf_counter()
+    value: object | EstimationFailure = frame
+    if isinstance(frame, DeviceFrame):
+        try:
+            value = method.observe(frame)
+        except EstimationFailure as failure:
+            value = failure
+        except (Exception, SystemExit) as error:
+            value = _crash(error)
+    return Observed(record.frame, record.device, value, time.perf_counter() - start)
+
+
+def _solved(method: DeviceMethod, observed: Sequence[Observed], leds: Mapping[int, Led]) -> list[EstimateRow]:
+    usable = [one for one in observed if not isinstance(one.value, EstimationFailure)]
+    results: dict[int, object] = {one.frame: one.value for one in observed}
+    start = time.perf_counter()
+    try:
+        found = list(method.solve([one.value for one in usable])) if usable else []
+        if len(found) != len(usable):
+            raise EstimationFailure("variant", "returned another number of results than of frames")
+        results.update(zip((one.frame for one in usable), found, strict=True))
+    except EstimationFailure as failure:
+        results.update((one.frame, failure) for one in usable)
+    except (Exception, SystemExit) as error:
+        results.update((one.frame, _crash(error)) for one in usable)
+    share_s = (time.perf_counter() - start) / max(len(usable), 1)
+    rows = []
+    for one in observed:
+        result, time_s = results[one.frame], one.time_s + (share_s if one in usable else 0.0)
+        try:
+            if isinstance(result, EstimationFailure):
+                raise result
+            rows.append(_ok(one.frame, result, leds, time_s))
+        except EstimationFailure as failure:
+            rows.append(_failed(one.frame, failure, leds, time_s))
+        except (Exception, SystemExit) as error:
+            rows.append(_failed(one.frame, _crash(error), leds, time_s))
+    return rows
+
+
+def _crash(error: BaseException) -> EstimationFailure:
+    return EstimationFailure("variant", f"crashed ({type(error).__name__})")
 
 
 def _read(dataset: Dataset, record: FrameRecord) -> DeviceFrame | EstimationFailure:
@@ -81,8 +195,7 @@ def estimate_frame(variant: Variant, frame: DeviceFrame, index: int) -> Estimate
     except EstimationFailure as failure:
         return _failed(index, failure, frame.leds, time.perf_counter() - start)
     except (Exception, SystemExit) as error:
-        crash = EstimationFailure("variant", f"crashed ({type(error).__name__})")
-        return _failed(index, crash, frame.leds, time.perf_counter() - start)
+        return _failed(index, _crash(error), frame.leds, time.perf_counter() - start)
 
 
 def _ok(index: int, estimate: object, leds: Mapping[int, Led], time_s: float) -> EstimateRow:

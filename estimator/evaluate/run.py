@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from estimator.errors import InputError
-from estimator.evaluate.batch import estimate_dataset
+from estimator.evaluate.batch import estimate_dataset, steps
 from estimator.evaluate.workers import estimate_with_workers
 from estimator.io.dataset import read_dataset
 from estimator.io.estimates import EstimateRow, estimates_path, write_estimates
@@ -23,6 +23,9 @@ def run(
 ) -> dict[str, tuple[EstimateRow, ...]]:
     """Estimate every frame of a dataset, and write estimates/VARIANT.parquet for each variant.
 
+    A variant that uses all frames of a device (`self-calibrated`) gets them by the column `device` of the frames. No
+    variant gets the truth.
+
     Parameters
     ----------
     directory
@@ -32,7 +35,8 @@ def run(
     workers
         Number of processes; the estimates do not depend on it. More than 1 needs variants given by name.
     progress
-        Called with (frames done, frames in all) at the start and after every frame.
+        Called with (frames done, frames in all) at the start and after every frame. Where a variant uses all frames
+        of a device, each frame counts twice: as its image is done, and as the frames of its device are.
 
     Returns
     -------
@@ -53,7 +57,7 @@ def run(
     for name in chosen:
         estimates_path(folder, name)
     dataset = read_dataset(folder)
-    done, total = 0, len(dataset.frames)
+    done, total = 0, len(dataset.frames) * steps(chosen.values())
 
     def on_frame() -> None:
         nonlocal done

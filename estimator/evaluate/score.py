@@ -11,15 +11,21 @@ from pydantic import BaseModel, Field, ValidationError, model_validator
 from estimator.errors import InputError
 from estimator.evaluate.statistics import (
     AgainstBound,
+    DeviceScore,
+    GoodLeds,
+    Groups,
     Interval,
+    MapScore,
     Nees,
     OfAll,
     Summary,
     against_bound,
     median_interval,
     nees,
+    nees_by_map,
     of_all,
     rmse_interval,
+    root_mean_square,
     squared_in_sigmas,
     summary,
 )
@@ -33,7 +39,9 @@ from estimator.io.truth import TruthRow, read_truth
 if TYPE_CHECKING:
     import pandas as pd
 
-VERSION = 3
+VERSION = 4
+# Enough for a position without gravity: frames with more are counted with these.
+ENOUGH_LEDS = 4
 
 
 class RangeError(Row):
@@ -47,10 +55,14 @@ class FrameScore(Row):
     """Score of one frame of one variant; positions in world metres. Errors are null for a failed frame.
 
     `vertical_error_m` is signed, positive is too high. `bound_m` is the root of the trace of the frame's Cramer-Rao
-    bound, null without one; `nees` is `e^T C^-1 e` if the variant reports a covariance C.
+    bound, null without one, `bound_exact_m` that of a device that knows camera and map exactly; `nees` is `e^T C^-1 e`
+    if the variant reports a covariance C. `good_leds` counts the LEDs whose whole image is on the sensor.
     """
 
     frame: int
+    device: int
+    map: int
+    good_leds: int
     status: Literal["ok", "failed"]
     reason: str
     true_m: Triple
@@ -59,6 +71,7 @@ class FrameScore(Row):
     horizontal_error_m: Size | None
     vertical_error_m: Number | None
     bound_m: Size | None
+    bound_exact_m: Size | None
     nees: Size | None
     ambiguous: bool
     range_errors: tuple[RangeError, ...]
@@ -76,7 +89,8 @@ class VariantScore(Row):
     """Score of one variant over all frames.
 
     `of_all` counts failed frames as infinite errors. The other summaries are over the `ok` frames, null without one:
-    read them together with `success_rate`, the share of `ok` frames. The two intervals are those of `error_3d`. Range
+    read them together with `success_rate`, the share of `ok` frames. The two intervals are those of `error_3d`.
+    `against_exact_bound` is null where every frame's exact bound is its bound. Range
     errors are of all ranges that the variant computed, including those of frames that failed afterwards.
     """
 
@@ -96,7 +110,12 @@ class VariantScore(Row):
     ranges: int
     range_error: Summary | None
     against_bound: AgainstBound | None
+    against_exact_bound: AgainstBound | None
     nees: Nees | None
+    nees_by_map: Nees | None
+    by_device: tuple[DeviceScore, ...]
+    by_map: tuple[MapScore, ...]
+    by_good_leds: tuple[GoodLeds, ...]
     median_time_s: Size | None
     rows: tuple[FrameScore, ...]
 
@@ -105,7 +124,7 @@ class Scores(Row):
     """Scores of a dataset, the content of scores.json: all that a report needs, including the truth."""
 
     format: Literal["estimator-scores"] = "estimator-scores"
-    version: Literal[3] = 3
+    version: Literal[4] = 4
     dataset: str
     room_m: tuple[Positive, Positive, Positive]
     led_map: tuple[AnyLed, ...]
@@ -124,9 +143,10 @@ class Scores(Row):
         Returns
         -------
         pandas.DataFrame
-            One row a variant. The columns are the keys of a variant in scores.json (datasets/FORMAT.md) without
-            `failures` and `rows`; a summary gives a column for each of its keys, `error_3d_median_m`, `nees_mean` and
-            so on. Units stand in the names. Missing values are NaN, and infinite ones of `of_all` infinity.
+            One row a variant. The columns are the keys of a variant in scores.json (datasets/FORMAT.md) without the
+            lists (`failures`, `by_device`, `by_map`, `by_good_leds`, `rows`); a summary gives a column for each of its
+            keys, `error_3d_median_m`, `nees_mean` and so on. Units stand in the names. Missing values are NaN, and
+            infinite ones of `of_all` infinity.
 
         Raises
         ------
@@ -175,9 +195,15 @@ SUMMARIES: dict[str, type[Row]] = {
     "vertical": Summary,
     "range_error": Summary,
     "against_bound": AgainstBound,
+    "against_exact_bound": AgainstBound,
     "nees": Nees,
+    "nees_by_map": Nees,
 }
 """Keys of a variant that hold several values."""
+
+
+LISTS = ("failures", "by_device", "by_map", "by_good_leds", "rows")
+"""Keys of a variant that hold any number of values, which have no place in a row."""
 
 
 def _summary_row(score: VariantScore | None) -> dict[str, object]:
@@ -185,7 +211,7 @@ def _summary_row(score: VariantScore | None) -> dict[str, object]:
     row: dict[str, object] = {}
     for field in VariantScore.model_fields:
         value = None if score is None else getattr(score, field)
-        if field in ("failures", "rows"):
+        if field in LISTS:
             continue
         if field not in SUMMARIES:
             row[field] = value
@@ -220,13 +246,25 @@ def _frame_row(variant: str, row: FrameScore) -> dict[str, object]:
 
 
 def score_variant(
-    variant: str, estimates: Sequence[EstimateRow], truth: Sequence[TruthRow], leds: Mapping[int, Led]
+    variant: str,
+    estimates: Sequence[EstimateRow],
+    truth: Sequence[TruthRow],
+    leds: Mapping[int, Led],
+    devices: Sequence[int] | None = None,
 ) -> VariantScore:
-    """Score of one variant's rows by the truth of the same frames."""
-    rows = tuple(score_frame(row, true, leds) for row, true in zip(estimates, truth, strict=True))
+    """Score of one variant's rows by the truth of the same frames; all are of one device if `devices` is None."""
+    of_frame = [0] * len(estimates) if devices is None else devices
+    rows = tuple(
+        score_frame(row, true, leds, device) for row, true, device in zip(estimates, truth, of_frame, strict=True)
+    )
     good = [row for row in rows if row.status == "ok"]
+    sure = [row for row in good if row.nees is not None]
+    groups = groups_of(good)
+    # Of frames that share errors and are of one device, no interval can be made.
+    dependent = groups_of(rows).devices > 1
+    unsure, one_device = dependent and groups.devices < 2, dependent and groups_of(sure).devices < 2
+    squares = [row.nees for row in sure if row.nees is not None]
     errors_m = [row.error_3d_m for row in good if row.error_3d_m is not None]
-    bounded = [(row.error_3d_m, row.bound_m) for row in good if row.error_3d_m is not None and row.bound_m is not None]
     range_errors_m = [error.error_m for row in rows for error in row.range_errors]
     return VariantScore(
         variant=variant,
@@ -238,20 +276,77 @@ def score_variant(
         failures=dict(Counter(row.reason for row in rows if row.status == "failed").most_common()),
         of_all=of_all([row.error_3d_m for row in rows]),
         error_3d=summary(errors_m),
-        median_interval=median_interval(errors_m),
-        rmse_interval=rmse_interval(errors_m),
+        median_interval=None if unsure else median_interval(errors_m, groups),
+        rmse_interval=None if unsure else rmse_interval(errors_m, groups),
         horizontal=summary([row.horizontal_error_m for row in good if row.horizontal_error_m is not None]),
         vertical=summary([row.vertical_error_m for row in good if row.vertical_error_m is not None]),
         ranges=len(range_errors_m),
         range_error=summary(range_errors_m),
-        against_bound=against_bound([error_m for error_m, _ in bounded], [bound_m for _, bound_m in bounded]),
-        nees=nees([row.nees for row in good if row.nees is not None]),
+        against_bound=_against(good, "bound_m"),
+        against_exact_bound=None if _same_bounds(rows) else _against(good, "bound_exact_m"),
+        nees=None if one_device else nees(squares, groups_of(sure)),
+        nees_by_map=nees_by_map(squares, groups_of(sure)),
+        by_device=_by_device(rows),
+        by_map=_by_map(rows),
+        by_good_leds=_by_good_leds(rows),
         median_time_s=float(np.median([row.time_s for row in good])) if good else None,
         rows=rows,
     )
 
 
-def score_frame(estimate: EstimateRow, truth: TruthRow, leds: Mapping[int, Led]) -> FrameScore:
+def groups_of(rows: Sequence[FrameScore]) -> Groups:
+    """Devices and maps of frames."""
+    return Groups.of([row.device for row in rows], [row.map for row in rows])
+
+
+def _against(good: Sequence[FrameScore], field: Literal["bound_m", "bound_exact_m"]) -> AgainstBound | None:
+    pairs = [(row.error_3d_m, getattr(row, field)) for row in good]
+    both = [(error_m, bound_m) for error_m, bound_m in pairs if error_m is not None and bound_m is not None]
+    return against_bound([error_m for error_m, _ in both], [bound_m for _, bound_m in both])
+
+
+def _same_bounds(rows: Sequence[FrameScore]) -> bool:
+    return all(row.bound_exact_m == row.bound_m for row in rows)
+
+
+def _by_device(rows: Sequence[FrameScore]) -> tuple[DeviceScore, ...]:
+    groups = sorted({(row.device, row.map) for row in rows})
+    of_group = [[row for row in rows if (row.device, row.map) == group] for group in groups]
+    return tuple(
+        DeviceScore(device=device, map=one, **_in_group(some))
+        for (device, one), some in zip(groups, of_group, strict=True)
+    )
+
+
+def _by_map(rows: Sequence[FrameScore]) -> tuple[MapScore, ...]:
+    found = []
+    for one in sorted({row.map for row in rows}):
+        some = [row for row in rows if row.map == one]
+        found.append(MapScore(map=one, devices=len({row.device for row in some}), **_in_group(some)))
+    return tuple(found)
+
+
+def _in_group(rows: Sequence[FrameScore]) -> dict[str, Any]:
+    errors_m = [row.error_3d_m for row in rows if row.error_3d_m is not None]
+    squares = [row.nees for row in rows if row.nees is not None]
+    return {
+        "frames": len(rows),
+        "failed": sum(row.status == "failed" for row in rows),
+        "rmse_m": float(root_mean_square(np.array(errors_m))) if errors_m else None,
+        "nees": float(np.mean(squares)) if squares else None,
+    }
+
+
+def _by_good_leds(rows: Sequence[FrameScore]) -> tuple[GoodLeds, ...]:
+    found = []
+    for count in range(ENOUGH_LEDS + 1):
+        some = [row for row in rows if min(row.good_leds, ENOUGH_LEDS) == count]
+        failed = sum(row.status == "failed" for row in some)
+        found.append(GoodLeds(good_leds=count, frames=len(some), failed=failed))
+    return tuple(found)
+
+
+def score_frame(estimate: EstimateRow, truth: TruthRow, leds: Mapping[int, Led], device: int = 0) -> FrameScore:
     """Score of one frame: position errors if it has a position, range errors for its ranges."""
     true_m = np.array(truth.position_m)
     error = horizontal = vertical = squares = None
@@ -265,9 +360,11 @@ def score_frame(estimate: EstimateRow, truth: TruthRow, leds: Mapping[int, Led])
         RangeError(led=r.led, error_m=r.range_m - float(np.linalg.norm(np.array(leds[r.led].position_m) - true_m)))
         for r in estimate.ranges
     )
-    bound_m2 = truth.bound_m2
     return FrameScore(
         frame=estimate.frame,
+        device=device,
+        map=truth.map,
+        good_leds=truth.good_leds,
         status=estimate.status,
         reason=estimate.reason,
         true_m=truth.position_m,
@@ -275,12 +372,17 @@ def score_frame(estimate: EstimateRow, truth: TruthRow, leds: Mapping[int, Led])
         error_3d_m=error,
         horizontal_error_m=horizontal,
         vertical_error_m=vertical,
-        bound_m=None if bound_m2 is None else float(np.sqrt(bound_m2[0] + bound_m2[4] + bound_m2[8])),
+        bound_m=_root_of_trace(truth.bound_m2),
+        bound_exact_m=_root_of_trace(truth.bound_exact_m2 if truth.bound_exact_m2 is not None else truth.bound_m2),
         nees=squares,
         ambiguous=estimate.ambiguous,
         range_errors=range_errors,
         time_s=estimate.time_s,
     )
+
+
+def _root_of_trace(covariance_m2: Sequence[float] | None) -> float | None:
+    return None if covariance_m2 is None else float(np.sqrt(covariance_m2[0] + covariance_m2[4] + covariance_m2[8]))
 
 
 def score(directory: str | Path) -> Scores:
@@ -307,11 +409,14 @@ def score(directory: str | Path) -> Scores:
     if not paths:
         raise InputError(f"{folder / 'estimates'}: no estimates to score; make them with `estimator run {folder}`")
     truth = read_truth(folder / "truth.parquet", len(dataset.frames))
+    devices = [record.device for record in dataset.frames]
     scores = Scores(
         dataset=dataset.name,
         room_m=dataset.room_m,
         led_map=tuple(dataset.leds.values()),
-        variants=tuple(score_variant(path.stem, _read_known(path, dataset), truth, dataset.leds) for path in paths),
+        variants=tuple(
+            score_variant(path.stem, _read_known(path, dataset), truth, dataset.leds, devices) for path in paths
+        ),
     )
     write_atomically(folder / "scores.json", scores.model_dump_json(indent=1).encode() + b"\n")
     return scores

@@ -2,7 +2,7 @@
 
 from estimator.evaluate.comparison import Comparison
 from estimator.evaluate.score import VariantScore
-from estimator.evaluate.statistics import Interval, Summary
+from estimator.evaluate.statistics import Interval, Nees, Summary
 
 ERROR_HEADERS = (
     *(
@@ -23,13 +23,25 @@ ERROR_NOTE = (
     "are over the frames that succeeded: median to max of the 3D error, with bootstrap intervals; medians of "
     "horizontal, vertical and range errors (of all ranges, including those of failed frames) and of the time."
 )
-LIMIT_HEADERS = ("frames with a bound", "bound", "RMSE there", "efficiency", "NEES", "99 % interval", "of", "ambiguous")
+LIMIT_HEADERS = (
+    *("frames with a bound", "bound", "RMSE there", "efficiency", "exact bound"),
+    *("NEES", "99 % interval", "of", "ambiguous"),
+)
 LIMIT_NOTE = (
     "Bound and RMSE are root mean squares over the frames that succeeded and have a Cramér-Rao bound; efficiency is "
-    "their ratio. NEES is the mean squared error in units of the covariance that the variant reports, 3 if the "
-    "covariance is consistent; above its interval the variant is overconfident, below it conservative. Ambiguous: "
-    "estimates with a second one that fits nearly as well."
+    "their ratio. The bound is that of a frame by itself: a variant that uses several may be below it. Exact bound: of "
+    "a device that knows camera and map exactly. NEES is the mean squared error in units "
+    "of the covariance that the variant reports, 3 if the covariance is consistent; above its interval the variant is "
+    "overconfident, below it conservative. Ambiguous: estimates with a second one that fits nearly as well."
 )
+GROUP_HEADERS = ("devices", "maps", "RMSE by device", "NEES by device", "NEES by map", "99 % interval")
+GROUP_NOTE = (
+    "Frames of a device share the errors of its camera and map, devices in one building the map's: intervals are made "
+    "of devices and maps. By device: smallest to largest of the devices; by map: the mean, and its interval with the "
+    "maps as samples."
+)
+LOST_HEADERS = ("no good LED", "1", "2", "3", "4 or more")
+LOST_NOTE = "Failed frames of all frames, by the number of LEDs whose whole image is on the sensor."
 PAIR_HEADERS = ("both", "only A", "only B", "neither", "A nearer", "median A − B", "95 % interval", "Wilcoxon p")
 PAIR_NOTE = (
     "Over the frames where both succeeded: the share where A is nearer, the median of A's 3D error minus B's with its "
@@ -64,19 +76,54 @@ def _of(part: Summary | None, field: str) -> str:
 
 def limit_cells(score: VariantScore) -> tuple[str, ...]:
     """Row of a variant, by LIMIT_HEADERS."""
-    bound, consistency = score.against_bound, score.nees
+    bound, exact, consistency = score.against_bound, score.against_exact_bound, score.nees
     of_bound, of_nees = ("0", "–", "–", "–"), ("–", "–", "0")
     if bound is not None:
         efficiency = "–" if bound.efficiency is None else f"{bound.efficiency:.3g}"
         of_bound = (str(bound.frames), length_text(bound.bound_rms_m), length_text(bound.rmse_m), efficiency)
     if consistency is not None:
-        verdict = ""
-        if not consistency.within:
-            verdict = " (overconfident)" if consistency.mean > consistency.high else " (conservative)"
-        interval = f"{consistency.low:.3g} to {consistency.high:.3g}"
-        of_nees = (f"{consistency.mean:.3g}{verdict}", interval, str(consistency.frames))
+        of_nees = (nees_text(consistency), nees_interval_text(consistency), str(consistency.frames))
     share = f" ({share_text(score.ambiguous, score.ok)})" if score.ambiguous else ""
-    return (*of_bound, *of_nees, f"{score.ambiguous}{share}")
+    of_exact = "–" if exact is None else length_text(exact.bound_rms_m)
+    return (*of_bound, of_exact, *of_nees, f"{score.ambiguous}{share}")
+
+
+def nees_text(consistency: Nees) -> str:
+    """Mean NEES, and the verdict where it is outside its interval."""
+    verdict = ""
+    if not consistency.within:
+        verdict = " (overconfident)" if consistency.mean > consistency.high else " (conservative)"
+    return f"{consistency.mean:.3g}{verdict}"
+
+
+def nees_interval_text(consistency: Nees) -> str:
+    """Interval of the mean NEES of a consistent covariance."""
+    return f"{consistency.low:.3g} to {consistency.high:.3g}"
+
+
+def has_groups(score: VariantScore) -> bool:
+    """Whether the frames are of several devices or maps."""
+    return len(score.by_device) > 1
+
+
+def group_cells(score: VariantScore) -> tuple[str, ...]:
+    """Row of a variant, by GROUP_HEADERS."""
+    sizes_m = [one.rmse_m for one in score.by_device if one.rmse_m is not None]
+    squares = [one.nees for one in score.by_device if one.nees is not None]
+    by_map = score.nees_by_map
+    return (
+        str(len({one.device for one in score.by_device})),
+        str(len(score.by_map)),
+        interval_text(Interval(low_m=min(sizes_m), high_m=max(sizes_m))) if sizes_m else "–",
+        f"{min(squares):.3g} to {max(squares):.3g}" if squares else "–",
+        "–" if by_map is None else nees_text(by_map),
+        "–" if by_map is None else nees_interval_text(by_map),
+    )
+
+
+def lost_cells(score: VariantScore) -> tuple[str, ...]:
+    """Row of a variant, by LOST_HEADERS."""
+    return tuple(f"{one.failed} of {one.frames}" if one.frames else "–" for one in score.by_good_leds)
 
 
 def pair_cells(pair: Comparison) -> tuple[str, ...]:

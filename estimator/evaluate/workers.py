@@ -12,7 +12,17 @@ from contextlib import contextmanager
 import cv2
 
 from estimator.errors import InputError
-from estimator.evaluate.batch import Rows, estimate_dataset, estimate_shot, shots
+from estimator.evaluate.batch import (
+    Observed,
+    Rows,
+    ShotResult,
+    devices,
+    estimate_dataset,
+    estimate_device,
+    estimate_shot,
+    in_order,
+    shots,
+)
 from estimator.io.dataset import Dataset, FrameRecord
 from estimator.io.estimates import EstimateRow
 from estimator.methods.registry import Registry
@@ -32,7 +42,6 @@ def estimate_with_workers(
     workers = min(workers, len(todo))
     if workers <= 1:
         return estimate_dataset(dataset, variants, on_frame)
-    rows: Rows = {variant.name: [] for variant in variants}
     # A forked child of a process with threads may hang: spawn.
     pool = ProcessPoolExecutor(
         workers, multiprocessing.get_context("spawn"), _start, (dataset, tuple(names), max(1, _cores() // workers))
@@ -40,16 +49,23 @@ def estimate_with_workers(
     try:
         with _interrupts_deferred():  # submit() starts child processes
             tasks = [pool.submit(_work, records) for records in todo]
+        results = []
         for records, task in zip(todo, tasks, strict=True):
-            for name, of_shot in task.result().items():
-                rows[name] += of_shot
+            results.append(task.result())
             for _ in records:
+                on_frame()
+        of_devices = devices(results)
+        solving = [pool.submit(_solve, device) for device in of_devices]
+        solved = []
+        for device, solution in zip(of_devices, solving, strict=True):
+            solved.append(solution.result())
+            for _ in next(iter(device.values())):
                 on_frame()
     except BrokenProcessPool:
         raise InputError("a worker process died (out of memory?); nothing was written; try fewer --workers") from None
     finally:
         pool.shutdown(cancel_futures=True)
-    return {name: tuple(of_variant) for name, of_variant in rows.items()}
+    return in_order(dataset, variants, [*(result.rows for result in results), *solved])
 
 
 @contextmanager
@@ -98,6 +114,11 @@ def _exit_with_parent() -> None:
         os._exit(1)
 
 
-def _work(records: tuple[FrameRecord, ...]) -> Rows:
+def _work(records: tuple[FrameRecord, ...]) -> ShotResult:
     dataset, variants = _worker_state
     return estimate_shot(dataset, records, variants)
+
+
+def _solve(observed: dict[str, list[Observed]]) -> Rows:
+    dataset, variants = _worker_state
+    return estimate_device(dataset, observed, variants)

@@ -8,6 +8,7 @@ from estimator.methods.maximum_likelihood import ML
 from estimator.methods.nakazawa2013 import NAKAZAWA2013
 from estimator.methods.pnp import IPPE, PNP, SQPNP
 from estimator.methods.rahman2011 import RAHMAN2011
+from estimator.methods.self_calibrated import SELF_CALIBRATED
 from estimator.methods.up2p import UP2P, up2p_with
 from estimator.methods.variant import Variant
 from estimator.methods.yoshino2008 import YOSHINO2008
@@ -27,6 +28,7 @@ VARIANTS = {
         UP2P,
         GRAVITY_FIT,
         ML,
+        SELF_CALIBRATED,
     )
 }
 STAGED = {"huynh2016": huynh2016_with, "gravity-fit": gravity_fit_with, "up2p": up2p_with}

@@ -7,11 +7,12 @@ Another package registers a function `f(frame: DeviceFrame) -> Estimate`, or a `
 import inspect
 import logging
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from typing import Self
 
-from estimator.errors import InputError
+from estimator.errors import EstimationFailure, InputError
 from estimator.io.device import DeviceFrame
 from estimator.io.estimates import NAME
 from estimator.io.records import first_line
@@ -94,6 +95,9 @@ def variants() -> list[Variant]:
 def estimate(frame: DeviceFrame, variant: str | Variant = "ml") -> Estimate:
     """Estimate the position of a frame's camera.
 
+    A variant that uses all frames of a device (`self-calibrated`) uses this one alone; give it more by
+    `estimate_device`.
+
     Parameters
     ----------
     frame
@@ -116,6 +120,51 @@ def estimate(frame: DeviceFrame, variant: str | Variant = "ml") -> Estimate:
     """
     chosen = Registry.read().named(variant) if isinstance(variant, str) else variant
     return chosen.estimate(frame)
+
+
+def estimate_device(
+    frames: Iterable[DeviceFrame], variant: str | Variant = "self-calibrated"
+) -> list[Estimate | EstimationFailure]:
+    """Estimate the positions of the frames of one device together.
+
+    Parameters
+    ----------
+    frames
+        Frames of one device in one building, by `read_frame` or `frame`. A generator will do: one image at a time is
+        needed. Frames of several devices do not belong together: their cameras have other errors.
+    variant
+        A variant, or the name of one. A variant that uses one frame at a time estimates each by itself.
+
+    Returns
+    -------
+    list
+        For each frame, in order, its Estimate, or the EstimationFailure that says why it has no position.
+
+    Raises
+    ------
+    InputError
+        There is no variant of that name, or `frames` are of several devices.
+    """
+    chosen = Registry.read().named(variant) if isinstance(variant, str) else variant
+    method = chosen.of_device
+    results: dict[int, Estimate | EstimationFailure] = {}
+    observed: dict[int, object] = {}
+    numbers: set[int] = set()
+    for index, one in enumerate(frames):
+        numbers.add(one.device)
+        try:
+            if method is None:
+                results[index] = chosen.estimate(one)
+            else:
+                observed[index] = method.observe(one)
+        except EstimationFailure as failure:
+            results[index] = failure
+    if len(numbers) > 1:
+        of_devices = ", ".join(map(str, sorted(numbers)))
+        raise InputError(f"frames: of the devices {of_devices}; needed the frames of one device")
+    if method is not None and observed:
+        results.update(zip(observed, method.solve(list(observed.values())), strict=True))
+    return [results[index] for index in sorted(results)]
 
 
 def _load(point: EntryPoint) -> Variant:

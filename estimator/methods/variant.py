@@ -1,11 +1,13 @@
 """Interface of a variant: a function from a frame to an estimate, under a name."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame
 
 Floats = NDArray[np.float64]
@@ -26,9 +28,39 @@ class Estimate:
 
 
 @dataclass(frozen=True)
+class DeviceMethod:
+    """Method over all frames of one device, in two steps, so that one image at a time is in memory.
+
+    `observe` reduces a frame to what `solve` needs of it. Its result holds no image and can be pickled: worker
+    processes observe frames and solve devices. `solve` takes the results of one device's frames, in the order of the
+    frames, and returns an Estimate, or an EstimationFailure, for each. A frame for which `observe` raises
+    EstimationFailure has failed, and `solve` does not get it.
+    """
+
+    observe: Callable[[DeviceFrame], Any]
+    solve: Callable[[Sequence[Any]], Sequence[Estimate | EstimationFailure]]
+
+    def alone(self, frame: DeviceFrame) -> Estimate:
+        """Estimate of a frame by itself, as if the device had taken no other; raises EstimationFailure."""
+        (result,) = self.solve([self.observe(frame)])
+        if isinstance(result, EstimationFailure):
+            raise result
+        return result
+
+
+@dataclass(frozen=True)
 class Variant:
-    """A positioning method under a name, with a summary of one line; `estimate` raises EstimationFailure."""
+    """A positioning method under a name, with a summary of one line; `estimate` raises EstimationFailure.
+
+    A variant that uses all frames of a device has them by `of_device`; its `estimate` uses the one frame alone.
+    """
 
     name: str
     summary: str
     estimate: Callable[[DeviceFrame], Estimate]
+    of_device: DeviceMethod | None = None
+
+    @classmethod
+    def over_device(cls, name: str, summary: str, method: DeviceMethod) -> "Variant":
+        """The variant of a method over all frames of a device."""
+        return cls(name, summary, method.alone, method)

@@ -34,6 +34,11 @@ class Decades:
         rows = [row for variant in variants for row in variant.rows]
         errors_m = [row.error_3d_m for row in rows if row.error_3d_m is not None]
         shown_m = [max(size_m, MIN_SHOWN_M) for size_m in errors_m + [b for _, b in frames_with_bound(variants)]]
+        return cls.around(shown_m)
+
+    @classmethod
+    def around(cls, shown_m: Sequence[float]) -> "Decades":
+        """Axis that contains some lengths, all positive."""
         low = math.floor(math.log10(min(shown_m, default=1e-3)))
         return cls(low, max(math.ceil(math.log10(max(shown_m, default=1.0))), low + 1))
 
@@ -123,3 +128,47 @@ def distribution_plot(variants: Sequence[VariantScore]) -> str:
         parts.append(f'<path class="curve v{index}" d="M{LEFT} {bottom}{"".join(steps)}H{WIDTH - RIGHT}"/>')
         parts.append(mark(WIDTH - RIGHT, y(len(errors_m) / max(variant.frames, 1)), 3.5, index))
     return picture(WIDTH, bottom + BOTTOM, "distribution of the 3D errors over all frames", parts)
+
+
+def device_plot(variants: Sequence[VariantScore], nees: bool) -> str:
+    """SVG of the RMSE of each device on a logarithmic axis, or of its mean NEES; devices are grouped by map.
+
+    The line of NEES is 3, the mean of a consistent covariance.
+    """
+    devices = [(one.device, one.map) for one in variants[0].by_device] if variants else []
+    devices.sort(key=lambda one: (one[1], one[0]))
+    place = {device: index for index, device in enumerate(devices)}
+    found = [
+        (index, one, value)
+        for index, variant in enumerate(variants)
+        for one in variant.by_device
+        if (value := one.nees if nees else one.rmse_m) is not None
+    ]
+    decades = Decades.around([max(value, MIN_SHOWN_M) for *_, value in found] + ([3.0] if nees else []))
+    bottom = TOP + HEIGHT
+
+    def x(device: float) -> float:
+        return LEFT + INNER * (device + 0.5) / max(len(devices), 1)
+
+    def y(value: float) -> float:
+        return TOP + HEIGHT * (1 - decades.share(value))
+
+    parts = []
+    for decade in decades.labelled_m():
+        parts.append(line(LEFT, y(decade), WIDTH - RIGHT, y(decade), "rule"))
+        parts.append(text(LEFT - 8, y(decade) + 4, f"{decade:g}" if nees else length_text(decade), "end"))
+    if nees:
+        parts.append(line(LEFT, y(3.0), WIDTH - RIGHT, y(3.0), "bound"))
+    step = max(1, math.ceil(len(devices) / (2 * MAX_LABELS)))
+    parts += [text(x(place[one]), bottom + 16, str(one[0]), "middle") for one in devices[::step]]
+    for before, after in itertools.pairwise(devices):
+        if before[1] != after[1]:
+            edge = x(place[after] - 0.5)
+            parts.append(line(edge, TOP, edge, bottom, "rule"))
+    parts.append(text(LEFT + INNER / 2, bottom + 34, "device, grouped by map", "middle"))
+    for index, one, value in found:
+        shown = f"{value:.3g}" if nees else length_text(value)
+        title = f"{variants[index].variant}, device {one.device}, map {one.map}: {shown}"
+        parts.append(mark(x(place[one.device, one.map]), y(value), 3, index, title))
+    label = "mean NEES of each device" if nees else "RMSE of each device"
+    return picture(WIDTH, bottom + BOTTOM, label, parts)

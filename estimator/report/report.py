@@ -11,21 +11,31 @@ from pathlib import Path
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from estimator.errors import InputError
 from estimator.evaluate.comparison import best, compare
+from estimator.evaluate.levels import levels_of, variants_of
 from estimator.evaluate.score import Scores, VariantScore
 from estimator.evaluate.score_table import (
     ERROR_HEADERS,
     ERROR_NOTE,
+    GROUP_HEADERS,
+    GROUP_NOTE,
     LIMIT_HEADERS,
     LIMIT_NOTE,
+    LOST_HEADERS,
+    LOST_NOTE,
     PAIR_HEADERS,
     PAIR_NOTE,
     error_cells,
+    group_cells,
+    has_groups,
     limit_cells,
+    lost_cells,
     pair_cells,
 )
-from estimator.report.figures import distribution_plot, error_plot, frames_with_bound
+from estimator.report.figures import device_plot, distribution_plot, error_plot, frames_with_bound
 from estimator.report.floor_plan import estimates_outside, floor_plan
+from estimator.report.levels import level_plot
 from estimator.report.svg import key, style_of_variants
 
 # Previews are for an impression; a page of thousands of them would not open.
@@ -80,6 +90,8 @@ class Section:
     variants: Sequence[VariantScore]
     scores: Table
     limits: Table | None
+    groups: Table | None
+    lost: Table | None
     pairs: Table | None
     best: str
     failures: Sequence[tuple[int, str, int]]
@@ -87,6 +99,8 @@ class Section:
     bounded: int
     error_plot: Markup
     distribution_plot: Markup
+    device_plots: Sequence[Markup]
+    """RMSE and NEES by device; empty for one device."""
     plans: Sequence[tuple[Markup, int]]
     """Floor plan of each variant, and its number of estimates outside the walls."""
     previews: Sequence[Preview]
@@ -98,9 +112,11 @@ def page(datasets: Sequence[tuple[Path, Scores]]) -> str:
 
     Raises OSError if a preview cannot be read.
     """
-    max_variants = max((len(scores.variants) for _, scores in datasets), default=0)
+    plot, of_levels = _levels(datasets)
+    max_variants = max([of_levels, *(len(scores.variants) for _, scores in datasets)])
     return TEMPLATES.get_template("report.html").render(
         sections=[_section(folder, scores) for folder, scores in datasets],
+        level_plot=Markup(plot),
         variant_style=Markup(style_of_variants(max_variants)),
         max_large_plans=MAX_LARGE_PLANS,
     )
@@ -119,12 +135,15 @@ def _section(folder: Path, scores: Scores) -> Section:
         variants=variants,
         scores=_table(ERROR_HEADERS, [(index, error_cells(v)) for index, v in enumerate(variants)], ERROR_NOTE),
         limits=_limit_table(variants),
+        groups=_group_table(variants),
+        lost=_lost_table(variants),
         pairs=_pair_table(variants),
         best=best(variants).variant if variants else "",
         failures=[(i, reason, count) for i, v in enumerate(variants) for reason, count in v.failures.items()],
         bounded=len(frames_with_bound(variants)),
         error_plot=Markup(error_plot(variants)),
         distribution_plot=Markup(distribution_plot(variants)),
+        device_plots=[Markup(device_plot(variants, nees)) for nees in (False, True) if any(map(has_groups, variants))],
         plans=[
             (Markup(floor_plan(scores.room_m, leds_m, v, index)), estimates_outside(scores.room_m, v))
             for index, v in enumerate(variants)
@@ -139,6 +158,29 @@ def _limit_table(variants: Sequence[VariantScore]) -> Table | None:
     if not any(variant.against_bound or variant.nees or variant.ambiguous for variant in variants):
         return None
     return _table(LIMIT_HEADERS, [(index, limit_cells(variant)) for index, variant in enumerate(variants)], LIMIT_NOTE)
+
+
+def _group_table(variants: Sequence[VariantScore]) -> Table | None:
+    """Table by device and map; None for one device."""
+    if not any(map(has_groups, variants)):
+        return None
+    return _table(GROUP_HEADERS, [(index, group_cells(variant)) for index, variant in enumerate(variants)], GROUP_NOTE)
+
+
+def _lost_table(variants: Sequence[VariantScore]) -> Table | None:
+    """Table of failed frames by good LEDs; None if no frame failed."""
+    if not any(variant.failed for variant in variants):
+        return None
+    return _table(LOST_HEADERS, [(index, lost_cells(variant)) for index, variant in enumerate(variants)], LOST_NOTE)
+
+
+def _levels(datasets: Sequence[tuple[Path, Scores]]) -> tuple[str, int]:
+    """Plot of the levels, and its number of variants; empty unless there are several datasets and all have a bound."""
+    try:
+        levels = levels_of(datasets)
+    except InputError:
+        return "", 0
+    return (level_plot(levels), len(variants_of(levels))) if len(levels) > 1 else ("", 0)
 
 
 def _pair_table(variants: tuple[VariantScore, ...]) -> Table | None:

@@ -95,7 +95,7 @@ class Uncertainty:
         offset = self.leds_m - pose.position_m
         lifted = self.lift_m2 * offset[:, 2] / (offset**2).sum(axis=1)
         of_map = by_led @ self.levers + by_led[:, :, 2:] * (lifted[:, None] * self.sizes)[:, None, :]
-        of_camera = _intrinsic_slopes_px(p_cam, image, self.camera)[:, :, self.intrinsics]
+        of_camera = intrinsic_slopes_px(p_cam, image, self.camera)[:, :, self.intrinsics]
         return np.concatenate([of_camera, of_map], axis=2)
 
     def covariance_px2(self, pose: Pose) -> Floats:
@@ -247,7 +247,7 @@ def _add_leds(of_map: _MapParameters, leds: Sequence[Led]) -> None:
     of_map.add_sizes(ids, np.array([led.size_sigma_m or 0.0 for led in leds]), 2 / half_width_m)
 
 
-def _intrinsic_slopes_px(p_cam: Floats, image: Floats, camera: Camera) -> Floats:
+def intrinsic_slopes_px(p_cam: Floats, image: Floats, camera: Camera) -> Floats:
     """Derivatives (n, 2, 7) of the pixels of points by the errors of INTRINSICS.
 
     `p_cam` (n, 3) are the points in camera axes, `image` (n, 2) their normalized image coordinates. An equidistant lens

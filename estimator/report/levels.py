@@ -1,0 +1,80 @@
+"""Plot of levels: every variant's RMSE against the bound of each of several datasets, as SVG."""
+
+from collections.abc import Sequence
+from html import escape
+
+from estimator.evaluate.levels import Level, variants_of
+from estimator.evaluate.score_table import length_text
+from estimator.report.figures import Decades
+from estimator.report.svg import line, mark, picture, style_of_variants, text
+
+WIDTH, HEIGHT = 560, 420
+LEFT, TOP, BOTTOM = 72, 44, 44
+LEGEND = 250
+LINE = 18
+STYLE = """svg { background: #fff; font: 12px system-ui, sans-serif; }
+svg text { fill: #444; }
+svg path { fill: none; stroke-width: 1.6; }
+svg .rule { stroke: #dde2e6; }
+svg .bound { stroke: #1c2024; stroke-width: 2; }
+svg .mark { stroke: none !important; }"""
+
+
+def level_plot(levels: Sequence[Level]) -> str:
+    """SVG element: bound across and RMSE up, both logarithmic; the diagonal is the bound itself.
+
+    A mark with failed frames has their number beside it: its RMSE leaves them out.
+    """
+    variants = variants_of(levels)
+    sizes_m = [level.bound_rms_m for level in levels]
+    sizes_m += [size for level in levels for one in variants if (size := level.rmse_m(one)) is not None and size > 0]
+    up = Decades.around(sizes_m)
+    across = Decades.around([level.bound_rms_m for level in levels])
+    height = max(HEIGHT, LINE * len(variants))
+
+    def x(size_m: float) -> float:
+        return LEFT + WIDTH * across.share(size_m)
+
+    def y(size_m: float) -> float:
+        return TOP + height * (1 - up.share(size_m))
+
+    parts = []
+    for decade_m in up.labelled_m():
+        parts.append(line(LEFT, y(decade_m), LEFT + WIDTH, y(decade_m), "rule"))
+        parts.append(text(LEFT - 8, y(decade_m) + 4, length_text(decade_m), "end"))
+    for decade_m in across.labelled_m():
+        parts.append(line(x(decade_m), TOP, x(decade_m), TOP + height, "rule"))
+        parts.append(text(x(decade_m), TOP + height + 16, length_text(decade_m), "middle"))
+    for rank, level in enumerate(levels):
+        parts.append(line(x(level.bound_rms_m), TOP, x(level.bound_rms_m), TOP + height, "rule"))
+        parts.append(text(x(level.bound_rms_m), TOP - 8 - 14 * (rank % 2), level.name, "middle"))
+    parts.append(text(LEFT + WIDTH / 2, TOP + height + 34, "bound of the dataset", "middle"))
+    parts.append(text(LEFT - 8, TOP - 12, "RMSE", "end"))
+    first, last = 10.0 ** max(up.low, across.low), 10.0 ** min(up.high, across.high)
+    if last > first:
+        parts.append(line(x(first), y(first), x(last), y(last), "bound"))
+    for index, variant in enumerate(variants):
+        places = [(level, size) for level in levels if (size := level.rmse_m(variant)) is not None]
+        if len(places) > 1:
+            steps = "L".join(f"{x(level.bound_rms_m):.1f} {y(size):.1f}" for level, size in places)
+            parts.append(f'<path class="curve v{index}" d="M{steps}"/>')
+        for level, size in places:
+            of_variant = level.variants[variant]
+            lost = f", {of_variant.failed} of {of_variant.frames} frames failed" if of_variant.failed else ""
+            title = f"{variant}, {level.name}: {length_text(size)}{lost}"
+            parts.append(mark(x(level.bound_rms_m), y(size), 4, index, title))
+            if of_variant.failed:
+                parts.append(text(x(level.bound_rms_m) + 8, y(size) - 4, f"{of_variant.failed} failed", "start"))
+        parts.append(mark(LEFT + WIDTH + 40, TOP + LINE * (index + 0.5), 4, index))
+        parts.append(text(LEFT + WIDTH + 52, TOP + LINE * (index + 0.5) + 4, variant, "start"))
+    return picture(LEFT + WIDTH + LEGEND, TOP + height + BOTTOM, "RMSE of each variant by the datasets' bounds", parts)
+
+
+def level_picture(levels: Sequence[Level]) -> str:
+    """The plot as a file of its own, with its styles."""
+    style = f"{STYLE}\n{style_of_variants(len(variants_of(levels)))}"
+    element = level_plot(levels)
+    head, body = element.split(">", 1)
+    size = head.split('viewBox="0 0 ')[1].split('"')[0].split()
+    root = f'{head} xmlns="http://www.w3.org/2000/svg" width="{size[0]}" height="{size[1]}"'
+    return f"{root}>\n<style>{escape(style, quote=False)}</style>{body}\n"
