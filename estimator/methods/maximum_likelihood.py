@@ -11,7 +11,7 @@ direction, mechanical vignetting (natural vignetting is modelled), and motion. L
 excluded by their goodness of fit.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,7 @@ from estimator.io.device import DeviceFrame
 from estimator.methods.gravity_fit import agreement, ambiguous
 from estimator.methods.up2p import upright_pose
 from estimator.methods.variant import Estimate, Variant
-from estimator.pixels.led_pixels import EDGE_PX, LedPixels, gather_led_pixels
+from estimator.pixels.led_pixels import EDGE_PX, LedPixels, gather_led_pixels, leds_in_view
 from estimator.pixels.likelihood import Noise, PhotometricFit, excess_chi2, fit_photometry, score
 from estimator.solvers.reprojection import fit, observe
 from estimator.spots.correspondences import find_correspondences
@@ -94,7 +94,7 @@ def maximize(frame: DeviceFrame, gravity: "Gravity", start: Pose, covariance: Fl
     pose, excluded = start, set[int]()
     ids_before: set[int] = set()
     for _ in range(MAX_STEPS):
-        pixels = gather_led_pixels(frame, pose, covariance)
+        pixels = gather_led_pixels(frame, leds_in_view(frame, pose, covariance))
         ids = {led.id for led in pixels.leds}
         used = np.array([led.id not in excluded for led in pixels.leds])
         result = _fisher_scoring(frame, pixels, gravity, used, pose)
@@ -166,21 +166,25 @@ def _fisher_scoring(frame: DeviceFrame, pixels: LedPixels, gravity: Gravity, use
     """Fisher scoring with the LEDs used, (n,), to convergence or until the images leave the gathered pixels."""
     camera = frame.camera
     centres_m = np.array([led.position_m for led in pixels.leds])
-    origin_px = project(centres_m, pixels.pose, camera).pixels
+    origin_px = project(centres_m, pixels.state.pose, camera).pixels
     noise = Noise.of(frame)
     photometry: PhotometricFit | None = None
     pose, step, accepted, min_deviance = start, np.zeros(POSE_PARAMETERS), start, np.inf
     for _ in range(MAX_STEPS):
-        rendered = pixels.rendered if pose is pixels.pose else pixels.model.render(pose)
+        rendered = (
+            pixels.rendered
+            if pose is pixels.state.pose
+            else pixels.model.render(replace(pixels.state, pose=pose))
+        )
         angles = pose.rig_angles(camera)
         candidate = fit_photometry(pixels, rendered, used, noise, photometry)
-        deviance = candidate.deviance + gravity.deviance(angles) / len(pixels.cells)
+        deviance = candidate.deviance + gravity.deviance(angles) / len(pixels.electrons)
         if deviance > MAX_DEVIANCE_RATIO * min_deviance:  # the step was too long for the linearization
             step = step / 4
             pose = accepted.moved(step, camera)
             continue
         photometry, accepted, min_deviance = candidate, pose, deviance
-        information, gradient = score(pixels, rendered, photometry)
+        information, gradient = (of_leds.sum(axis=0) for of_leds in score(pixels, rendered, photometry))
         information, gradient = information + gravity.information(), gradient + gravity.gradient(angles)
         before, step = step, _solved(information, gradient)
         if step @ information @ before < -MAX_RETURN * (before @ information @ before):
