@@ -11,6 +11,7 @@ direction, mechanical vignetting (natural vignetting is modelled), and motion. L
 excluded by their goodness of fit.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,9 +25,10 @@ from estimator.io.device import DeviceFrame
 from estimator.methods.gravity_fit import agreement, ambiguous
 from estimator.methods.up2p import upright_pose
 from estimator.methods.variant import Estimate, Variant
+from estimator.pixels.led_model import rim
 from estimator.pixels.led_pixels import EDGE_PX, LedPixels, gather_led_pixels, leds_in_view
 from estimator.pixels.likelihood import Noise, PhotometricFit, excess_chi2, fit_photometry, score
-from estimator.solvers.reprojection import fit, observe
+from estimator.solvers.reprojection import Observations, fit, observe
 from estimator.spots.correspondences import find_correspondences
 
 Floats = NDArray[np.float64]
@@ -36,6 +38,8 @@ Mask = NDArray[np.bool_]
 MAX_STEPS = 40
 # Fisher scoring has converged at a step of a tenth of a standard deviation, squared: the next is far shorter.
 CONVERGED_STEP2 = 1e-2
+# Points of a rim whose movement is looked at.
+RIM_POINTS = 4
 # Largest movement of an LED's image in one step: the linearization at edges holds within it.
 MAX_STEP_PX = 1.0
 # A step that multiplies the mean deviance by more was too long. Smaller increases occur when readings near saturation
@@ -48,8 +52,9 @@ MAX_RETURN = 0.5
 MIN_SIGNAL_TO_NOISE = 5.0
 # Among LEDs that are not explained, those with at least this share of the largest excess are excluded together.
 MIN_EXCLUDED_SHARE = 0.25
-# Accuracy of centroids, with the model error: determines which LEDs' images are certain at the start.
+# Accuracy of centroids, with the model error, and its share of an LED image's half width: determines which LEDs' images are certain at the start.
 START_SIGMA_PX = 0.05
+START_SIGMA_SHARE = 2e-3
 MIN_FOR_CONSENSUS = 3
 DIVERGED = "the likelihood has no maximum near the pose of the spots"
 # Standard deviation of the position above which the pixels do not determine it.
@@ -71,7 +76,8 @@ def ml(frame: DeviceFrame) -> Estimate:
     The initial pose is that of `gravity_fit`, which also decides whether the estimate is ambiguous and whether gravity
     is used. With two spots the initial pose is the fit to them and gravity.
     """
-    observations = observe(frame, find_correspondences(frame))
+    correspondences = find_correspondences(frame)
+    observations = observe(frame, correspondences)
     inliers, use_gravity, is_ambiguous = np.ones(len(observations.leds_m), dtype=bool), True, False
     if len(observations.leds_m) < MIN_FOR_CONSENSUS:
         upright = upright_pose(observations)
@@ -84,18 +90,35 @@ def ml(frame: DeviceFrame) -> Estimate:
         use_gravity, is_ambiguous = agreed.gravity, ambiguous(agreed)
     gravity = Gravity.of(frame) if use_gravity else NO_GRAVITY
     slopes = project(observations.leds_m[inliers], start, frame.camera).slopes.reshape(-1, POSE_PARAMETERS)
-    information = slopes.T @ slopes / START_SIGMA_PX**2 + gravity.information()
-    found = maximize(frame, gravity, start, _covariance(information))
+    slopes /= np.repeat(_start_sigma_px(observations, inliers, start), 2)[:, None]
+    information = slopes.T @ slopes + gravity.information()
+    located = {led.id for led in frame.leds.values() if led.position_m in set(map(tuple, observations.leds_m[inliers]))}
+    found = maximize(frame, gravity, start, _covariance(information), located)
     return Estimate(found.pose.position_m, covariance_m2=found.covariance[:3, :3], ambiguous=is_ambiguous)
 
 
-def maximize(frame: DeviceFrame, gravity: "Gravity", start: Pose, covariance: Floats) -> Maximum:
-    """Maximum of the likelihood from an initial pose with a covariance (6, 6). Raises EstimationFailure."""
+def _start_sigma_px(observations: Observations, inliers: Mask, start: Pose) -> Floats:
+    """Accuracy (n,) of the inliers' centroids with the model error, which grows with an LED image."""
+    depth_m = start.in_camera(observations.leds_m[inliers])[:, 2]
+    # lift_m2 is 4 s^2, r^2 for a disc.
+    radius_px = np.sqrt(observations.lift_m2[inliers]) / np.abs(depth_m) / observations.camera.pixel_angle_rad
+    return np.asarray(np.hypot(START_SIGMA_PX, START_SIGMA_SHARE * radius_px))
+
+
+def maximize(
+    frame: DeviceFrame, gravity: "Gravity", start: Pose, covariance: Floats, located: Collection[int] = frozenset()
+) -> Maximum:
+    """Maximum of the likelihood from an initial pose with a covariance (6, 6). Raises EstimationFailure.
+
+    `located` are the ids of LEDs whose images the initial pose predicts, whatever its covariance.
+    """
     pose, excluded = start, set[int]()
     ids_before: set[int] = set()
+    found = set(located)
     for _ in range(MAX_STEPS):
-        pixels = gather_led_pixels(frame, leds_in_view(frame, pose, covariance))
+        pixels = gather_led_pixels(frame, leds_in_view(frame, pose, covariance, found))
         ids = {led.id for led in pixels.leds}
+        found |= ids
         used = np.array([led.id not in excluded for led in pixels.leds])
         result = _fisher_scoring(frame, pixels, gravity, used, pose)
         while result.converged and (unexplained := _unexplained(result)).any():
@@ -165,8 +188,9 @@ class _ScoringResult:
 def _fisher_scoring(frame: DeviceFrame, pixels: LedPixels, gravity: Gravity, used: Mask, start: Pose) -> _ScoringResult:
     """Fisher scoring with the LEDs used, (n,), to convergence or until the images leave the gathered pixels."""
     camera = frame.camera
-    centres_m = np.array([led.position_m for led in pixels.leds])
-    origin_px = project(centres_m, pixels.state.pose, camera).pixels
+    # Of a large LED, a point of the rim moves more than the centre.
+    rims_m = np.concatenate([rim(led, RIM_POINTS) + np.array(led.position_m) for led in pixels.leds])
+    origin_px = project(rims_m, pixels.state.pose, camera).pixels
     noise = Noise.of(frame)
     photometry: PhotometricFit | None = None
     pose, step, accepted, min_deviance = start, np.zeros(POSE_PARAMETERS), start, np.inf
@@ -189,11 +213,11 @@ def _fisher_scoring(frame: DeviceFrame, pixels: LedPixels, gravity: Gravity, use
         before, step = step, _solved(information, gradient)
         if step @ information @ before < -MAX_RETURN * (before @ information @ before):
             step = step / 2
-        centres = project(centres_m, pose, camera)
-        step *= min(1.0, MAX_STEP_PX / max(float(np.linalg.norm(centres.slopes @ step, axis=1).max()), 1e-12))
+        rims = project(rims_m, pose, camera)
+        step *= min(1.0, MAX_STEP_PX / max(float(np.linalg.norm(rims.slopes @ step, axis=1).max()), 1e-12))
         converged = float(step @ information @ step) < CONVERGED_STEP2
         pose = pose.moved(step, camera)
-        moved_px = np.linalg.norm(centres.pixels + centres.slopes @ step - origin_px, axis=1)
+        moved_px = np.linalg.norm(rims.pixels + rims.slopes @ step - origin_px, axis=1)
         if converged or not bool((moved_px < EDGE_PX - 1).all()):
             break
     else:

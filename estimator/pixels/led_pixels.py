@@ -5,6 +5,7 @@ those of the background around it, need not be read one by one: each block of th
 exact, a sum over its pixels.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import cv2
@@ -25,8 +26,11 @@ Mask = NDArray[np.bool_]
 
 # An image may move by nearly this much before its pixels have to be sorted into edge, inside and background again.
 EDGE_PX = 2
-# Width of the background ring around the edge: the background is quadratic over it.
-RING_PX = 8
+# The background of the edge pixels is that of pixels up to NEAR_PX beyond them. Further off it may be another surface: a
+# frame around the luminaire, the panel that LEDs are mounted on, the ceiling beyond it.
+NEAR_PX = 1
+# Width of the background ring around the edge.
+RING_PX = 0
 # Blocks of the uniform pixels of a face along each axis, and sectors of the ring, each summed for a reading: the light
 # changes little over a block.
 BLOCKS = 6
@@ -53,8 +57,9 @@ class LedPixels:
     there. `edges` (e,) are the readings that are edge pixels, `cells` (e,) their cells in `model.rois`. `pixel_counts`
     (m,) is the number of pixels of a reading, `electrons` (m,) their sum.
 
-    With the coordinates (a, b) of a pixel on the face, in half widths from its centre: `background` (m, 4) is the
-    lens's fall-off times 1, a, b and a^2 + b^2, `face` (m, 3) the mean of a, b and a^2 + b^2 - 1/2 over the LED's light.
+    With the coordinates (a, b) of a pixel on the face, in half widths from its centre: `background` (m, 5) is the
+    lens's fall-off times 1, a, b, a^2 + b^2, and 1 for pixels far from the face; `face` (m, 3) is the mean of a, b and
+    a^2 + b^2 - 1/2 over the LED's light.
     `uniform_light` (m,) is the light inside the LED image summed over the pixels of a reading, 0 for edge pixels, whose
     light depends on the state. `more` says whether other LEDs of the map may be in view, whose images the state does
     not determine well enough.
@@ -148,14 +153,14 @@ def gather_led_pixels(frame: DeviceFrame, view: LedsInView) -> LedPixels:
         (au, av), (bu, bv) = footprints.to_face[k].tolist()
         u, v = footprints.centre[k].tolist()
         du, dv = columns + 0.5 - u, rows + 0.5 - v
-        position = _FacePixels(au * du + av * dv, bu * du + bv * dv, fall_offs[k], shares[k] > 0.5)
+        position = _FacePixels(au * du + av * dv, bu * du + bv * dv, fall_offs[k], shares[k] > 0.5, masks[k].far)
         for of_colour in _colours(frame, rows, columns):
             row, column = np.nonzero(known & of_colour & masks[k].edge)
             if len(row) == 0:
                 continue
             cells = rois.cell(np.full(len(row), k), row + rois.rows[k], column + rois.columns[k])
             row_u, column_u = np.nonzero(known & of_colour & ~masks[k].edge)
-            groups.append(_group(position, electrons, masks[k].far, cells, (row, column), (row_u, column_u)))
+            groups.append(_group(position, electrons, cells, (row, column), (row_u, column_u)))
             led_of_group.append(k)
     if not groups:
         raise EstimationFailure("fit", "no pixel of the LEDs in view is usable: all are saturated or overlap others")
@@ -186,39 +191,42 @@ def gather_led_pixels(frame: DeviceFrame, view: LedsInView) -> LedPixels:
 
 @dataclass(frozen=True, eq=False)
 class _FacePixels:
-    """A region's pixels, (rows, columns): coordinates `a`, `b` on the face, the lens's fall-off, and whether inside."""
+    """A region's pixels, (rows, columns): coordinates `a`, `b` on the face, the lens's fall-off, and whether a
+    pixel is inside, or far (see `_Masks`).
+    """
 
     a: Floats
     b: Floats
     fall_off: Floats
     inside: Mask
+    far: Mask
 
 
 def _group(
-    pixels: _FacePixels, electrons: Floats, far: Mask, cells: Ints, edge: tuple[Ints, Ints], uniform: tuple[Ints, Ints]
+    pixels: _FacePixels, electrons: Floats, cells: Ints, edge: tuple[Ints, Ints], uniform: tuple[Ints, Ints]
 ) -> _Readings:
     """Readings of the edge pixels and of blocks of the uniform pixels, both given by (row, column)."""
     a, b, fall_off = pixels.a[edge], pixels.b[edge], pixels.fall_off[edge]
     r2 = a * a + b * b
-    background = np.stack([fall_off, fall_off * a, fall_off * b, fall_off * r2], axis=1)
+    background = np.stack([fall_off * basis for basis in (np.ones(len(a)), a, b, r2, pixels.far[edge])], axis=1)
     face = np.stack([a, b, r2 - 0.5], axis=1)
     count = np.ones(len(a))
     light = np.zeros(len(a))
-    a, b, fall_off, inside = (values[uniform] for values in (pixels.a, pixels.b, pixels.fall_off, pixels.inside))
+    a, b, fall_off, inside, far = (values[uniform] for values in vars(pixels).values())
     r2 = a * a + b * b
-    # Blocks: the face in BLOCKS x BLOCKS, the ring in sectors, near to the face and far from it.
+    # Blocks: the face in BLOCKS x BLOCKS, the ring in sectors.
     tile = np.clip(np.floor((a + 1) * BLOCKS / 2), 0, BLOCKS - 1) * BLOCKS
     tile += np.clip(np.floor((b + 1) * BLOCKS / 2), 0, BLOCKS - 1)
-    sector = np.floor((np.arctan2(b, a) / np.pi + 1) / 2 * SECTORS) % SECTORS + SECTORS * far[uniform]
+    sector = np.floor((np.arctan2(b, a) / np.pi + 1) / 2 * SECTORS) % SECTORS
     _, block = np.unique(np.where(inside, tile, BLOCKS**2 + sector), return_inverse=True)
     blocks = int(block.max()) + 1 if len(block) else 0
 
     def summed(values: Floats) -> Floats:
         return np.asarray(np.bincount(block, values, blocks), dtype=np.float64)
 
-    sums = [summed(fall_off * basis) for basis in (np.ones(len(a)), a, b, r2)]
+    sums = [summed(fall_off * basis) for basis in (np.ones(len(a)), a, b, r2, far)]
     lit = summed(inside.astype(float)) > 0
-    mean = [np.divide(one, sums[0], out=np.zeros(blocks), where=lit & (sums[0] > 0)) for one in sums[1:]]
+    mean = [np.divide(one, sums[0], out=np.zeros(blocks), where=lit & (sums[0] > 0)) for one in sums[1:4]]
     return _Readings(
         cells=cells,
         pixel_counts=np.concatenate([count, summed(np.ones(len(a)))]),
@@ -229,10 +237,13 @@ def _group(
     )
 
 
-def leds_in_view(frame: DeviceFrame, pose: Pose, covariance: Floats) -> LedsInView:
+def leds_in_view(
+    frame: DeviceFrame, pose: Pose, covariance: Floats, found: Collection[int] = frozenset()
+) -> LedsInView:
     """LEDs of the map that are in view from a pose with a covariance (6, 6) of its parameters.
 
-    Left out are LEDs whose image is not determined to MAX_IMAGE_SIGMA_PX. Raises EstimationFailure if none is left.
+    Left out are LEDs whose image is not determined to MAX_IMAGE_SIGMA_PX, but for those `found` before, by id. Raises
+    EstimationFailure if none is left.
     """
     low, high = _read_out(frame)
     leds = tuple(frame.leds.values())
@@ -252,6 +263,7 @@ def leds_in_view(frame: DeviceFrame, pose: Pose, covariance: Floats) -> LedsInVi
     with np.errstate(invalid="ignore"):
         in_view = footprints.whole & (footprints.high > low).all(axis=1) & (footprints.low < high).all(axis=1)
         certain = ((slopes @ covariance) * slopes).sum(axis=(1, 2)) < MAX_IMAGE_SIGMA_PX**2
+    certain |= np.array([led.id in found for led in near_leds])
     if not in_view.any():
         raise EstimationFailure("fit", "no LED of the map is in view from the pose of the spots")
     if not (in_view & certain).any():
@@ -282,7 +294,7 @@ def _rois(frame: DeviceFrame, footprints: LedFootprints, margin_px: int) -> RoiS
 @dataclass(frozen=True, eq=False)
 class _Masks:
     """Pixels of a region: `edge` may be partly lit by the LED while its image moves by EDGE_PX, `lit` may be lit at
-    all, `far` are further from the face than half of the ring.
+    all, `far` are more than NEAR_PX beyond the pixels that it lights.
     """
 
     edge: Mask
@@ -296,7 +308,7 @@ def _edge_and_lit(share: Floats) -> _Masks:
     partly_lit = lit & (share < 1 - UNIFORM_TOLERANCE)
     edge, near_lit, near = (
         cv2.dilate(mask.astype(np.uint8), np.ones((2 * px + 1, 2 * px + 1), dtype=np.uint8)).astype(bool)
-        for mask, px in ((partly_lit, EDGE_PX), (lit, EDGE_PX), (lit, EDGE_PX + RING_PX // 2))
+        for mask, px in ((partly_lit, EDGE_PX), (lit, EDGE_PX), (lit, NEAR_PX))
     )
     return _Masks(edge, near_lit, ~near)
 

@@ -31,12 +31,12 @@ SATURATION_MARGIN_SIGMA = 5.0
 # Lower limit of a variance, electrons squared: keeps weights finite.
 MIN_VARIANCE_E2 = 1e-3
 # Background coefficients and amplitude of a group.
-COEFFICIENTS = 5
+COEFFICIENTS = 6
 # Relative determinant below which readings do not determine amplitude and background; they are then not used.
 MIN_DETERMINANT = 1e-9
-# Standard deviations a priori of the background's slopes by a and b, and of its curvature, per half width: relative to
+# Standard deviations a priori of the background's slopes by a and b, its curvature, and its step far from the face: relative to
 # the background's level plus HALO_SHARE of the amplitude.
-BACKGROUND_SIGMAS = (1.0, 1.0, 0.3)
+BACKGROUND_SIGMAS = (1.0, 1.0, 0.3, 1.0)
 HALO_SHARE = 0.05
 # Limit of an LED's chi-square: its degrees of freedom, its own scatter in standard deviations, and a model error of the
 # edge, at most this share of the LED's light: by an inaccurate blur of the lens, or a shift of 0.05 px.
@@ -65,9 +65,9 @@ class Noise:
 class PhotometricFit:
     """Amplitudes and backgrounds of g groups given the image, and the m readings expected by them.
 
-    `basis` (m, 5) are the derivatives of the readings by a group's four background coefficients and its amplitude;
+    `basis` (m, 6) are the derivatives of the readings by a group's five background coefficients and its amplitude;
     `amplitude` and `signal_to_noise` are (g,); `expected` (m,) are electrons; `weight` (m,) is 1 / variance, 0 for
-    readings not used; `covariance` (g, 5, 5) is that of the coefficients, 0 if the readings do not determine them;
+    readings not used; `covariance` (g, 6, 6) is that of the coefficients, 0 if the readings do not determine them;
     `level` (g,) is the scale of the background's prior; `deviance` is the mean over the readings of twice the log
     likelihood ratio of a saturated model, expected to be near 1.
     """
@@ -115,7 +115,8 @@ def fit_photometry(
         determined = determinant > MIN_DETERMINANT * normal[:, 0, 0] * normal[:, -1, -1]
         prior = np.maximum(np.outer(level, BACKGROUND_SIGMAS), MIN_VARIANCE_E2) ** -2.0
         total = normal.copy()
-        total[:, range(1, 4), range(1, 4)] += prior
+        slopes = range(1, COEFFICIENTS - 1)
+        total[:, slopes, slopes] += prior
         total[~determined] = np.eye(COEFFICIENTS)
         covariance = _inverse(total) * determined[:, None, None]
         coefficients = np.einsum("gij,jg->gi", covariance, sums[len(pairs) :])
