@@ -6,9 +6,15 @@ accelerometer's reading is normally distributed about the true tilts. Fisher sco
 weights are computed anew at every step, and the inverse of the information is the covariance, which is the Cramer-Rao
 bound if the model is true.
 
-Not modelled: gradients of the background across an LED, light of other sources, the dependence of an LED's luminance on
-direction, mechanical vignetting (natural vignetting is modelled), and motion. LEDs that the model does not explain are
-excluded by their goodness of fit.
+What the device states with standard deviations (intrinsics, luminaires, LEDs and their sizes and profiles, the map's
+datum) is estimated with the pose, as nuisances with priors (`estimator.pixels.nuisances`); the covariance is then the
+hybrid bound. What it does not state is taken as exact, unless the images contradict: if LED images are displaced
+against each other by more than their noise explains, or have another size or profile, these become nuisances as well.
+The standard deviation of such a nuisance is that of all LEDs of the frame: a variance component (Foerstner 1979). A
+camera that states nothing is then assumed to be one as sold. A displacement common to all images is not revealed.
+
+Not modelled: light of other sources beside a smooth background, mechanical vignetting (natural vignetting is), and
+motion. LEDs that the model does not explain are excluded by their goodness of fit.
 """
 
 from collections.abc import Collection
@@ -16,20 +22,39 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from estimator.camera.leveling import tilt_from_gravity, tilt_sigmas
 from estimator.camera.pose import POSE_PARAMETERS, Pose
 from estimator.camera.projection import project
 from estimator.errors import EstimationFailure
-from estimator.io.device import DeviceFrame
+from estimator.io.device import Camera, DeviceFrame
 from estimator.methods.gravity_fit import agreement, ambiguous
 from estimator.methods.up2p import upright_pose
 from estimator.methods.variant import Estimate, Variant
-from estimator.pixels.led_model import rim
+from estimator.pixels.led_model import (
+    IMAGE_PARAMETERS,
+    POSE_ALONE,
+    PROFILE_PARAMETERS,
+    ImageState,
+    RenderedLeds,
+    rim,
+)
 from estimator.pixels.led_pixels import EDGE_PX, LedPixels, gather_led_pixels, leds_in_view
 from estimator.pixels.likelihood import Noise, PhotometricFit, excess_chi2, fit_photometry, score
+from estimator.pixels.nuisances import (
+    LOCAL_PARAMETERS,
+    NO_GRAVITY,
+    Gravity,
+    Nuisances,
+    Priors,
+    Solution,
+    solve,
+    square_root,
+)
 from estimator.solvers.reprojection import Observations, fit, observe
 from estimator.spots.correspondences import find_correspondences
+from estimator.spots.identify import Correspondence
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -52,22 +77,41 @@ MAX_RETURN = 0.5
 MIN_SIGNAL_TO_NOISE = 5.0
 # Among LEDs that are not explained, those with at least this share of the largest excess are excluded together.
 MIN_EXCLUDED_SHARE = 0.25
-# Accuracy of centroids, with the model error, and its share of an LED image's half width: determines which LEDs' images are certain at the start.
+# Accuracy of centroids, with the model error, and its share of an LED image's half width: determines which LEDs' images
+# are certain at the start.
 START_SIGMA_PX = 0.05
 START_SIGMA_SHARE = 2e-3
 MIN_FOR_CONSENSUS = 3
 DIVERGED = "the likelihood has no maximum near the pose of the spots"
 # Standard deviation of the position above which the pixels do not determine it.
 MAX_SIGMA_M = 1.0
+# An edge is displaced by errors of the background that it does not share with the pixels beyond it: at most this many
+# pixels times the background's share of the LED's luminance, one standard deviation.
+BACKGROUND_EDGE_PX = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """Initial values: pose, nuisances of all LEDs of the map, the pose's covariance (6, 6), and which LEDs of the map
+    have an image that the initial values predict, whatever the covariance, (n,).
+    """
+
+    pose: Pose
+    nuisances: Nuisances
+    covariance: Floats
+    located: Mask
 
 
 @dataclass(frozen=True, eq=False)
 class Maximum:
-    """The most likely pose, the covariance (6, 6) of its parameters, and the ids of the LEDs used."""
+    """The most likely pose and nuisances, the covariance (6, 6) of the pose, and the ids of the LEDs used."""
 
     pose: Pose
+    nuisances: Nuisances
     covariance: Floats
     leds: tuple[int, ...]
+    last: "_ScoringResult"
+    pixels: LedPixels
 
 
 def ml(frame: DeviceFrame) -> Estimate:
@@ -83,18 +127,29 @@ def ml(frame: DeviceFrame) -> Estimate:
         upright = upright_pose(observations)
         if upright is None:
             raise EstimationFailure("position", "too few LEDs identified to fix a position")
-        start = fit(observations, upright).pose
+        pose = fit(observations, upright).pose
     else:
         agreed = agreement(observations)
-        start, inliers = agreed.best.pose, agreed.inliers
+        pose, inliers = agreed.best.pose, agreed.inliers
         use_gravity, is_ambiguous = agreed.gravity, ambiguous(agreed)
-    gravity = Gravity.of(frame) if use_gravity else NO_GRAVITY
-    slopes = project(observations.leds_m[inliers], start, frame.camera).slopes.reshape(-1, POSE_PARAMETERS)
-    slopes /= np.repeat(_start_sigma_px(observations, inliers, start), 2)[:, None]
-    information = slopes.T @ slopes + gravity.information()
-    located = {led.id for led in frame.leds.values() if led.position_m in set(map(tuple, observations.leds_m[inliers]))}
-    found = maximize(frame, gravity, start, _covariance(information), located)
+    gravity = gravity_of(frame) if use_gravity else NO_GRAVITY
+    priors = Priors.of(frame, tuple(frame.leds.values()))
+    slopes = project(observations.leds_m[inliers], pose, frame.camera).slopes.reshape(-1, POSE_PARAMETERS)
+    slopes /= np.repeat(_start_sigma_px(observations, inliers, pose), 2)[:, None]
+    tilts = np.zeros((2, POSE_PARAMETERS))
+    tilts[:, 3:5] = np.diag(1 / gravity.sigma)
+    covariance = np.linalg.inv(slopes.T @ slopes + tilts.T @ tilts)
+    used = set(map(tuple, observations.leds_m[inliers].tolist()))
+    located = np.array([led.position_m in used for led in frame.leds.values()])
+    found = maximize(frame, gravity, priors, Start(pose, Nuisances.zero(priors), covariance, located))
     return Estimate(found.pose.position_m, covariance_m2=found.covariance[:3, :3], ambiguous=is_ambiguous)
+
+
+def gravity_of(frame: DeviceFrame) -> Gravity:
+    """Prior of the rig's tilts by a frame's accelerometer."""
+    x, y, z = (frame.camera.R_cam_rig_array().T @ frame.accelerometer_m_s2).tolist()
+    tilts = tilt_from_gravity((x, y, z))
+    return Gravity(np.array(tilts), tilt_sigmas(frame.accelerometer, tilts[1]))
 
 
 def _start_sigma_px(observations: Observations, inliers: Mask, start: Pose) -> Floats:
@@ -105,68 +160,43 @@ def _start_sigma_px(observations: Observations, inliers: Mask, start: Pose) -> F
     return np.asarray(np.hypot(START_SIGMA_PX, START_SIGMA_SHARE * radius_px))
 
 
-def maximize(
-    frame: DeviceFrame, gravity: "Gravity", start: Pose, covariance: Floats, located: Collection[int] = frozenset()
-) -> Maximum:
-    """Maximum of the likelihood from an initial pose with a covariance (6, 6). Raises EstimationFailure.
-
-    `located` are the ids of LEDs whose images the initial pose predicts, whatever its covariance.
-    """
-    pose, excluded = start, set[int]()
-    ids_before: set[int] = set()
-    found = set(located)
+def maximize(frame: DeviceFrame, gravity: Gravity, priors: Priors, start: Start) -> Maximum:
+    """Maximum of the likelihood from initial values; `priors` are of all LEDs of the map. Raises EstimationFailure."""
+    pose, nuisances, covariance, located = start.pose, start.nuisances, start.covariance, start.located.copy()
+    excluded = np.zeros(len(priors.leds), dtype=bool)
+    before: Mask | None = None
+    sigma_m = priors.position_sigma_m()
     for _ in range(MAX_STEPS):
-        pixels = gather_led_pixels(frame, leds_in_view(frame, pose, covariance, found))
-        ids = {led.id for led in pixels.leds}
-        found |= ids
-        used = np.array([led.id not in excluded for led in pixels.leds])
-        result = _fisher_scoring(frame, pixels, gravity, used, pose)
+        state = nuisances.state(pose, frame.camera, priors)
+        view = leds_in_view(frame, state, covariance, sigma_m, located)
+        pixels = gather_led_pixels(frame, view, _parameters(priors))
+        located[pixels.index] = True
+        used = ~excluded[pixels.index]
+        search = _Search(frame, pixels, gravity, priors.only(pixels.index))
+        result = search.run(used, pose, nuisances.only(pixels.index))
         while result.converged and (unexplained := _unexplained(result)).any():
             used &= ~unexplained
-            result = _fisher_scoring(frame, pixels, gravity, used, result.pose)
-        pose = result.pose
-        excluded |= {led.id for led, use in zip(pixels.leds, used, strict=True) if not use}
+            result = search.run(used, result.pose, result.nuisances)
+        pose, nuisances = result.pose, nuisances.updated(pixels.index, result.nuisances)
+        excluded[pixels.index[~used]] = True
         if result.converged:
-            covariance = _covariance(result.information)
-            if not pixels.more or ids == ids_before:
-                return Maximum(pose, covariance, tuple(sorted(ids - excluded)))
+            covariance = result.solution.covariance
+            if not np.trace(covariance[:3, :3]) < MAX_SIGMA_M**2:
+                raise EstimationFailure("fit", "the LEDs in view do not determine a position")
+            now = np.zeros(len(priors.leds), dtype=bool)
+            now[pixels.index] = True
+            if not pixels.more or (before is not None and (now == before).all()):
+                ids = tuple(sorted(led.id for led, use in zip(pixels.leds, used, strict=True) if use))
+                return Maximum(pose, nuisances, covariance, ids, result, pixels)
             # The better known pose may determine the images of more LEDs.
-            ids_before = ids
+            before = now
     raise EstimationFailure("fit", DIVERGED)
 
 
-@dataclass(frozen=True)
-class Gravity:
-    """Prior of the rig's tilts by the accelerometer: means (2,) and standard deviations (2,), radians."""
-
-    tilts: Floats
-    sigma: Floats
-
-    @staticmethod
-    def of(frame: DeviceFrame) -> "Gravity":
-        """Prior by a frame's accelerometer."""
-        x, y, z = (frame.camera.R_cam_rig_array().T @ frame.accelerometer_m_s2).tolist()
-        tilts = tilt_from_gravity((x, y, z))
-        return Gravity(np.array(tilts), tilt_sigmas(frame.accelerometer, tilts[1]))
-
-    def information(self) -> Floats:
-        """Information about the pose, (6, 6)."""
-        return np.diag([0.0, 0.0, 0.0, *(self.sigma**-2), 0.0])
-
-    def gradient(self, angles: Floats) -> Floats:
-        """Gradient of the log prior by the pose, (6,), at the rig's (tilt_x, tilt_y, yaw)."""
-        return np.array([0.0, 0.0, 0.0, *(self._residual(angles) / self.sigma**2), 0.0])
-
-    def deviance(self, angles: Floats) -> float:
-        """Sum of the squared residuals of the tilts, in standard deviations."""
-        return float(((self._residual(angles) / self.sigma) ** 2).sum())
-
-    def _residual(self, angles: Floats) -> Floats:
-        residual = self.tilts - angles[:2]
-        return np.asarray(residual - 2 * np.pi * np.round(residual / (2 * np.pi)))
-
-
-NO_GRAVITY = Gravity(np.zeros(2), np.full(2, np.inf))
+def _parameters(priors: Priors) -> Ints:
+    """The IMAGE_PARAMETERS that are estimated: the pose, intrinsics with a prior, and sizes, for the background's sake."""
+    of_camera = POSE_PARAMETERS + np.flatnonzero(priors.camera)
+    return np.concatenate([POSE_ALONE, of_camera, [IMAGE_PARAMETERS - 1]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,75 +208,107 @@ class _ScoringResult:
     """
 
     pose: Pose
+    nuisances: Nuisances
     converged: bool
-    information: Floats
+    solution: Solution
     used: Mask
     faint: Mask
     excess: Floats
 
 
-def _fisher_scoring(frame: DeviceFrame, pixels: LedPixels, gravity: Gravity, used: Mask, start: Pose) -> _ScoringResult:
-    """Fisher scoring with the LEDs used, (n,), to convergence or until the images leave the gathered pixels."""
-    camera = frame.camera
-    # Of a large LED, a point of the rim moves more than the centre.
-    rims_m = np.concatenate([rim(led, RIM_POINTS) + np.array(led.position_m) for led in pixels.leds])
-    origin_px = project(rims_m, pixels.state.pose, camera).pixels
-    noise = Noise.of(frame)
-    photometry: PhotometricFit | None = None
-    pose, step, accepted, min_deviance = start, np.zeros(POSE_PARAMETERS), start, np.inf
-    for _ in range(MAX_STEPS):
-        rendered = (
-            pixels.rendered
-            if pose is pixels.state.pose
-            else pixels.model.render(replace(pixels.state, pose=pose))
+class _Search:
+    """Fisher scoring with the readings around LEDs; `priors` are those of the LEDs."""
+
+    def __init__(self, frame: DeviceFrame, pixels: LedPixels, gravity: Gravity, priors: Priors) -> None:
+        self._camera = frame.camera
+        self._pixels = pixels
+        self._gravity = gravity
+        self._priors = priors
+        self._noise = Noise.of(frame)
+        # Of a large LED, a point of the rim moves more than the centre.
+        self._rims_m = np.stack([rim(led, RIM_POINTS) for led in pixels.leds])
+        self._centres_m = np.array([led.position_m for led in pixels.leds])
+        self._origin_px = self._rims_px(pixels.state)
+
+    def run(self, used: Mask, pose: Pose, nuisances: Nuisances) -> _ScoringResult:
+        """Scoring with the LEDs used, (n,), to convergence or until the images leave the gathered pixels."""
+        pixels, camera = self._pixels, self._camera
+        priors = self._with_edge_errors(used)
+        photometry: PhotometricFit | None = None
+        step, factor, accepted, min_deviance = None, 1.0, (pose, nuisances), np.inf
+        for _ in range(MAX_STEPS):
+            state = nuisances.state(pose, camera, priors)
+            rendered = self._rendered(state)
+            profile = nuisances.profile() if priors.leds[:, 4:].any() else None
+            angles = pose.rig_angles(camera)
+            candidate = fit_photometry(pixels, rendered, used, self._noise, photometry, profile)
+            of_priors = self._gravity.deviance(angles) + nuisances.deviance(priors)
+            deviance = candidate.deviance + of_priors / len(pixels.electrons)
+            if step is not None and deviance > MAX_DEVIANCE_RATIO * min_deviance:  # too long for the linearization
+                factor /= 4
+                pose, nuisances = self._moved(accepted, step, factor)
+                continue
+            photometry, accepted, min_deviance = candidate, (pose, nuisances), deviance
+            rows, right = square_root(*score(pixels, rendered, photometry, profile))
+            before, step = step, solve(rows, right, priors, nuisances, self._gravity, angles)
+            factor = 1.0 if before is None else self._damping(step, before, factor)
+            moved_px = self._movement_px(accepted, step, factor, priors)
+            factor *= min(1.0, MAX_STEP_PX / max(moved_px, 1e-12))
+            converged = step.step2 * factor**2 < CONVERGED_STEP2 and moved_px < MAX_STEP_PX
+            pose, nuisances = self._moved(accepted, step, factor)
+            off_px = self._rims_px(nuisances.state(pose, camera, priors)) - self._origin_px
+            if converged or not bool((np.linalg.norm(off_px, axis=-1) < EDGE_PX - 1).all()):
+                break
+        else:
+            raise EstimationFailure("fit", DIVERGED)
+        count = len(pixels.leds)
+        max_signal_to_noise = np.zeros(count)
+        np.maximum.at(max_signal_to_noise, pixels.led, photometry.signal_to_noise)
+        excess: Floats = np.asarray(
+            np.bincount(pixels.led, excess_chi2(pixels, rendered, photometry), count), dtype=np.float64
         )
-        angles = pose.rig_angles(camera)
-        candidate = fit_photometry(pixels, rendered, used, noise, photometry)
-        deviance = candidate.deviance + gravity.deviance(angles) / len(pixels.electrons)
-        if deviance > MAX_DEVIANCE_RATIO * min_deviance:  # the step was too long for the linearization
-            step = step / 4
-            pose = accepted.moved(step, camera)
-            continue
-        photometry, accepted, min_deviance = candidate, pose, deviance
-        information, gradient = (of_leds.sum(axis=0) for of_leds in score(pixels, rendered, photometry))
-        information, gradient = information + gravity.information(), gradient + gravity.gradient(angles)
-        before, step = step, _solved(information, gradient)
-        if step @ information @ before < -MAX_RETURN * (before @ information @ before):
-            step = step / 2
-        rims = project(rims_m, pose, camera)
-        step *= min(1.0, MAX_STEP_PX / max(float(np.linalg.norm(rims.slopes @ step, axis=1).max()), 1e-12))
-        converged = float(step @ information @ step) < CONVERGED_STEP2
-        pose = pose.moved(step, camera)
-        moved_px = np.linalg.norm(rims.pixels + rims.slopes @ step - origin_px, axis=1)
-        if converged or not bool((moved_px < EDGE_PX - 1).all()):
-            break
-    else:
-        raise EstimationFailure("fit", DIVERGED)
-    count = len(pixels.leds)
-    max_signal_to_noise = np.zeros(count)
-    np.maximum.at(max_signal_to_noise, pixels.led, photometry.signal_to_noise)
-    excess: Floats = np.asarray(
-        np.bincount(pixels.led, excess_chi2(pixels, rendered, photometry), count), dtype=np.float64
-    )
-    faint = used & (max_signal_to_noise < MIN_SIGNAL_TO_NOISE)
-    return _ScoringResult(pose, converged, information, used, faint, excess)
+        faint = used & (max_signal_to_noise < MIN_SIGNAL_TO_NOISE)
+        return _ScoringResult(pose, nuisances, converged, step, used, faint, excess)
 
+    def _damping(self, step: Solution, before: Solution, factor: float) -> float:
+        """Factor of a step: a half where it takes back much of the one before."""
+        inner = step.pose_step @ step.information @ before.pose_step * factor
+        length2 = before.pose_step @ step.information @ before.pose_step * factor**2
+        return 0.5 if inner < -MAX_RETURN * length2 else 1.0
 
-def _solved(information: Floats, gradient: Floats) -> Floats:
-    """Step of Fisher scoring, with parameters scaled to equal size; raises EstimationFailure if it is undetermined."""
-    scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
-    try:
-        factor = np.linalg.cholesky(information / np.outer(scale, scale))
-    except np.linalg.LinAlgError:
-        raise EstimationFailure("fit", "the LEDs in view do not determine a position") from None
-    return np.asarray(np.linalg.solve(factor.T, np.linalg.solve(factor, gradient / scale)) / scale)
+    def _with_edge_errors(self, used: Mask) -> Priors:
+        """The priors, with the errors of the sizes that an imperfect background causes."""
+        pixels = self._pixels
+        photometry = fit_photometry(pixels, pixels.rendered, used, self._noise)
+        amplitude, background = np.zeros(len(pixels.leds)), np.zeros(len(pixels.leds))
+        np.maximum.at(amplitude, pixels.led, photometry.amplitude)
+        np.maximum.at(background, pixels.led, photometry.background)
+        share = np.divide(background, amplitude, out=np.zeros_like(amplitude), where=amplitude > 0)
+        size_px = np.linalg.norm(self._origin_px - self._origin_px.mean(axis=1, keepdims=True), axis=-1).mean(axis=1)
+        leds = self._priors.leds.copy()
+        leds[:, 3] = np.hypot(leds[:, 3], BACKGROUND_EDGE_PX * np.minimum(share, 1.0) / size_px)
+        return replace(self._priors, leds=leds)
 
+    def _rendered(self, state: ImageState) -> RenderedLeds:
+        pixels = self._pixels
+        return pixels.rendered if state is pixels.state else pixels.model.render(state, pixels.rendered.parameters)
 
-def _covariance(information: Floats) -> Floats:
-    covariance = np.stack([_solved(information, unit) for unit in np.eye(POSE_PARAMETERS)])
-    if not np.trace(covariance[:3, :3]) < MAX_SIGMA_M**2:
-        raise EstimationFailure("fit", "the LEDs in view do not determine a position")
-    return (covariance + covariance.T) / 2
+    def _moved(self, start: tuple[Pose, Nuisances], step: Solution, factor: float) -> tuple[Pose, Nuisances]:
+        return start[0].moved(factor * step.pose_step, self._camera), start[1].moved(step.step, factor)
+
+    def _movement_px(self, start: tuple[Pose, Nuisances], step: Solution, factor: float, priors: Priors) -> float:
+        """Largest movement of a point of a rim by a step."""
+        before, after = (
+            self._rims_px(nuisances.state(pose, self._camera, priors))
+            for pose, nuisances in (start, self._moved(start, step, factor))
+        )
+        return float(np.nan_to_num(np.linalg.norm(after - before, axis=-1), nan=np.inf).max())
+
+    def _rims_px(self, state: ImageState) -> Floats:
+        """Points of the rims, (n, RIM_POINTS, 2)."""
+        centres_m = self._centres_m + state.shifts_m
+        points_m = centres_m[:, None] + self._rims_m * state.sizes[:, None, None]
+        return project(points_m.reshape(-1, 3), state.pose, state.camera).pixels.reshape(-1, RIM_POINTS, 2)
 
 
 def _unexplained(result: _ScoringResult) -> Mask:

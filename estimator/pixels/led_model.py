@@ -40,6 +40,8 @@ FALL_OFF_NODES = 8
 
 IMAGE_PARAMETERS = POSE_PARAMETERS + CAMERA_PARAMETERS + 1
 """Parameters of LED images: the pose's, the intrinsics', then the relative error of the LED's own size."""
+PROFILE_PARAMETERS = 3
+"""Coefficients of an LED's luminance over its face: of a, b and a^2 + b^2 - 1/2, see `LedPixels`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +60,10 @@ class ImageState:
     def as_told(pose: Pose, camera: Camera, leds: int) -> "ImageState":
         """LEDs as in the map."""
         return ImageState(pose, camera, np.zeros((leds, 3)), np.ones(leds))
+
+    def of(self, chosen: NDArray[np.bool_] | Ints) -> "ImageState":
+        """The state of the chosen LEDs."""
+        return ImageState(self.pose, self.camera, self.shifts_m[chosen], self.sizes[chosen])
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,6 +114,9 @@ def led_footprints(leds: Sequence[Led], state: ImageState) -> LedFootprints:
     centres_cam = projected.p_cam.reshape(len(leds), COARSE_POINTS, 3).mean(axis=1)
     depth_m = projection_of(camera).defocus_depth_m(centres_cam)
     return LedFootprints(pixels.min(axis=1), pixels.max(axis=1), centre, edges, to_face, depth_m)
+
+
+POSE_ALONE = np.arange(POSE_PARAMETERS)
 
 
 def rim(led: Led, points: int) -> Floats:
@@ -170,10 +179,12 @@ def _interpolation(at: Floats, nodes: Floats, barycentric: Floats) -> Floats:
 class RenderedLeds:
     """LED images under one pose: `light` (cells,) in each cell of a region stack.
 
-    The light of a pixel inside an LED image is the lens's fall-off there, 1 at the LED image's centre.
+    The light of a pixel inside an LED image is the lens's fall-off there, 1 at the LED image's centre. `parameters`
+    (p,) are those that derivatives are by.
     """
 
     light: Floats
+    parameters: Ints
     _rois: RoiStack
     _pieces: EdgePieces
     _lens: LensBlur
@@ -226,25 +237,25 @@ class LedImageModel:
         self._rims_m = np.concatenate([rim(led, n) for led, n in zip(leds, counts.tolist(), strict=True)])
         self._centres_m = np.array([led.position_m for led in leds])
 
-    def render(self, state: ImageState, extended: bool = False) -> RenderedLeds:
+    def render(self, state: ImageState, parameters: Ints = POSE_ALONE) -> RenderedLeds:
         """Images of all LEDs under a state, each alone in its region.
 
-        The derivatives are by the pose, or if `extended` by all IMAGE_PARAMETERS.
+        `parameters` are those of the IMAGE_PARAMETERS that derivatives are by.
         """
         lens, factors = self._lens, self._lens.factors[self._led, None]
         offsets_m = self._rims_m * state.sizes[self._led, None]
         rims = project(self._centres_m[self._led] + state.shifts_m[self._led] + offsets_m, state.pose, state.camera)
-        slopes = _extended_slopes(rims, offsets_m, state.camera) if extended else rims.slopes
+        slopes = _slopes(rims, offsets_m, state.camera)[:, :, parameters]
         outlines = Outlines(rims.pixels * factors, self._following, self._led, slopes * factors[:, None])
         covered, pieces = cover(self._fine, outlines)
         light = covered * self._fine_fall_off
         pieces = pieces.times(self._fine_fall_off[self._fine.cell(pieces.roi, pieces.row, pieces.column)])
         if lens.kernels:
             light = _blurred(light, self._fine, self.rois, lens, lens.kernels)
-        return RenderedLeds(light, self.rois, pieces, lens)
+        return RenderedLeds(light, parameters, self.rois, pieces, lens)
 
 
-def _extended_slopes(rims: ProjectedPoints, offsets_m: Floats, camera: Camera) -> Floats:
+def _slopes(rims: ProjectedPoints, offsets_m: Floats, camera: Camera) -> Floats:
     """Derivatives (n, 2, p) of points of rims by the IMAGE_PARAMETERS; `offsets_m` (n, 3) are from the LEDs' centres."""
     slopes = np.zeros((len(offsets_m), 2, IMAGE_PARAMETERS))
     slopes[:, :, :POSE_PARAMETERS] = rims.slopes

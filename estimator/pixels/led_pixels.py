@@ -1,11 +1,9 @@
-"""Pixel readings of LED images: edge pixels one by one, uniform pixels inside and around an LED image as sums.
+"""Pixel readings of LED images: edge pixels one by one, uniform pixels inside an LED image as sums.
 
-The sum of Poisson variables is a sufficient statistic of a common mean, so the uniform pixels of an LED's face, and
-those of the background around it, need not be read one by one: each block of them is one reading. Its expectation is
-exact, a sum over its pixels.
+The sum of Poisson variables is a sufficient statistic of a common mean, so the uniform pixels of an LED's face need not
+be read one by one: each block of them is one reading. Its expectation is exact, a sum over its pixels.
 """
 
-from collections.abc import Collection
 from dataclasses import dataclass
 
 import cv2
@@ -16,7 +14,14 @@ from estimator.camera.pose import Pose
 from estimator.camera.projection import project
 from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame, Led, Part
-from estimator.pixels.led_model import ImageState, LedFootprints, LedImageModel, RenderedLeds, led_footprints
+from estimator.pixels.led_model import (
+    POSE_ALONE,
+    ImageState,
+    LedFootprints,
+    LedImageModel,
+    RenderedLeds,
+    led_footprints,
+)
 from estimator.pixels.polygon_raster import RoiStack
 from estimator.pixels.psf import LensBlur
 
@@ -26,46 +31,43 @@ Mask = NDArray[np.bool_]
 
 # An image may move by nearly this much before its pixels have to be sorted into edge, inside and background again.
 EDGE_PX = 2
-# The background of the edge pixels is that of pixels up to NEAR_PX beyond them. Further off it may be another surface: a
-# frame around the luminaire, the panel that LEDs are mounted on, the ceiling beyond it.
+# Pixels up to NEAR_PX beyond those that an LED lights tell the background of its edge. Those further off may show
+# another surface: the panel that LEDs are mounted on ends, and the ceiling or the panel's side begins.
 NEAR_PX = 1
-# Width of the background ring around the edge.
-RING_PX = 0
-# Blocks of the uniform pixels of a face along each axis, and sectors of the ring, each summed for a reading: the light
-# changes little over a block.
+# Blocks of the uniform pixels of a face along each axis, each summed for a reading: the light changes little over one.
 BLOCKS = 6
-SECTORS = 12
 # A pixel whose share of an LED's light is within this of 0 or 1 is uniform.
 UNIFORM_TOLERANCE = 1e-3
 # An LED is used once the pose determines its image to this, one standard deviation.
 MAX_IMAGE_SIGMA_PX = 0.5
 # Share of the pixels inside an LED image that have to be known: read out and not saturated.
 MIN_KNOWN_SHARE = 0.5
+NONE_IN_VIEW = "no LED of the map is in view from the pose that the spots give"
 # Extent of an LED image in half widths: 1.4 for a square's vertex, and the scale of a tilted view varies over a face.
 MAX_EXTENT = 3.0
 
 
 @dataclass(frozen=True, eq=False)
 class LedPixels:
-    """Readings around n LEDs, m in all: edge pixels, and sums over blocks of uniform pixels.
+    """Readings around n LEDs, m in all: edge pixels, and sums over blocks of the uniform pixels inside.
 
     A group of readings has a common amplitude and background: an LED, or an LED's pixels of one colour; there are g.
     The readings of a group follow each other, from `starts[k]` to `starts[k + 1]`, (g + 1,); each group has an edge
     pixel. `led` (g,) is the LED of each group, an index to `leds`.
 
-    `model` is the image model of the LEDs, `state` the state that the pixels were sorted by, `rendered` the images
+    `index` (n,) is the number of each LED in the map, `model` the image model of the LEDs, `state` the state that the pixels were sorted by, `rendered` the images
     there. `edges` (e,) are the readings that are edge pixels, `cells` (e,) their cells in `model.rois`. `pixel_counts`
     (m,) is the number of pixels of a reading, `electrons` (m,) their sum.
 
-    With the coordinates (a, b) of a pixel on the face, in half widths from its centre: `background` (m, 5) is the
-    lens's fall-off times 1, a, b, a^2 + b^2, and 1 for pixels far from the face; `face` (m, 3) is the mean of a, b and
-    a^2 + b^2 - 1/2 over the LED's light.
+    With the coordinates (a, b) of a pixel on the face, in half widths from its centre: `background` (m, 4) is the
+    lens's fall-off times 1, a, b and a^2 + b^2; `face` (m, 3) is the mean of a, b and a^2 + b^2 - 1/2 over a reading.
     `uniform_light` (m,) is the light inside the LED image summed over the pixels of a reading, 0 for edge pixels, whose
     light depends on the state. `more` says whether other LEDs of the map may be in view, whose images the state does
     not determine well enough.
     """
 
     leds: tuple[Led, ...]
+    index: Ints
     model: LedImageModel
     state: ImageState
     rendered: RenderedLeds
@@ -112,17 +114,18 @@ class _Readings:
 class LedsInView:
     """LEDs of the map whose images overlap the regions read out, under a state of them; see `leds_in_view`.
 
-    `more` says whether there may be others, whose images the state does not determine well enough.
+    `index` (n,) is the number of each in the map. `more` says whether there may be others, whose images the state does not determine well enough.
     """
 
     leds: tuple[Led, ...]
+    index: Ints
     state: ImageState
     footprints: LedFootprints
     more: bool
 
 
-def gather_led_pixels(frame: DeviceFrame, view: LedsInView) -> LedPixels:
-    """Readings of LEDs in view.
+def gather_led_pixels(frame: DeviceFrame, view: LedsInView, parameters: Ints = POSE_ALONE) -> LedPixels:
+    """Readings of LEDs in view; `parameters` are those that the derivatives of their images are by.
 
     Left out are saturated pixels, and pixels that another LED of the map illuminates as well. LEDs with a mostly
     saturated image are left out unless all are: the location of an edge depends on the amplitude, which the unsaturated
@@ -130,9 +133,9 @@ def gather_led_pixels(frame: DeviceFrame, view: LedsInView) -> LedPixels:
     """
     leds, state, footprints = view.leds, view.state, view.footprints
     lens = LensBlur(frame.camera, footprints.defocus_depth_m)
-    rois = _rois(frame, footprints, EDGE_PX + RING_PX + lens.radius_px)
+    rois = _rois(frame, footprints, EDGE_PX + lens.radius_px)
     model = LedImageModel(leds, footprints, frame.camera, lens, rois)
-    rendered = model.render(state)
+    rendered = model.render(state, parameters)
     fall_offs = [rois.roi(model.fall_off, k) for k in range(len(leds))]
     with np.errstate(all="ignore"):
         shares = [np.nan_to_num(rois.roi(rendered.light, k) / fall_offs[k]) for k in range(len(leds))]
@@ -153,14 +156,14 @@ def gather_led_pixels(frame: DeviceFrame, view: LedsInView) -> LedPixels:
         (au, av), (bu, bv) = footprints.to_face[k].tolist()
         u, v = footprints.centre[k].tolist()
         du, dv = columns + 0.5 - u, rows + 0.5 - v
-        position = _FacePixels(au * du + av * dv, bu * du + bv * dv, fall_offs[k], shares[k] > 0.5, masks[k].far)
+        position = _FacePixels(au * du + av * dv, bu * du + bv * dv, fall_offs[k])
         for of_colour in _colours(frame, rows, columns):
-            row, column = np.nonzero(known & of_colour & masks[k].edge)
+            row, column = np.nonzero(known & of_colour & masks[k].edge & masks[k].near)
             if len(row) == 0:
                 continue
             cells = rois.cell(np.full(len(row), k), row + rois.rows[k], column + rois.columns[k])
-            row_u, column_u = np.nonzero(known & of_colour & ~masks[k].edge)
-            groups.append(_group(position, electrons, cells, (row, column), (row_u, column_u)))
+            row_in, column_in = np.nonzero(known & of_colour & ~masks[k].edge & (shares[k] > 0.5))
+            groups.append(_group(position, electrons, cells, (row, column), (row_in, column_in)))
             led_of_group.append(k)
     if not groups:
         raise EstimationFailure("fit", "no pixel of the LEDs in view is usable: all are saturated or overlap others")
@@ -173,6 +176,7 @@ def gather_led_pixels(frame: DeviceFrame, view: LedsInView) -> LedPixels:
 
     return LedPixels(
         leds=leds,
+        index=view.index,
         model=model,
         state=state,
         rendered=rendered,
@@ -191,63 +195,58 @@ def gather_led_pixels(frame: DeviceFrame, view: LedsInView) -> LedPixels:
 
 @dataclass(frozen=True, eq=False)
 class _FacePixels:
-    """A region's pixels, (rows, columns): coordinates `a`, `b` on the face, the lens's fall-off, and whether a
-    pixel is inside, or far (see `_Masks`).
-    """
+    """A region's pixels, (rows, columns): coordinates `a`, `b` on the face, and the lens's fall-off."""
 
     a: Floats
     b: Floats
     fall_off: Floats
-    inside: Mask
-    far: Mask
 
 
 def _group(
-    pixels: _FacePixels, electrons: Floats, cells: Ints, edge: tuple[Ints, Ints], uniform: tuple[Ints, Ints]
+    pixels: _FacePixels, electrons: Floats, cells: Ints, edge: tuple[Ints, Ints], inside: tuple[Ints, Ints]
 ) -> _Readings:
-    """Readings of the edge pixels and of blocks of the uniform pixels, both given by (row, column)."""
+    """Readings of the edge pixels and of blocks of the pixels inside the face, both given by (row, column)."""
     a, b, fall_off = pixels.a[edge], pixels.b[edge], pixels.fall_off[edge]
     r2 = a * a + b * b
-    background = np.stack([fall_off * basis for basis in (np.ones(len(a)), a, b, r2, pixels.far[edge])], axis=1)
+    background = np.stack([fall_off * basis for basis in (np.ones(len(a)), a, b, r2)], axis=1)
     face = np.stack([a, b, r2 - 0.5], axis=1)
     count = np.ones(len(a))
     light = np.zeros(len(a))
-    a, b, fall_off, inside, far = (values[uniform] for values in vars(pixels).values())
+    a, b, fall_off = (values[inside] for values in vars(pixels).values())
     r2 = a * a + b * b
-    # Blocks: the face in BLOCKS x BLOCKS, the ring in sectors.
     tile = np.clip(np.floor((a + 1) * BLOCKS / 2), 0, BLOCKS - 1) * BLOCKS
     tile += np.clip(np.floor((b + 1) * BLOCKS / 2), 0, BLOCKS - 1)
-    sector = np.floor((np.arctan2(b, a) / np.pi + 1) / 2 * SECTORS) % SECTORS
-    _, block = np.unique(np.where(inside, tile, BLOCKS**2 + sector), return_inverse=True)
+    _, block = np.unique(tile, return_inverse=True)
     blocks = int(block.max()) + 1 if len(block) else 0
 
     def summed(values: Floats) -> Floats:
         return np.asarray(np.bincount(block, values, blocks), dtype=np.float64)
 
-    sums = [summed(fall_off * basis) for basis in (np.ones(len(a)), a, b, r2, far)]
-    lit = summed(inside.astype(float)) > 0
-    mean = [np.divide(one, sums[0], out=np.zeros(blocks), where=lit & (sums[0] > 0)) for one in sums[1:4]]
+    sums = np.stack([summed(fall_off * basis) for basis in (np.ones(len(a)), a, b, r2)], axis=1)
+    mean = sums[:, 1:] / sums[:, :1]
     return _Readings(
         cells=cells,
         pixel_counts=np.concatenate([count, summed(np.ones(len(a)))]),
-        electrons=np.concatenate([electrons[edge], summed(electrons[uniform])]),
-        background=np.concatenate([background, np.stack(sums, axis=1)]),
-        face=np.concatenate([face, np.stack([mean[0], mean[1], np.where(lit, mean[2] - 0.5, 0.0)], axis=1)]),
-        uniform_light=np.concatenate([light, np.where(lit, sums[0], 0.0)]),
+        electrons=np.concatenate([electrons[edge], summed(electrons[inside])]),
+        background=np.concatenate([background, sums]),
+        face=np.concatenate([face, mean - [0.0, 0.0, 0.5]]),
+        uniform_light=np.concatenate([light, sums[:, 0]]),
     )
 
 
 def leds_in_view(
-    frame: DeviceFrame, pose: Pose, covariance: Floats, found: Collection[int] = frozenset()
+    frame: DeviceFrame, state: ImageState, covariance: Floats, sigma_m: Floats, located: Mask
 ) -> LedsInView:
-    """LEDs of the map that are in view from a pose with a covariance (6, 6) of its parameters.
+    """LEDs of the map, n in all, that are in view under a state of them.
 
-    Left out are LEDs whose image is not determined to MAX_IMAGE_SIGMA_PX, but for those `found` before, by id. Raises
+    Left out are LEDs whose image is not determined to MAX_IMAGE_SIGMA_PX by the pose, of covariance (6, 6), and by
+    their own position, of standard deviation `sigma_m` (n,), but for those whose image is `located` (n,). Raises
     EstimationFailure if none is left.
     """
     low, high = _read_out(frame)
     leds = tuple(frame.leds.values())
-    centres = project(np.array([led.position_m for led in leds]), pose, frame.camera)
+    centres_m = np.array([led.position_m for led in leds]) + state.shifts_m
+    centres = project(centres_m, state.pose, state.camera)
     half_widths_m = np.array([led.half_width_m for led in leds])
     with np.errstate(invalid="ignore"):
         # The image moves with the camera as much as a point of the face moves it from its centre.
@@ -256,24 +255,25 @@ def leds_in_view(
         near = ((centres.pixels > low - extent_px) & (centres.pixels < high + extent_px)).all(axis=1)
     candidates = np.flatnonzero(near)
     if len(candidates) == 0:
-        raise EstimationFailure("fit", "no LED of the map is in view from the pose of the spots")
-    near_leds = [leds[k] for k in candidates]
-    footprints = led_footprints(near_leds, ImageState.as_told(pose, frame.camera, len(near_leds)))
+        raise EstimationFailure("fit", NONE_IN_VIEW)
+    footprints = led_footprints([leds[k] for k in candidates], state.of(candidates))
     slopes = centres.slopes[candidates]
     with np.errstate(invalid="ignore"):
         in_view = footprints.whole & (footprints.high > low).all(axis=1) & (footprints.low < high).all(axis=1)
-        certain = ((slopes @ covariance) * slopes).sum(axis=(1, 2)) < MAX_IMAGE_SIGMA_PX**2
-    certain |= np.array([led.id in found for led in near_leds])
+        variance_px2 = ((slopes @ covariance) * slopes).sum(axis=(1, 2)) + (sigma_m * scale)[candidates] ** 2
+        chosen = in_view & ((variance_px2 < MAX_IMAGE_SIGMA_PX**2) | located[candidates])
     if not in_view.any():
-        raise EstimationFailure("fit", "no LED of the map is in view from the pose of the spots")
-    if not (in_view & certain).any():
+        raise EstimationFailure("fit", NONE_IN_VIEW)
+    if not chosen.any():
+        sigma_px = float(np.sqrt(variance_px2[in_view].min()))
         raise EstimationFailure(
-            "fit", f"LEDs of the map in view: {in_view.sum()}, none with an image known to {MAX_IMAGE_SIGMA_PX} px"
+            "fit",
+            f"LEDs of the map in view: {in_view.sum()}, but the best known image to {sigma_px:.1f} px only, "
+            f"needed {MAX_IMAGE_SIGMA_PX} px",
         )
-    chosen = in_view & certain
-    used = tuple(led for led, use in zip(near_leds, chosen, strict=True) if use)
-    state = ImageState.as_told(pose, frame.camera, len(used))
-    return LedsInView(used, state, footprints.of(chosen), bool((in_view & ~certain).any()))
+    index = candidates[chosen]
+    used = tuple(leds[k] for k in index)
+    return LedsInView(used, index, state.of(index), footprints.of(chosen), bool((in_view & ~chosen).any()))
 
 
 def _read_out(frame: DeviceFrame) -> tuple[Ints, Ints]:
@@ -294,12 +294,12 @@ def _rois(frame: DeviceFrame, footprints: LedFootprints, margin_px: int) -> RoiS
 @dataclass(frozen=True, eq=False)
 class _Masks:
     """Pixels of a region: `edge` may be partly lit by the LED while its image moves by EDGE_PX, `lit` may be lit at
-    all, `far` are more than NEAR_PX beyond the pixels that it lights.
+    all, `near` are at most NEAR_PX beyond the pixels that it lights.
     """
 
     edge: Mask
     lit: Mask
-    far: Mask
+    near: Mask
 
 
 def _edge_and_lit(share: Floats) -> _Masks:
@@ -310,7 +310,7 @@ def _edge_and_lit(share: Floats) -> _Masks:
         cv2.dilate(mask.astype(np.uint8), np.ones((2 * px + 1, 2 * px + 1), dtype=np.uint8)).astype(bool)
         for mask, px in ((partly_lit, EDGE_PX), (lit, EDGE_PX), (lit, NEAR_PX))
     )
-    return _Masks(edge, near_lit, ~near)
+    return _Masks(edge, near_lit, near)
 
 
 def _readings(frame: DeviceFrame, rois: RoiStack, k: int) -> tuple[Floats, Mask]:

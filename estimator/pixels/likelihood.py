@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.io.device import DeviceFrame
-from estimator.pixels.led_model import RenderedLeds
+from estimator.pixels.led_model import IMAGE_PARAMETERS, PROFILE_PARAMETERS, RenderedLeds
 from estimator.pixels.led_pixels import LedPixels
 
 Floats = NDArray[np.float64]
@@ -31,12 +31,12 @@ SATURATION_MARGIN_SIGMA = 5.0
 # Lower limit of a variance, electrons squared: keeps weights finite.
 MIN_VARIANCE_E2 = 1e-3
 # Background coefficients and amplitude of a group.
-COEFFICIENTS = 6
+COEFFICIENTS = 5
 # Relative determinant below which readings do not determine amplitude and background; they are then not used.
 MIN_DETERMINANT = 1e-9
-# Standard deviations a priori of the background's slopes by a and b, its curvature, and its step far from the face: relative to
+# Standard deviations a priori of the background's slopes by a and b, its curvature: relative to
 # the background's level plus HALO_SHARE of the amplitude.
-BACKGROUND_SIGMAS = (1.0, 1.0, 0.3, 1.0)
+BACKGROUND_SIGMAS = (1.0, 1.0, 0.3)
 HALO_SHARE = 0.05
 # Limit of an LED's chi-square: its degrees of freedom, its own scatter in standard deviations, and a model error of the
 # edge, at most this share of the LED's light: by an inaccurate blur of the lens, or a shift of 0.05 px.
@@ -65,15 +65,16 @@ class Noise:
 class PhotometricFit:
     """Amplitudes and backgrounds of g groups given the image, and the m readings expected by them.
 
-    `basis` (m, 6) are the derivatives of the readings by a group's five background coefficients and its amplitude;
-    `amplitude` and `signal_to_noise` are (g,); `expected` (m,) are electrons; `weight` (m,) is 1 / variance, 0 for
-    readings not used; `covariance` (g, 6, 6) is that of the coefficients, 0 if the readings do not determine them;
+    `basis` (m, 5) are the derivatives of the readings by a group's four background coefficients and its amplitude;
+    `amplitude`, `background` (by the face) and `signal_to_noise` are (g,); `expected` (m,) are electrons; `weight` (m,) is 1 / variance, 0 for
+    readings not used; `covariance` (g, 5, 5) is that of the coefficients, 0 if the readings do not determine them;
     `level` (g,) is the scale of the background's prior; `deviance` is the mean over the readings of twice the log
     likelihood ratio of a saturated model, expected to be near 1.
     """
 
     basis: Floats
     amplitude: Floats
+    background: Floats
     signal_to_noise: Floats
     expected: Floats
     weight: Floats
@@ -130,7 +131,9 @@ def fit_photometry(
     sigma = np.sqrt(covariance[:, -1, -1])
     signal_to_noise = np.divide(amplitude, sigma, out=np.zeros_like(sigma), where=sigma > 0)
     deviance = _mean_deviance(y[weight > 0], expected[weight > 0], n[weight > 0] * noise.dark_e2)
-    return PhotometricFit(basis, amplitude, signal_to_noise, expected, weight, covariance, level, deviance)
+    return PhotometricFit(
+        basis, amplitude, coefficients[:, 0], signal_to_noise, expected, weight, covariance, level, deviance
+    )
 
 
 def _inverse(matrices: Floats) -> Floats:
@@ -150,10 +153,10 @@ def _mean_deviance(electrons: Floats, expected: Floats, dark_e2: Floats) -> floa
 def score(
     pixels: LedPixels, rendered: RenderedLeds, photometry: PhotometricFit, profile: Floats | None = None
 ) -> tuple[Floats, Floats]:
-    """Information (n, p, p) and gradient (n, p) of the log likelihood by the p parameters of each of n LEDs' images.
+    """Information (n, p, p) and gradient (n, p) of the log likelihood by the LOCAL_PARAMETERS of each of n LEDs.
 
-    Amplitudes and backgrounds are eliminated. The parameters are those of `rendered`'s derivatives, and if `profile`
-    (n, 3) is given, its three coefficients after them.
+    Amplitudes and backgrounds are eliminated. Parameters that `rendered` has no derivatives by have no information; so
+    has the profile if `profile` (n, 3) is None.
     """
     slopes = rendered.slopes(pixels.cells) * photometry.amplitude[pixels.group[pixels.edges]][:, None]
     if profile is not None:
@@ -161,8 +164,12 @@ def score(
         slopes *= factor[pixels.edges][:, None]
         of_profile = pixels.face * (pixels.light(rendered) * photometry.amplitude[pixels.group])[:, None]
     residual = photometry.weight * (pixels.electrons - photometry.expected)
-    count = slopes.shape[1] + (0 if profile is None else of_profile.shape[1])
-    information, gradient = np.zeros((len(pixels.leds), count, count)), np.zeros((len(pixels.leds), count))
+    columns = rendered.parameters
+    if profile is not None:
+        columns = np.concatenate([columns, IMAGE_PARAMETERS + np.arange(PROFILE_PARAMETERS)])
+    count, all_of_them = len(columns), IMAGE_PARAMETERS + PROFILE_PARAMETERS
+    information = np.zeros((len(pixels.leds), all_of_them, all_of_them))
+    gradient = np.zeros((len(pixels.leds), all_of_them))
     first_edge = np.searchsorted(pixels.edges, pixels.starts)
     for g, led in enumerate(pixels.led.tolist()):
         # The edge pixels are the first readings of a group, and the image's shape does not change the others.
@@ -174,8 +181,8 @@ def score(
             design[:, slopes.shape[1] :] = of_profile[readings]
         weighted = design * photometry.weight[readings][:, None]
         mixed = weighted.T @ photometry.basis[readings]
-        information[led] += weighted.T @ design - mixed @ photometry.covariance[g] @ mixed.T
-        gradient[led] += design.T @ residual[readings]
+        information[led][np.ix_(columns, columns)] += weighted.T @ design - mixed @ photometry.covariance[g] @ mixed.T
+        gradient[led][columns] += design.T @ residual[readings]
     return information, gradient
 
 
