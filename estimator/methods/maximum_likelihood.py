@@ -17,13 +17,14 @@ Not modelled: light of other sources beside a smooth background, mechanical vign
 motion. LEDs that the model does not explain are excluded by their goodness of fit.
 """
 
-from collections.abc import Collection
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from estimator.camera.intrinsics import camera_slopes, with_errors
 from estimator.camera.leveling import tilt_from_gravity, tilt_sigmas
 from estimator.camera.pose import POSE_PARAMETERS, Pose
 from estimator.camera.projection import project
@@ -45,6 +46,7 @@ from estimator.pixels.likelihood import Noise, PhotometricFit, excess_chi2, fit_
 from estimator.pixels.nuisances import (
     LOCAL_PARAMETERS,
     NO_GRAVITY,
+    Components,
     Gravity,
     Nuisances,
     Priors,
@@ -53,6 +55,7 @@ from estimator.pixels.nuisances import (
     square_root,
 )
 from estimator.solvers.reprojection import Observations, fit, observe
+from estimator.solvers.robust_fit import Consensus
 from estimator.spots.correspondences import find_correspondences
 from estimator.spots.identify import Correspondence
 
@@ -82,6 +85,21 @@ MIN_EXCLUDED_SHARE = 0.25
 START_SIGMA_PX = 0.05
 START_SIGMA_SHARE = 2e-3
 MIN_FOR_CONSENSUS = 3
+START_STEPS = 10
+# Errors of the spots beside their noise, in turn, until the spots agree on a pose.
+MODEL_ERRORS_PX = (0.0, 0.3, 1.0, 3.0, 10.0, 30.0)
+# Nuisances that no one states: initial standard deviations, and how much an LED's image may differ from the model
+# before it reveals them, beside its noise: shift, size, profile.
+START_COMPONENTS = Components(place_m=5e-3, size=0.01, profile=0.03)
+SHIFT_TOLERANCE_PX = 3e-3
+SIZE_TOLERANCE_PX = 0.02
+PROFILE_TOLERANCE = 3e-3
+# Probability that noise reveals one.
+REVEALED_PROBABILITY = 1e-9
+# Share of the LEDs in view below which it is not the LEDs that are wrong, but the model.
+MIN_USED_SHARE = 0.75
+MAX_ROUNDS = 3
+MAX_TUNING = 10
 DIVERGED = "the likelihood has no maximum near the pose of the spots"
 # Standard deviation of the position above which the pixels do not determine it.
 MAX_SIGMA_M = 1.0
@@ -93,23 +111,28 @@ BACKGROUND_EDGE_PX = 0.02
 @dataclass(frozen=True, eq=False)
 class Start:
     """Initial values: pose, nuisances of all LEDs of the map, the pose's covariance (6, 6), and which LEDs of the map
-    have an image that the initial values predict, whatever the covariance, (n,).
+    have an image that the initial values predict, whatever the covariance, (n,). `components` are added to the priors.
     """
 
     pose: Pose
     nuisances: Nuisances
     covariance: Floats
     located: Mask
+    components: Components = Components()
 
 
 @dataclass(frozen=True, eq=False)
 class Maximum:
-    """The most likely pose and nuisances, the covariance (6, 6) of the pose, and the ids of the LEDs used."""
+    """The most likely pose and nuisances, the covariance (6, 6) of the pose, and the ids of the LEDs used.
+
+    `components` are those of the priors; `last` is the result of the last search, with `pixels`.
+    """
 
     pose: Pose
     nuisances: Nuisances
     covariance: Floats
     leds: tuple[int, ...]
+    components: Components
     last: "_ScoringResult"
     pixels: LedPixels
 
@@ -129,20 +152,53 @@ def ml(frame: DeviceFrame) -> Estimate:
             raise EstimationFailure("position", "too few LEDs identified to fix a position")
         pose = fit(observations, upright).pose
     else:
-        agreed = agreement(observations)
+        agreed = _agreement(observations)
         pose, inliers = agreed.best.pose, agreed.inliers
         use_gravity, is_ambiguous = agreed.gravity, ambiguous(agreed)
     gravity = gravity_of(frame) if use_gravity else NO_GRAVITY
-    priors = Priors.of(frame, tuple(frame.leds.values()))
-    slopes = project(observations.leds_m[inliers], pose, frame.camera).slopes.reshape(-1, POSE_PARAMETERS)
-    slopes /= np.repeat(_start_sigma_px(observations, inliers, pose), 2)[:, None]
-    tilts = np.zeros((2, POSE_PARAMETERS))
-    tilts[:, 3:5] = np.diag(1 / gravity.sigma)
-    covariance = np.linalg.inv(slopes.T @ slopes + tilts.T @ tilts)
-    used = set(map(tuple, observations.leds_m[inliers].tolist()))
-    located = np.array([led.position_m in used for led in frame.leds.values()])
-    found = maximize(frame, gravity, priors, Start(pose, Nuisances.zero(priors), covariance, located))
+    positions = set(map(tuple, observations.leds_m[inliers].tolist()))
+    spots = [one for one in correspondences if one.led.position_m in positions]
+    found = _maximize_honestly(frame, gravity, spots, pose)
     return Estimate(found.pose.position_m, covariance_m2=found.covariance[:3, :3], ambiguous=is_ambiguous)
+
+
+def _agreement(observations: Observations) -> Consensus:
+    """Consensus of spots and gravity, at the smallest model error of the spots at which there is one."""
+    for sigma_px in MODEL_ERRORS_PX:
+        try:
+            return agreement(_with_model_error(observations, sigma_px))
+        except EstimationFailure:
+            if sigma_px == MODEL_ERRORS_PX[-1]:
+                raise
+    raise AssertionError
+
+
+def _with_model_error(observations: Observations, sigma_px: float) -> Observations:
+    spread = np.linalg.inv(observations.whitening)
+    error2 = (sigma_px * observations.camera.pixel_angle_rad) ** 2
+    covariance = spread @ spread.transpose(0, 2, 1) + error2 * np.eye(2)
+    return replace(observations, whitening=np.linalg.inv(np.linalg.cholesky(covariance)))
+
+
+def _maximize_honestly(frame: DeviceFrame, gravity: Gravity, spots: Sequence[Correspondence], pose: Pose) -> Maximum:
+    """Maximum with what the device states, and with what the images reveal beside it. Raises EstimationFailure."""
+    priors = Priors.of(frame, tuple(frame.leds.values()))
+    start = start_at_spots(frame, gravity, priors, spots, pose, Components())
+    try:
+        found = maximize(frame, gravity, priors, start)
+        revealed = _revealed(frame, gravity, priors, found)
+    except EstimationFailure as failure:
+        found, revealed = failure, START_COMPONENTS
+    for _ in range(MAX_ROUNDS):
+        if isinstance(found, Maximum) and revealed == found.components:
+            return found
+        wider = priors
+        if revealed.place_m > 0 and frame.camera.uncertainty is None:
+            wider = replace(priors, camera=_as_sold(frame.camera))
+        start = start_at_spots(frame, gravity, wider, spots, pose, revealed)
+        found = maximize(frame, gravity, wider, start)
+        revealed = _revealed(frame, gravity, wider, found)
+    return found
 
 
 def gravity_of(frame: DeviceFrame) -> Gravity:
@@ -152,32 +208,130 @@ def gravity_of(frame: DeviceFrame) -> Gravity:
     return Gravity(np.array(tilts), tilt_sigmas(frame.accelerometer, tilts[1]))
 
 
-def _start_sigma_px(observations: Observations, inliers: Mask, start: Pose) -> Floats:
-    """Accuracy (n,) of the inliers' centroids with the model error, which grows with an LED image."""
-    depth_m = start.in_camera(observations.leds_m[inliers])[:, 2]
-    # lift_m2 is 4 s^2, r^2 for a disc.
-    radius_px = np.sqrt(observations.lift_m2[inliers]) / np.abs(depth_m) / observations.camera.pixel_angle_rad
-    return np.asarray(np.hypot(START_SIGMA_PX, START_SIGMA_SHARE * radius_px))
+def start_at_spots(
+    frame: DeviceFrame,
+    gravity: Gravity,
+    priors: Priors,
+    spots: Sequence[Correspondence],
+    pose: Pose,
+    components: Components,
+) -> Start:
+    """Initial values from the centroids of identified spots, with the same priors as the pixels.
+
+    `priors` are of all LEDs of the map. Where LEDs are not where the map says, their images then are where their spots
+    are. Raises EstimationFailure if the spots do not determine a pose.
+    """
+    number = {led: k for k, led in enumerate(frame.leds)}
+    index = np.array([number[one.led.id] for one in spots], dtype=np.int64)
+    of_spots, nuisances = priors.only(index), Nuisances.zero(priors).only(index)
+    lift_m2 = np.array([4 * one.led.mean_square_extent_m2 for one in spots])
+    measured_px = np.array([(one.spot.u_px, one.spot.v_px) for one in spots])
+    used = np.ones(len(spots), dtype=bool)
+    for _ in range(START_STEPS):
+        total = components.added(of_spots)
+        camera = with_errors(frame.camera, nuisances.camera)
+        points_m = of_spots.positions_m + nuisances.shifts_m(of_spots)
+        offset_m = points_m - pose.position_m
+        # See `estimator.solvers.reprojection` on the eccentricity of a centroid.
+        points_m[:, 2] += lift_m2 * offset_m[:, 2] / (offset_m**2).sum(axis=1)
+        images = project(points_m, pose, camera)
+        radius_px = np.sqrt(lift_m2) / np.linalg.norm(offset_m, axis=1) / camera.pixel_angle_rad
+        sigma_px = np.hypot(START_SIGMA_PX, START_SIGMA_SHARE * radius_px)
+        rows = np.zeros((len(spots), 2, LOCAL_PARAMETERS))
+        rows[:, :, :POSE_PARAMETERS] = images.slopes
+        rows[:, :, POSE_PARAMETERS : IMAGE_PARAMETERS - 1] = camera_slopes(images, camera)
+        rows /= sigma_px[:, None, None]
+        right = (measured_px - images.pixels) / sigma_px[:, None]
+        angles = pose.rig_angles(camera)
+        components, solution = _tuned(components, of_spots, used, rows, right, nuisances, gravity, angles)
+        pose, nuisances = pose.moved(solution.pose_step, camera), nuisances.moved(solution.step)
+        if solution.step2 < CONVERGED_STEP2:
+            break
+    located = np.zeros(len(priors.leds), dtype=bool)
+    located[index] = True
+    everything = Nuisances.zero(priors).updated(index, nuisances)
+    return Start(pose, everything, solution.covariance, located, components)
+
+
+def _tuned(
+    components: Components,
+    stated: Priors,
+    used: Mask,
+    rows: Floats,
+    right: Floats,
+    now: Nuisances,
+    gravity: Gravity,
+    angles: Floats,
+) -> tuple[Components, Solution]:
+    """Components of the LEDs used, (n,), that agree with the step they lead to, and that step; see `solve`."""
+    solution = solve(rows, right, components.added(stated), now, gravity, angles)
+    for _ in range(MAX_TUNING):
+        new = components.updated(stated, now.moved(solution.step), solution.redundancy, used)
+        if not new.differs(components):
+            break
+        components = new
+        solution = solve(rows, right, components.added(stated), now, gravity, angles)
+    return components, solution
+
+
+def _revealed(frame: DeviceFrame, gravity: Gravity, priors: Priors, found: Maximum) -> Components:
+    """Components of a maximum, and those that its images reveal beside them, with an initial value each."""
+    pixels, result, had = found.pixels, found.last, found.components
+    if had == START_COMPONENTS or all(vars(had).values()):
+        return had
+    if result.used.sum() < min(len(result.used) - 1, MIN_USED_SHARE * len(result.used)):
+        return START_COMPONENTS
+    state = result.nuisances.state(result.pose, frame.camera, priors.only(pixels.index))
+    rendered = pixels.model.render(state, np.arange(IMAGE_PARAMETERS))
+    profile = result.nuisances.profile()
+    photometry = fit_photometry(pixels, rendered, result.used, Noise.of(frame), result.photometry, profile)
+    information, gradient = (one[result.used] for one in score(pixels, rendered, photometry, profile))
+    radius_px = pixels.radius_px[result.used]
+
+    def reveals(columns: list[int], tolerance: Floats, more: float = 0.0, freedom: int = 0) -> bool:
+        """Whether the LEDs' parameters of these columns differ from 0 by more than the noise and a tolerance (n,)."""
+        D, g = information[:, columns][:, :, columns], gradient[:, columns]
+        spread = D + D @ D * tolerance[:, None, None] ** 2 + 1e-12 * np.trace(D, axis1=1, axis2=2)[:, None, None] * np.eye(len(columns))
+        total = np.einsum("ni,ni->", g, np.linalg.solve(spread, g[:, :, None])[:, :, 0]) + more
+        return bool(total > chi2.isf(REVEALED_PROBABILITY, g.size + freedom))
+
+    # A shift of the principal point is one of the image.
+    shift = [POSE_PARAMETERS + 2, POSE_PARAMETERS + 3]
+    size, of_profile = [IMAGE_PARAMETERS - 1], [IMAGE_PARAMETERS + k for k in range(PROFILE_PARAMETERS)]
+    z = result.nuisances.standardized(had.added(priors).only(pixels.index))
+    of_priors = gravity.deviance(result.pose.rig_angles(frame.camera)) + float(
+        (z.camera**2).sum() + (z.datum**2).sum() + (z.luminaires**2).sum() + (z.leds[result.used, :3] ** 2).sum()
+    )
+    ones = np.ones(len(radius_px))
+    new = {}
+    if had.place_m == 0 and reveals(shift, SHIFT_TOLERANCE_PX * ones, of_priors, 2):
+        new["place_m"] = START_COMPONENTS.place_m
+    if had.size == 0 and reveals(size, SIZE_TOLERANCE_PX / radius_px):
+        new["size"] = START_COMPONENTS.size
+    if had.profile == 0 and reveals(of_profile, PROFILE_TOLERANCE * ones):
+        new["profile"] = START_COMPONENTS.profile
+    return replace(had, **new)
 
 
 def maximize(frame: DeviceFrame, gravity: Gravity, priors: Priors, start: Start) -> Maximum:
     """Maximum of the likelihood from initial values; `priors` are of all LEDs of the map. Raises EstimationFailure."""
     pose, nuisances, covariance, located = start.pose, start.nuisances, start.covariance, start.located.copy()
+    components = start.components
     excluded = np.zeros(len(priors.leds), dtype=bool)
     before: Mask | None = None
-    sigma_m = priors.position_sigma_m()
     for _ in range(MAX_STEPS):
         state = nuisances.state(pose, frame.camera, priors)
-        view = leds_in_view(frame, state, covariance, sigma_m, located)
+        view = leds_in_view(frame, state, covariance, components.added(priors).position_sigma_m(), located)
         pixels = gather_led_pixels(frame, view, _parameters(priors))
         located[pixels.index] = True
         used = ~excluded[pixels.index]
         search = _Search(frame, pixels, gravity, priors.only(pixels.index))
-        result = search.run(used, pose, nuisances.only(pixels.index))
+        result = search.run(used, pose, nuisances.only(pixels.index), components)
         while result.converged and (unexplained := _unexplained(result)).any():
             used &= ~unexplained
-            result = search.run(used, result.pose, result.nuisances)
+            result = search.run(used, result.pose, result.nuisances, result.components)
         pose, nuisances = result.pose, nuisances.updated(pixels.index, result.nuisances)
+        components = result.components
         excluded[pixels.index[~used]] = True
         if result.converged:
             covariance = result.solution.covariance
@@ -187,7 +341,7 @@ def maximize(frame: DeviceFrame, gravity: Gravity, priors: Priors, start: Start)
             now[pixels.index] = True
             if not pixels.more or (before is not None and (now == before).all()):
                 ids = tuple(sorted(led.id for led, use in zip(pixels.leds, used, strict=True) if use))
-                return Maximum(pose, nuisances, covariance, ids, result, pixels)
+                return Maximum(pose, nuisances, covariance, ids, components, result, pixels)
             # The better known pose may determine the images of more LEDs.
             before = now
     raise EstimationFailure("fit", DIVERGED)
@@ -211,6 +365,8 @@ class _ScoringResult:
     nuisances: Nuisances
     converged: bool
     solution: Solution
+    components: Components
+    photometry: PhotometricFit
     used: Mask
     faint: Mask
     excess: Floats
@@ -230,10 +386,11 @@ class _Search:
         self._centres_m = np.array([led.position_m for led in pixels.leds])
         self._origin_px = self._rims_px(pixels.state)
 
-    def run(self, used: Mask, pose: Pose, nuisances: Nuisances) -> _ScoringResult:
+    def run(self, used: Mask, pose: Pose, nuisances: Nuisances, components: Components) -> _ScoringResult:
         """Scoring with the LEDs used, (n,), to convergence or until the images leave the gathered pixels."""
         pixels, camera = self._pixels, self._camera
-        priors = self._with_edge_errors(used)
+        stated = self._with_edge_errors(used)
+        priors = components.added(stated)
         photometry: PhotometricFit | None = None
         step, factor, accepted, min_deviance = None, 1.0, (pose, nuisances), np.inf
         for _ in range(MAX_STEPS):
@@ -248,9 +405,13 @@ class _Search:
                 factor /= 4
                 pose, nuisances = self._moved(accepted, step, factor)
                 continue
-            photometry, accepted, min_deviance = candidate, (pose, nuisances), deviance
+            photometry, accepted = candidate, (pose, nuisances)
             rows, right = square_root(*score(pixels, rendered, photometry, profile))
-            before, step = step, solve(rows, right, priors, nuisances, self._gravity, angles)
+            before = step
+            components, step = _tuned(components, stated, used, rows, right, nuisances, self._gravity, angles)
+            priors = components.added(stated)
+            of_priors = self._gravity.deviance(angles) + nuisances.deviance(priors)
+            min_deviance = candidate.deviance + of_priors / len(pixels.electrons)
             factor = 1.0 if before is None else self._damping(step, before, factor)
             moved_px = self._movement_px(accepted, step, factor, priors)
             factor *= min(1.0, MAX_STEP_PX / max(moved_px, 1e-12))
@@ -268,7 +429,7 @@ class _Search:
             np.bincount(pixels.led, excess_chi2(pixels, rendered, photometry), count), dtype=np.float64
         )
         faint = used & (max_signal_to_noise < MIN_SIGNAL_TO_NOISE)
-        return _ScoringResult(pose, nuisances, converged, step, used, faint, excess)
+        return _ScoringResult(pose, nuisances, converged, step, components, photometry, used, faint, excess)
 
     def _damping(self, step: Solution, before: Solution, factor: float) -> float:
         """Factor of a step: a half where it takes back much of the one before."""
@@ -320,6 +481,14 @@ def _unexplained(result: _ScoringResult) -> Mask:
         return result.faint
     excess = np.where(result.used, result.excess, 0.0)
     return np.asarray((excess > 0) & (excess >= MIN_EXCLUDED_SHARE * excess.max()))
+
+
+def _as_sold(camera: Camera) -> Floats:
+    corner_px = np.hypot(camera.width_px, camera.height_px) / 2
+    radius = corner_px / camera.K[0][0]
+    k1, p = 6.0 / camera.pixel_pitch_um / (corner_px * radius**2), 1.2 / camera.pixel_pitch_um / (3 * corner_px * radius)
+    of_lens = [k1, p, p] if camera.projection == "perspective" else [0.0, 0.0, 0.0]
+    return np.array([0.01, 3e-4, 54 / camera.pixel_pitch_um, 54 / camera.pixel_pitch_um, *of_lens])
 
 
 ML = Variant(

@@ -120,6 +120,55 @@ class Priors:
         return np.concatenate([shift, self.positions_m[:, :, None]], axis=2)
 
 
+@dataclass(frozen=True)
+class Components:
+    """Standard deviations that the images of a frame reveal beside those that the device states; 0 for none.
+
+    `place_m` of each LED's x, y and z, metres; `size`, relative; `profile` of each coefficient.
+    """
+
+    place_m: float = 0.0
+    size: float = 0.0
+    profile: float = 0.0
+
+    def added(self, stated: Priors) -> Priors:
+        """Priors with both."""
+        extra = np.array([self.place_m] * 3 + [self.size] + [self.profile] * PROFILE_PARAMETERS)
+        return replace(stated, leds=np.hypot(stated.leds, extra))
+
+    def updated(self, stated: Priors, values: "Nuisances", redundancy: Floats, used: NDArray[np.bool_]) -> "Components":
+        """Components whose priors agree with the values of the LEDs used, (n,), and their redundancy (n, 7).
+
+        Foerstner (1979): the squares of residuals, in units of the variance assumed, over their redundancy. A component
+        of 0 stays 0, and so does one that is not controlled.
+        """
+        total = self.added(stated)
+        z2 = (values.standardized(total).leds ** 2)[used]
+        new = {}
+        for name, columns in COLUMNS_OF_COMPONENT.items():
+            now = getattr(self, name)
+            controlled = float(redundancy[used][:, columns].sum())
+            if now > 0 and controlled > MIN_REDUNDANCY:
+                ratio = float(z2[:, columns].sum()) / controlled
+                variance = ratio * (total.leds[used][:, columns] ** 2).mean() - (stated.leds[used][:, columns] ** 2).mean()
+                now = float(np.sqrt(max(variance, (MIN_COMPONENT * now) ** 2)))
+            new[name] = now
+        return Components(**new)
+
+    def differs(self, other: "Components") -> bool:
+        """Whether a component is other than in `other` by more than a twentieth."""
+        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
+        return any(abs(a - b) > 0.05 * max(a, b) for a, b in pairs)
+
+
+# Columns of an LED's own nuisances that have one component.
+COLUMNS_OF_COMPONENT = {"place_m": [0, 1, 2], "size": [3], "profile": [4, 5, 6]}
+# Redundancy of a component below which it is not estimated.
+MIN_REDUNDANCY = 0.5
+# Smallest ratio of a component to its former value.
+MIN_COMPONENT = 0.1
+
+
 @dataclass(frozen=True, eq=False)
 class Nuisances:
     """Values of the nuisances: true less believed; shapes and units as in `Priors`."""
@@ -213,11 +262,12 @@ class Solution:
 
 def square_root(information: Floats, gradient: Floats) -> tuple[Floats, Floats]:
     """Rows (n, p, p) and right-hand sides (n, p) of least squares with the information (n, p, p), gradient (n, p)."""
-    scale = 1 / np.sqrt(np.maximum(np.diagonal(information, axis1=1, axis2=2), 1e-300))
-    values, vectors = np.linalg.eigh(information * scale[:, :, None] * scale[:, None])
+    diagonal = np.diagonal(information, axis1=1, axis2=2)
+    scale = np.divide(1.0, np.sqrt(np.maximum(diagonal, 0.0)), out=np.zeros_like(diagonal), where=diagonal > 0)
+    values, vectors = np.linalg.eigh(np.clip(information * scale[:, :, None] * scale[:, None], -1.0, 1.0))
     kept = values > MIN_INFORMATION_SHARE * values[:, -1:]
     root = np.sqrt(np.where(kept, values, 0.0))
-    rows = (vectors * root[:, None]).transpose(0, 2, 1) / scale[:, None]
+    rows = (vectors * root[:, None]).transpose(0, 2, 1) * np.sqrt(np.maximum(diagonal, 0.0))[:, None]
     right = np.einsum("nij,ni->nj", vectors, gradient * scale)
     return rows, np.divide(right, root, out=np.zeros_like(right), where=kept)
 
