@@ -125,7 +125,7 @@ class Start:
 class Maximum:
     """The most likely pose and nuisances, the covariance (6, 6) of the pose, and the ids of the LEDs used.
 
-    `components` are those of the priors; `last` is the result of the last search, with `pixels`.
+    `components` are those of the priors, `model_is_wrong` says whether many LEDs are not explained; `last` is the result of the last search, with `pixels`.
     """
 
     pose: Pose
@@ -133,6 +133,7 @@ class Maximum:
     covariance: Floats
     leds: tuple[int, ...]
     components: Components
+    model_is_wrong: bool
     last: "_ScoringResult"
     pixels: LedPixels
 
@@ -146,27 +147,28 @@ def ml(frame: DeviceFrame) -> Estimate:
     correspondences = find_correspondences(frame)
     observations = observe(frame, correspondences)
     inliers, use_gravity, is_ambiguous = np.ones(len(observations.leds_m), dtype=bool), True, False
+    model_error_px = 0.0
     if len(observations.leds_m) < MIN_FOR_CONSENSUS:
         upright = upright_pose(observations)
         if upright is None:
             raise EstimationFailure("position", "too few LEDs identified to fix a position")
         pose = fit(observations, upright).pose
     else:
-        agreed = _agreement(observations)
+        agreed, model_error_px = _agreement(observations)
         pose, inliers = agreed.best.pose, agreed.inliers
         use_gravity, is_ambiguous = agreed.gravity, ambiguous(agreed)
     gravity = gravity_of(frame) if use_gravity else NO_GRAVITY
     positions = set(map(tuple, observations.leds_m[inliers].tolist()))
     spots = [one for one in correspondences if one.led.position_m in positions]
-    found = _maximize_honestly(frame, gravity, spots, pose)
+    found = _maximize_honestly(frame, gravity, spots, pose, exact=model_error_px == 0)
     return Estimate(found.pose.position_m, covariance_m2=found.covariance[:3, :3], ambiguous=is_ambiguous)
 
 
-def _agreement(observations: Observations) -> Consensus:
-    """Consensus of spots and gravity, at the smallest model error of the spots at which there is one."""
+def _agreement(observations: Observations) -> tuple[Consensus, float]:
+    """Consensus of spots and gravity, and the smallest model error of the spots, pixels, at which there is one."""
     for sigma_px in MODEL_ERRORS_PX:
         try:
-            return agreement(_with_model_error(observations, sigma_px))
+            return agreement(_with_model_error(observations, sigma_px)), sigma_px
         except EstimationFailure:
             if sigma_px == MODEL_ERRORS_PX[-1]:
                 raise
@@ -180,17 +182,25 @@ def _with_model_error(observations: Observations, sigma_px: float) -> Observatio
     return replace(observations, whitening=np.linalg.inv(np.linalg.cholesky(covariance)))
 
 
-def _maximize_honestly(frame: DeviceFrame, gravity: Gravity, spots: Sequence[Correspondence], pose: Pose) -> Maximum:
-    """Maximum with what the device states, and with what the images reveal beside it. Raises EstimationFailure."""
+def _maximize_honestly(
+    frame: DeviceFrame, gravity: Gravity, spots: Sequence[Correspondence], pose: Pose, exact: bool
+) -> Maximum:
+    """Maximum with what the device states, and with what the images reveal beside it. Raises EstimationFailure.
+
+    `exact` says whether the spots agree with what the device states.
+    """
     priors = Priors.of(frame, tuple(frame.leds.values()))
-    start = start_at_spots(frame, gravity, priors, spots, pose, Components())
-    try:
-        found = maximize(frame, gravity, priors, start)
-        revealed = _revealed(frame, gravity, priors, found)
-    except EstimationFailure as failure:
-        found, revealed = failure, START_COMPONENTS
+    found, revealed = None, START_COMPONENTS
+    if exact:
+        try:
+            start = start_at_spots(frame, gravity, priors, spots, pose, Components())
+            found = maximize(frame, gravity, priors, start)
+            revealed = _revealed(frame, gravity, priors, found)
+        except EstimationFailure:
+            if len(spots) < MIN_FOR_CONSENSUS:
+                raise
     for _ in range(MAX_ROUNDS):
-        if isinstance(found, Maximum) and revealed == found.components:
+        if found is not None and revealed == found.components:
             return found
         wider = priors
         if revealed.place_m > 0 and frame.camera.uncertainty is None:
@@ -198,6 +208,8 @@ def _maximize_honestly(frame: DeviceFrame, gravity: Gravity, spots: Sequence[Cor
         start = start_at_spots(frame, gravity, wider, spots, pose, revealed)
         found = maximize(frame, gravity, wider, start)
         revealed = _revealed(frame, gravity, wider, found)
+    if found is None:
+        raise EstimationFailure("fit", DIVERGED)
     return found
 
 
@@ -279,7 +291,7 @@ def _revealed(frame: DeviceFrame, gravity: Gravity, priors: Priors, found: Maxim
     pixels, result, had = found.pixels, found.last, found.components
     if had == START_COMPONENTS or all(vars(had).values()):
         return had
-    if result.used.sum() < min(len(result.used) - 1, MIN_USED_SHARE * len(result.used)):
+    if found.model_is_wrong:
         return START_COMPONENTS
     state = result.nuisances.state(result.pose, frame.camera, priors.only(pixels.index))
     rendered = pixels.model.render(state, np.arange(IMAGE_PARAMETERS))
@@ -291,7 +303,11 @@ def _revealed(frame: DeviceFrame, gravity: Gravity, priors: Priors, found: Maxim
     def reveals(columns: list[int], tolerance: Floats, more: float = 0.0, freedom: int = 0) -> bool:
         """Whether the LEDs' parameters of these columns differ from 0 by more than the noise and a tolerance (n,)."""
         D, g = information[:, columns][:, :, columns], gradient[:, columns]
-        spread = D + D @ D * tolerance[:, None, None] ** 2 + 1e-12 * np.trace(D, axis1=1, axis2=2)[:, None, None] * np.eye(len(columns))
+        spread = (
+            D
+            + D @ D * tolerance[:, None, None] ** 2
+            + 1e-12 * np.trace(D, axis1=1, axis2=2)[:, None, None] * np.eye(len(columns))
+        )
         total = np.einsum("ni,ni->", g, np.linalg.solve(spread, g[:, :, None])[:, :, 0]) + more
         return bool(total > chi2.isf(REVEALED_PROBABILITY, g.size + freedom))
 
@@ -319,6 +335,7 @@ def maximize(frame: DeviceFrame, gravity: Gravity, priors: Priors, start: Start)
     components = start.components
     excluded = np.zeros(len(priors.leds), dtype=bool)
     before: Mask | None = None
+    wrong = 0
     for _ in range(MAX_STEPS):
         state = nuisances.state(pose, frame.camera, priors)
         view = leds_in_view(frame, state, covariance, components.added(priors).position_sigma_m(), located)
@@ -329,6 +346,9 @@ def maximize(frame: DeviceFrame, gravity: Gravity, priors: Priors, start: Start)
         result = search.run(used, pose, nuisances.only(pixels.index), components)
         while result.converged and (unexplained := _unexplained(result)).any():
             used &= ~unexplained
+            wrong += 0 if result.faint.any() else int(unexplained.sum())
+            if _model_is_wrong(wrong, int(used.sum())):
+                break
             result = search.run(used, result.pose, result.nuisances, result.components)
         pose, nuisances = result.pose, nuisances.updated(pixels.index, result.nuisances)
         components = result.components
@@ -341,10 +361,17 @@ def maximize(frame: DeviceFrame, gravity: Gravity, priors: Priors, start: Start)
             now[pixels.index] = True
             if not pixels.more or (before is not None and (now == before).all()):
                 ids = tuple(sorted(led.id for led, use in zip(pixels.leds, used, strict=True) if use))
-                return Maximum(pose, nuisances, covariance, ids, components, result, pixels)
+                return Maximum(
+                    pose, nuisances, covariance, ids, components, _model_is_wrong(wrong, len(ids)), result, pixels
+                )
             # The better known pose may determine the images of more LEDs.
             before = now
     raise EstimationFailure("fit", DIVERGED)
+
+
+def _model_is_wrong(wrong: int, used: int) -> bool:
+    """Whether so many LEDs are not explained that the model is wrong, and not these LEDs."""
+    return used < min(wrong + used - 1, MIN_USED_SHARE * (wrong + used))
 
 
 def _parameters(priors: Priors) -> Ints:
@@ -486,7 +513,10 @@ def _unexplained(result: _ScoringResult) -> Mask:
 def _as_sold(camera: Camera) -> Floats:
     corner_px = np.hypot(camera.width_px, camera.height_px) / 2
     radius = corner_px / camera.K[0][0]
-    k1, p = 6.0 / camera.pixel_pitch_um / (corner_px * radius**2), 1.2 / camera.pixel_pitch_um / (3 * corner_px * radius)
+    k1, p = (
+        6.0 / camera.pixel_pitch_um / (corner_px * radius**2),
+        1.2 / camera.pixel_pitch_um / (3 * corner_px * radius),
+    )
     of_lens = [k1, p, p] if camera.projection == "perspective" else [0.0, 0.0, 0.0]
     return np.array([0.01, 3e-4, 54 / camera.pixel_pitch_um, 54 / camera.pixel_pitch_um, *of_lens])
 

@@ -150,7 +150,9 @@ class Components:
             controlled = float(redundancy[used][:, columns].sum())
             if now > 0 and controlled > MIN_REDUNDANCY:
                 ratio = float(z2[:, columns].sum()) / controlled
-                variance = ratio * (total.leds[used][:, columns] ** 2).mean() - (stated.leds[used][:, columns] ** 2).mean()
+                variance = (
+                    ratio * (total.leds[used][:, columns] ** 2).mean() - (stated.leds[used][:, columns] ** 2).mean()
+                )
                 now = float(np.sqrt(max(variance, (MIN_COMPONENT * now) ** 2)))
             new[name] = now
         return Components(**new)
