@@ -41,7 +41,7 @@ from estimator.pixels.led_model import (
     RenderedLeds,
     rim,
 )
-from estimator.pixels.led_pixels import EDGE_PX, LedPixels, gather_led_pixels, leds_in_view
+from estimator.pixels.led_pixels import LedPixels, gather_led_pixels, leds_in_view
 from estimator.pixels.likelihood import Noise, PhotometricFit, excess_chi2, fit_photometry, score
 from estimator.pixels.nuisances import (
     LOCAL_PARAMETERS,
@@ -68,8 +68,6 @@ MAX_STEPS = 40
 CONVERGED_STEP2 = 1e-2
 # Points of a rim whose movement is looked at.
 RIM_POINTS = 4
-# Largest movement of an LED's image in one step: the linearization at edges holds within it.
-MAX_STEP_PX = 1.0
 # A step that multiplies the mean deviance by more was too long. Smaller increases occur when readings near saturation
 # enter or leave.
 MAX_DEVIANCE_RATIO = 1.01
@@ -84,6 +82,12 @@ MIN_EXCLUDED_SHARE = 0.25
 # are certain at the start.
 START_SIGMA_PX = 0.05
 START_SIGMA_SHARE = 2e-3
+# Where the initial pose knows rims less well than this, relative to their centres, the search is damped at first: what
+# the images say little of would move far beyond the linearization. Damping starts at the information of the initial
+# pose, and changes by DAMPING_RATIO with the length of a step, down to MIN_DAMPING.
+DAMPED_SIGMA_PX = 0.3
+DAMPING_RATIO = 8.0
+MIN_DAMPING = 1e-3
 MIN_FOR_CONSENSUS = 3
 START_STEPS = 10
 # Errors of the spots beside their noise, in turn, until the spots agree on a pose.
@@ -96,6 +100,8 @@ SIZE_TOLERANCE_PX = 0.02
 PROFILE_TOLERANCE = 3e-3
 # Probability that noise reveals one.
 REVEALED_PROBABILITY = 1e-9
+# Pixels gathered in one search.
+MAX_GATHERS = 12
 # Share of the LEDs in view below which it is not the LEDs that are wrong, but the model.
 MIN_USED_SHARE = 0.75
 MAX_ROUNDS = 3
@@ -184,21 +190,25 @@ def _with_model_error(observations: Observations, sigma_px: float) -> Observatio
 
 def _maximize_honestly(
     frame: DeviceFrame, gravity: Gravity, spots: Sequence[Correspondence], pose: Pose, exact: bool
-) -> Maximum:
+) -> Maximum | Start:
     """Maximum with what the device states, and with what the images reveal beside it. Raises EstimationFailure.
 
-    `exact` says whether the spots agree with what the device states.
+    `exact` says whether the spots agree with what the device states. Where the pixels lead nowhere, and place or camera
+    are uncertain, the spots' own fit is the result: it is nearly as good then, since the noise of centroids is small
+    beside that uncertainty.
     """
     priors = Priors.of(frame, tuple(frame.leds.values()))
     found, revealed = None, START_COMPONENTS
-    if exact:
+    if exact or not priors.exact:
+        start = start_at_spots(frame, gravity, priors, spots, pose, Components())
         try:
-            start = start_at_spots(frame, gravity, priors, spots, pose, Components())
             found = maximize(frame, gravity, priors, start)
             revealed = _revealed(frame, gravity, priors, found)
         except EstimationFailure:
             if len(spots) < MIN_FOR_CONSENSUS:
                 raise
+            if exact and not priors.exact:
+                return start
     for _ in range(MAX_ROUNDS):
         if found is not None and revealed == found.components:
             return found
@@ -206,7 +216,12 @@ def _maximize_honestly(
         if revealed.place_m > 0 and frame.camera.uncertainty is None:
             wider = replace(priors, camera=_as_sold(frame.camera))
         start = start_at_spots(frame, gravity, wider, spots, pose, revealed)
-        found = maximize(frame, gravity, wider, start)
+        try:
+            found = maximize(frame, gravity, wider, start)
+        except EstimationFailure:
+            if not np.trace(start.covariance[:3, :3]) < MAX_SIGMA_M**2:
+                raise
+            return start
         revealed = _revealed(frame, gravity, wider, found)
     if found is None:
         raise EstimationFailure("fit", DIVERGED)
@@ -336,13 +351,15 @@ def maximize(frame: DeviceFrame, gravity: Gravity, priors: Priors, start: Start)
     excluded = np.zeros(len(priors.leds), dtype=bool)
     before: Mask | None = None
     wrong = 0
-    for _ in range(MAX_STEPS):
+    start_information = np.linalg.inv(start.covariance)
+    damping = 1.0 if _shape_sigma_px(frame, priors, start) > DAMPED_SIGMA_PX else 0.0
+    for _ in range(MAX_GATHERS):
         state = nuisances.state(pose, frame.camera, priors)
         view = leds_in_view(frame, state, covariance, components.added(priors).position_sigma_m(), located)
         pixels = gather_led_pixels(frame, view, _parameters(priors))
         located[pixels.index] = True
         used = ~excluded[pixels.index]
-        search = _Search(frame, pixels, gravity, priors.only(pixels.index))
+        search = _Search(frame, pixels, gravity, priors.only(pixels.index), start_information, damping)
         result = search.run(used, pose, nuisances.only(pixels.index), components)
         while result.converged and (unexplained := _unexplained(result)).any():
             used &= ~unexplained
@@ -367,6 +384,21 @@ def maximize(frame: DeviceFrame, gravity: Gravity, priors: Priors, start: Start)
             # The better known pose may determine the images of more LEDs.
             before = now
     raise EstimationFailure("fit", DIVERGED)
+
+
+def _shape_sigma_px(frame: DeviceFrame, priors: Priors, start: Start) -> float:
+    """Standard deviation of the rims of the LEDs located, relative to their centres, by the initial pose; the largest."""
+    located = np.flatnonzero(start.located)
+    leds = [one for one, is_located in zip(frame.leds.values(), start.located, strict=True) if is_located]
+    rims_m = np.stack([rim(led, RIM_POINTS) for led in leds])
+    state = start.nuisances.state(start.pose, frame.camera, priors).of(located)
+    centres_m = np.array([led.position_m for led in leds]) + state.shifts_m
+    points_m = np.concatenate([centres_m[:, None], centres_m[:, None] + rims_m], axis=1)
+    slopes = project(points_m.reshape(-1, 3), state.pose, state.camera).slopes.reshape(
+        len(leds), -1, 2, POSE_PARAMETERS
+    )
+    slopes = slopes[:, 1:] - slopes[:, :1]
+    return float(np.sqrt(np.nanmax(((slopes @ start.covariance) * slopes).sum(axis=(2, 3)))))
 
 
 def _model_is_wrong(wrong: int, used: int) -> bool:
@@ -402,12 +434,22 @@ class _ScoringResult:
 class _Search:
     """Fisher scoring with the readings around LEDs; `priors` are those of the LEDs."""
 
-    def __init__(self, frame: DeviceFrame, pixels: LedPixels, gravity: Gravity, priors: Priors) -> None:
+    def __init__(
+        self,
+        frame: DeviceFrame,
+        pixels: LedPixels,
+        gravity: Gravity,
+        priors: Priors,
+        start_information: Floats,
+        damping: float,
+    ) -> None:
         self._camera = frame.camera
         self._pixels = pixels
         self._gravity = gravity
         self._priors = priors
         self._noise = Noise.of(frame)
+        self._start_information = start_information
+        self._first_damping = damping
         # Of a large LED, a point of the rim moves more than the centre.
         self._rims_m = np.stack([rim(led, RIM_POINTS) for led in pixels.leds])
         self._centres_m = np.array([led.position_m for led in pixels.leds])
@@ -420,6 +462,7 @@ class _Search:
         priors = components.added(stated)
         photometry: PhotometricFit | None = None
         step, factor, accepted, min_deviance = None, 1.0, (pose, nuisances), np.inf
+        damping = self._first_damping
         for _ in range(MAX_STEPS):
             state = nuisances.state(pose, camera, priors)
             rendered = self._rendered(state)
@@ -435,17 +478,25 @@ class _Search:
             photometry, accepted = candidate, (pose, nuisances)
             rows, right = square_root(*score(pixels, rendered, photometry, profile))
             before = step
-            components, step = _tuned(components, stated, used, rows, right, nuisances, self._gravity, angles)
+            if damping > 0:
+                held = damping * self._start_information
+                step = solve(rows, right, priors, nuisances, self._gravity, angles, held)
+            else:
+                components, step = _tuned(components, stated, used, rows, right, nuisances, self._gravity, angles)
             priors = components.added(stated)
             of_priors = self._gravity.deviance(angles) + nuisances.deviance(priors)
             min_deviance = candidate.deviance + of_priors / len(pixels.electrons)
             factor = 1.0 if before is None else self._damping(step, before, factor)
             moved_px = self._movement_px(accepted, step, factor, priors)
-            factor *= min(1.0, MAX_STEP_PX / max(moved_px, 1e-12))
-            converged = step.step2 * factor**2 < CONVERGED_STEP2 and moved_px < MAX_STEP_PX
+            factor *= min(1.0, pixels.max_move_px / max(moved_px, 1e-12))
+            short = moved_px < pixels.max_move_px
+            converged = step.step2 * factor**2 < CONVERGED_STEP2 and short and damping == 0
+            if damping > 0:
+                damping *= DAMPING_RATIO ** (-1 if short else moved_px > 4 * pixels.max_move_px)
+                damping = damping if damping > MIN_DAMPING else 0.0
             pose, nuisances = self._moved(accepted, step, factor)
             off_px = self._rims_px(nuisances.state(pose, camera, priors)) - self._origin_px
-            if converged or not bool((np.linalg.norm(off_px, axis=-1) < EDGE_PX - 1).all()):
+            if converged or not bool((np.linalg.norm(off_px, axis=-1) < pixels.max_move_px).all()):
                 break
         else:
             raise EstimationFailure("fit", DIVERGED)

@@ -62,7 +62,8 @@ class LedPixels:
     With the coordinates (a, b) of a pixel on the face, in half widths from its centre: `background` (m, 4) is the
     lens's fall-off times 1, a, b and a^2 + b^2; `face` (m, 3) is the mean of a, b and a^2 + b^2 - 1/2 over a reading.
     `uniform_light` (m,) is the light inside the LED image summed over the pixels of a reading, 0 for edge pixels, whose
-    light depends on the state. `radius_px` (n,) is half the larger side of an LED image's bounding box. `more` says whether other LEDs of the map may be in view, whose images the state does
+    light depends on the state. `radius_px` (n,) is half the larger side of an LED image's bounding box. Images may move by `max_move_px`
+    before their pixels have to be sorted anew. `more` says whether other LEDs of the map may be in view, whose images the state does
     not determine well enough.
     """
 
@@ -81,6 +82,7 @@ class LedPixels:
     starts: Ints
     led: Ints
     radius_px: Floats
+    max_move_px: float
     more: bool
 
     @property
@@ -191,6 +193,7 @@ def gather_led_pixels(frame: DeviceFrame, view: LedsInView, parameters: Ints = P
         starts=starts,
         led=np.array(led_of_group),
         radius_px=(footprints.high - footprints.low).max(axis=1) / 2,
+        max_move_px=EDGE_PX - 1,
         more=view.more,
     )
 

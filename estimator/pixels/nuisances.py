@@ -274,10 +274,19 @@ def square_root(information: Floats, gradient: Floats) -> tuple[Floats, Floats]:
     return rows, np.divide(right, root, out=np.zeros_like(right), where=kept)
 
 
-def solve(rows: Floats, right: Floats, priors: Priors, now: Nuisances, gravity: Gravity, angles: Floats) -> Solution:
+def solve(
+    rows: Floats,
+    right: Floats,
+    priors: Priors,
+    now: Nuisances,
+    gravity: Gravity,
+    angles: Floats,
+    damping: Floats | None = None,
+) -> Solution:
     """Step of pose and nuisances that minimizes the squares of `rows` (n, r, p) x step - `right` (n, r), and priors.
 
-    The columns are the LOCAL_PARAMETERS; `angles` (3,) are the rig's. Raises EstimationFailure if the pose is not
+    The columns are the LOCAL_PARAMETERS; `angles` (3,) are the rig's; `damping` (6, 6), if given, is an information that
+    keeps the pose where it is (Levenberg-Marquardt), and is part of `Solution.covariance`. Raises EstimationFailure if the pose is not
     determined.
     """
     n = len(rows)
@@ -322,6 +331,10 @@ def solve(rows: Floats, right: Floats, priors: Priors, now: Nuisances, gravity: 
     prior[tilt, tilt] = 1 / gravity.sigma
     prior[tilt, -1] = gravity.residual(angles)
     total = np.concatenate([prior, *remaining])
+    if damping is not None:
+        held = np.zeros((POSE_PARAMETERS, COMMON_PARAMETERS + 1))
+        held[:, known:-1] = np.linalg.cholesky(damping).T
+        total = np.concatenate([total, held])
     scale = np.linalg.norm(total[:, :-1], axis=0)
     if not np.isfinite(total).all() or not (scale > 0).all():
         raise EstimationFailure("fit", UNDETERMINED)
