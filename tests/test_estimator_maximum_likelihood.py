@@ -13,8 +13,10 @@ from estimator.camera.pose import Pose, rotation
 from estimator.errors import EstimationFailure
 from estimator.io.device import Accelerometer, Camera, DecodedSpot, DeviceFrame, DiscLed, Part, Sensor
 from estimator.methods import maximum_likelihood
-from estimator.methods.maximum_likelihood import Gravity, maximize, ml
-from estimator.pixels.led_pixels import gather_led_pixels
+from estimator.methods.maximum_likelihood import Maximum, Start, gravity_of, maximize, ml
+from estimator.pixels.led_model import ImageState
+from estimator.pixels.led_pixels import gather_led_pixels, leds_in_view
+from estimator.pixels.nuisances import Gravity, Nuisances, Priors
 
 Floats = NDArray[np.float64]
 TARGET = (3.5, 3.6, 3.5)
@@ -38,6 +40,16 @@ def frame_of(view: View, leds_m: Floats, image_dn: NDArray[np.uint32], error_deg
         spots=tuple(DecodedSpot(led=10 + int(k), u_px=pixels[k, 0], v_px=pixels[k, 1]) for k in np.flatnonzero(inside)),
         leds={10 + k: DiscLed(id=10 + k, position_m=led, radius_m=0.01) for k, led in enumerate(leds_m)},
     )
+
+
+SURE = np.eye(6) * 1e-12
+
+
+def most_likely(frame: DeviceFrame, start: Pose, gravity: Gravity | None = None) -> Maximum:
+    """The maximum from a pose that is nearly certain, with an exact map."""
+    priors = Priors.of(frame, tuple(frame.leds.values()))
+    begin = Start(start, Nuisances.zero(priors), SURE, np.zeros(len(frame.leds), dtype=bool))
+    return maximize(frame, gravity or gravity_of(frame), priors, begin)
 
 
 def misread(view: View, frame: DeviceFrame, generator: np.random.Generator) -> DeviceFrame:
@@ -251,14 +263,18 @@ def test_the_covariance_is_that_of_small_changes_of_the_answer(monkeypatch: pyte
     )
     leds = {key: led.model_copy(update={"radius_m": PAIR_RADIUS_M}) for key, led in frame.leds.items()}
     frame = replace(frame, leds=leds)
-    start, gravity = Pose(np.array(view.position_m), view.R_cam_world), Gravity.of(frame)
-    pixels = gather_led_pixels(frame, start, np.eye(6) * 1e-12)
+    start, gravity = Pose(np.array(view.position_m), view.R_cam_world), gravity_of(frame)
+    state = ImageState.as_told(start, frame.camera, 2)
+    view_of_leds = leds_in_view(frame, state, SURE, np.zeros(2), np.zeros(2, dtype=bool))
+    pixels = gather_led_pixels(
+        frame, view_of_leds, maximum_likelihood._parameters(Priors.of(frame, tuple(leds.values())))
+    )
     monkeypatch.setattr(maximum_likelihood, "CONVERGED_STEP2", 1e-10)
 
     def answer_m(electrons: Floats, gravity: Gravity = gravity) -> Floats:
         changed = replace(pixels, electrons=electrons)
         monkeypatch.setattr(maximum_likelihood, "gather_led_pixels", lambda *_: changed)
-        return maximize(frame, gravity, start, np.eye(6) * 1e-12).pose.position_m
+        return most_likely(frame, start, gravity).pose.position_m
 
     unchanged_m, share = answer_m(pixels.electrons), 0.1
     steps = [
@@ -307,7 +323,7 @@ def test_an_led_is_used_from_a_signal_of_five_sigma_on() -> None:
     lit[[0, 3, 5, 12]] = [4000.0, 4000.0, 48.0, 4000.0]
     image = poisson(render(view, leds_m, 0.01, np.where(lit > 0, lit, 40.0), samples=16), 1)
     frame = frame_of(view, leds_m, image)
-    found = maximize(frame, Gravity.of(frame), Pose(np.array(view.position_m), view.R_cam_world), np.eye(6) * 1e-12)
+    found = most_likely(frame, Pose(np.array(view.position_m), view.R_cam_world))
     assert found.leds == (10, 13, 15, 22)
 
 
@@ -328,8 +344,8 @@ def test_the_search_ends_where_the_rest_of_the_way_is_short() -> None:
     """
     truth = Pose(np.array(DIM_VIEW.position_m), DIM_VIEW.R_cam_world)
     for frame in dim_frames():
-        one = maximize(frame, Gravity.of(frame), truth, np.eye(6) * 1e-12)
-        other = maximize(frame, Gravity.of(frame), one.pose, np.eye(6) * 1e-12)
+        one = most_likely(frame, truth)
+        other = most_likely(frame, one.pose)
         moved = other.pose.position_m - one.pose.position_m
         assert moved @ np.linalg.solve(one.covariance[:3, :3], moved) < 0.02**2
 
@@ -340,9 +356,7 @@ def test_the_search_does_not_go_back_and_forth_over_a_kink() -> None:
     go back and forth by 0.15 sigma.
     """
     frame = dim_frames()[1]
-    found = maximize(
-        frame, Gravity.of(frame), Pose(np.array(DIM_VIEW.position_m), DIM_VIEW.R_cam_world), np.eye(6) * 1e-12
-    )
+    found = most_likely(frame, Pose(np.array(DIM_VIEW.position_m), DIM_VIEW.R_cam_world))
     error = found.pose.position_m - DIM_VIEW.position_m
     assert error @ np.linalg.solve(found.covariance[:3, :3], error) < chi2.ppf(0.9999, 3)
 

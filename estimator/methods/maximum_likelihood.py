@@ -66,11 +66,15 @@ Mask = NDArray[np.bool_]
 MAX_STEPS = 40
 # Fisher scoring has converged at a step of a tenth of a standard deviation, squared: the next is far shorter.
 CONVERGED_STEP2 = 1e-2
+# A search that ends by the number of its steps has converged if they are shorter than a standard deviation, squared.
+MAX_CIRCLE2 = 1.0
 # Points of a rim whose movement is looked at.
 RIM_POINTS = 4
 # A step that multiplies the mean deviance by more was too long. Smaller increases occur when readings near saturation
 # enter or leave.
 MAX_DEVIANCE_RATIO = 1.01
+# A step is shortened so many times at most: where a wrong LED's weights change, the deviance grows without a step.
+MAX_SHORTENED = 3
 # A step that takes back more than this share of the one before overshoots and is halved: where an edge enters a pixel,
 # the likelihood is curved more than the information says, and full steps would go back and forth for ever.
 MAX_RETURN = 0.5
@@ -100,7 +104,9 @@ SIZE_TOLERANCE_PX = 0.02
 PROFILE_TOLERANCE = 3e-3
 # Probability that noise reveals one.
 REVEALED_PROBABILITY = 1e-9
-# Pixels gathered in one search.
+# Movement of an image above which its pixels are gathered once more.
+MAX_SETTLED_PX = 0.05
+# Largest number of times that pixels are gathered in one search.
 MAX_GATHERS = 12
 # Share of the LEDs in view below which it is not the LEDs that are wrong, but the model.
 MIN_USED_SHARE = 0.75
@@ -350,7 +356,7 @@ def maximize(frame: DeviceFrame, gravity: Gravity, priors: Priors, start: Start)
     components = start.components
     excluded = np.zeros(len(priors.leds), dtype=bool)
     before: Mask | None = None
-    wrong = 0
+    wrong, settled = 0, False
     start_information = np.linalg.inv(start.covariance)
     damping = 1.0 if _shape_sigma_px(frame, priors, start) > DAMPED_SIGMA_PX else 0.0
     for _ in range(MAX_GATHERS):
@@ -370,7 +376,8 @@ def maximize(frame: DeviceFrame, gravity: Gravity, priors: Priors, start: Start)
         pose, nuisances = result.pose, nuisances.updated(pixels.index, result.nuisances)
         components = result.components
         excluded[pixels.index[~used]] = True
-        if result.converged:
+        # Which pixels are next to an edge depends on where it was when they were gathered.
+        if result.converged and (result.moved_px < MAX_SETTLED_PX or settled):
             covariance = result.solution.covariance
             if not np.trace(covariance[:3, :3]) < MAX_SIGMA_M**2:
                 raise EstimationFailure("fit", "the LEDs in view do not determine a position")
@@ -383,12 +390,15 @@ def maximize(frame: DeviceFrame, gravity: Gravity, priors: Priors, start: Start)
                 )
             # The better known pose may determine the images of more LEDs.
             before = now
+        settled = result.converged
     raise EstimationFailure("fit", DIVERGED)
 
 
 def _shape_sigma_px(frame: DeviceFrame, priors: Priors, start: Start) -> float:
     """Standard deviation of the rims of the LEDs located, relative to their centres, by the initial pose; the largest."""
     located = np.flatnonzero(start.located)
+    if len(located) == 0:
+        return 0.0
     leds = [one for one, is_located in zip(frame.leds.values(), start.located, strict=True) if is_located]
     rims_m = np.stack([rim(led, RIM_POINTS) for led in leds])
     state = start.nuisances.state(start.pose, frame.camera, priors).of(located)
@@ -418,6 +428,7 @@ class _ScoringResult:
 
     `converged` says whether the maximum was reached, and not the limit of validity of the gathered pixels. `used`,
     `faint` (used, but with a low signal-to-noise ratio) and `excess` (of chi-square over its limit) are by LED, (n,).
+    `moved_px` is the largest movement of an image since its pixels were gathered.
     """
 
     pose: Pose
@@ -429,6 +440,7 @@ class _ScoringResult:
     used: Mask
     faint: Mask
     excess: Floats
+    moved_px: float
 
 
 class _Search:
@@ -462,7 +474,7 @@ class _Search:
         priors = components.added(stated)
         photometry: PhotometricFit | None = None
         step, factor, accepted, min_deviance = None, 1.0, (pose, nuisances), np.inf
-        damping = self._first_damping
+        damping, shortened = self._first_damping, 0
         for _ in range(MAX_STEPS):
             state = nuisances.state(pose, camera, priors)
             rendered = self._rendered(state)
@@ -471,11 +483,13 @@ class _Search:
             candidate = fit_photometry(pixels, rendered, used, self._noise, photometry, profile)
             of_priors = self._gravity.deviance(angles) + nuisances.deviance(priors)
             deviance = candidate.deviance + of_priors / len(pixels.electrons)
-            if step is not None and deviance > MAX_DEVIANCE_RATIO * min_deviance:  # too long for the linearization
+            too_long = step is not None and deviance > MAX_DEVIANCE_RATIO * min_deviance  # for the linearization
+            if too_long and shortened < MAX_SHORTENED:
+                shortened += 1
                 factor /= 4
                 pose, nuisances = self._moved(accepted, step, factor)
                 continue
-            photometry, accepted = candidate, (pose, nuisances)
+            photometry, accepted, shortened = candidate, (pose, nuisances), 0
             rows, right = square_root(*score(pixels, rendered, photometry, profile))
             before = step
             if damping > 0:
@@ -499,7 +513,10 @@ class _Search:
             if converged or not bool((np.linalg.norm(off_px, axis=-1) < pixels.max_move_px).all()):
                 break
         else:
-            raise EstimationFailure("fit", DIVERGED)
+            # Wrong LEDs may make the search go round in small circles.
+            converged = damping == 0 and step is not None and step.step2 * factor**2 < MAX_CIRCLE2
+            if not converged:
+                raise EstimationFailure("fit", DIVERGED)
         count = len(pixels.leds)
         max_signal_to_noise = np.zeros(count)
         np.maximum.at(max_signal_to_noise, pixels.led, photometry.signal_to_noise)
@@ -507,7 +524,7 @@ class _Search:
             np.bincount(pixels.led, excess_chi2(pixels, rendered, photometry), count), dtype=np.float64
         )
         faint = used & (max_signal_to_noise < MIN_SIGNAL_TO_NOISE)
-        return _ScoringResult(pose, nuisances, converged, step, components, photometry, used, faint, excess)
+        return _ScoringResult(pose, nuisances, converged, step, components, photometry, used, faint, excess, float(np.linalg.norm(off_px, axis=-1).max()))
 
     def _damping(self, step: Solution, before: Solution, factor: float) -> float:
         """Factor of a step: a half where it takes back much of the one before."""

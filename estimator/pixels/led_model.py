@@ -35,7 +35,7 @@ MIN_POINTS = 128
 EDGE_MARGIN = 1.25
 # Chebyshev nodes across and down a region at which the lens's fall-off is computed; it is interpolated between them by
 # a polynomial. Over a region of 0.5 rad, cos^4 is then exact to 1e-6 of the light (tested).
-FALL_OFF_NODES = 8
+FALL_OFF_NODES = 10
 
 
 IMAGE_PARAMETERS = POSE_PARAMETERS + CAMERA_PARAMETERS + 1

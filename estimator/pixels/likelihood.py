@@ -36,7 +36,7 @@ COEFFICIENTS = 5
 MIN_DETERMINANT = 1e-9
 # Standard deviations a priori of the background's slopes by a and b, its curvature: relative to
 # the background's level plus HALO_SHARE of the amplitude.
-BACKGROUND_SIGMAS = (1.0, 1.0, 0.3)
+BACKGROUND_SIGMAS = (0.3, 0.3, 0.05)
 HALO_SHARE = 0.05
 # Limit of an LED's chi-square: its degrees of freedom, its own scatter in standard deviations, and a model error of the
 # edge, at most this share of the LED's light: by an inaccurate blur of the lens, or a shift of 0.05 px.
