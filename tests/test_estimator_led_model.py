@@ -197,7 +197,7 @@ def test_the_fall_off_is_the_lens_s_in_every_pixel(factor: int, distorted: bool)
 def test_slopes_by_camera_and_size_are_what_differences_give(
     parameter: int, distortion: dict[str, float] | None
 ) -> None:
-    """As for the pose. The image is within 45 px of the principal point, so that unit steps of k1, p1 and p2 are large."""
+    """As for the pose. The image is within 45 px of the principal point: steps of k1, p1 and p2 are large."""
     lens, one = camera(distortion=distortion), led("disc")
     pose = here(lens)
     model = images(lens, one, pose)

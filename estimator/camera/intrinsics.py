@@ -1,4 +1,4 @@
-"""Errors of a camera's intrinsics, in the parameters and units of `uncertainty` in dataset.json (datasets/FORMAT.md)."""
+"""Errors of a camera's intrinsics, in the parameters and units of a camera's `uncertainty` (datasets/FORMAT.md)."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -45,6 +45,7 @@ from estimator.pixels.led_pixels import LedPixels, gather_led_pixels, leds_in_vi
 from estimator.pixels.likelihood import Noise, PhotometricFit, excess_chi2, fit_photometry, score
 from estimator.pixels.nuisances import (
     LOCAL_PARAMETERS,
+    NO_COMPONENTS,
     NO_GRAVITY,
     Components,
     Gravity,
@@ -130,14 +131,15 @@ class Start:
     nuisances: Nuisances
     covariance: Floats
     located: Mask
-    components: Components = Components()
+    components: Components = NO_COMPONENTS
 
 
 @dataclass(frozen=True, eq=False)
 class Maximum:
     """The most likely pose and nuisances, the covariance (6, 6) of the pose, and the ids of the LEDs used.
 
-    `components` are those of the priors, `model_is_wrong` says whether many LEDs are not explained; `last` is the result of the last search, with `pixels`.
+    `components` are those of the priors. `model_is_wrong` says whether many LEDs are not explained. `last` is the
+    result of the last search, with `pixels`.
     """
 
     pose: Pose
@@ -206,7 +208,7 @@ def _maximize_honestly(
     priors = Priors.of(frame, tuple(frame.leds.values()))
     found, revealed = None, START_COMPONENTS
     if exact or not priors.exact:
-        start = start_at_spots(frame, gravity, priors, spots, pose, Components())
+        start = start_at_spots(frame, gravity, priors, spots, pose, NO_COMPONENTS)
         try:
             found = maximize(frame, gravity, priors, start)
             revealed = _revealed(frame, gravity, priors, found)
@@ -261,7 +263,6 @@ def start_at_spots(
     measured_px = np.array([(one.spot.u_px, one.spot.v_px) for one in spots])
     used = np.ones(len(spots), dtype=bool)
     for _ in range(START_STEPS):
-        total = components.added(of_spots)
         camera = with_errors(frame.camera, nuisances.camera)
         points_m = of_spots.positions_m + nuisances.shifts_m(of_spots)
         offset_m = points_m - pose.position_m
@@ -357,7 +358,7 @@ def maximize(frame: DeviceFrame, gravity: Gravity, priors: Priors, start: Start)
     excluded = np.zeros(len(priors.leds), dtype=bool)
     before: Mask | None = None
     wrong, settled = 0, False
-    start_information = np.linalg.inv(start.covariance)
+    start_information = np.asarray(np.linalg.inv(start.covariance), dtype=np.float64)
     damping = 1.0 if _shape_sigma_px(frame, priors, start) > DAMPED_SIGMA_PX else 0.0
     for _ in range(MAX_GATHERS):
         state = nuisances.state(pose, frame.camera, priors)
@@ -395,7 +396,7 @@ def maximize(frame: DeviceFrame, gravity: Gravity, priors: Priors, start: Start)
 
 
 def _shape_sigma_px(frame: DeviceFrame, priors: Priors, start: Start) -> float:
-    """Standard deviation of the rims of the LEDs located, relative to their centres, by the initial pose; the largest."""
+    """Largest standard deviation of the rims of the LEDs located, relative to their centres, by the initial pose."""
     located = np.flatnonzero(start.located)
     if len(located) == 0:
         return 0.0
@@ -417,7 +418,7 @@ def _model_is_wrong(wrong: int, used: int) -> bool:
 
 
 def _parameters(priors: Priors) -> Ints:
-    """The IMAGE_PARAMETERS that are estimated: the pose, intrinsics with a prior, and sizes, for the background's sake."""
+    """The IMAGE_PARAMETERS to estimate: the pose, intrinsics with a prior, and sizes because of the background."""
     of_camera = POSE_PARAMETERS + np.flatnonzero(priors.camera)
     return np.concatenate([POSE_ALONE, of_camera, [IMAGE_PARAMETERS - 1]])
 
@@ -473,7 +474,8 @@ class _Search:
         stated = self._with_edge_errors(used)
         priors = components.added(stated)
         photometry: PhotometricFit | None = None
-        step, factor, accepted, min_deviance = None, 1.0, (pose, nuisances), np.inf
+        factor, accepted, min_deviance = 1.0, (pose, nuisances), np.inf
+        step: Solution | None = None
         damping, shortened = self._first_damping, 0
         for _ in range(MAX_STEPS):
             state = nuisances.state(pose, camera, priors)
@@ -483,8 +485,8 @@ class _Search:
             candidate = fit_photometry(pixels, rendered, used, self._noise, photometry, profile)
             of_priors = self._gravity.deviance(angles) + nuisances.deviance(priors)
             deviance = candidate.deviance + of_priors / len(pixels.electrons)
-            too_long = step is not None and deviance > MAX_DEVIANCE_RATIO * min_deviance  # for the linearization
-            if too_long and shortened < MAX_SHORTENED:
+            too_long = deviance > MAX_DEVIANCE_RATIO * min_deviance  # for the linearization
+            if step is not None and too_long and shortened < MAX_SHORTENED:
                 shortened += 1
                 factor /= 4
                 pose, nuisances = self._moved(accepted, step, factor)
@@ -517,6 +519,8 @@ class _Search:
             converged = damping == 0 and step is not None and step.step2 * factor**2 < MAX_CIRCLE2
             if not converged:
                 raise EstimationFailure("fit", DIVERGED)
+        assert step is not None
+        assert photometry is not None
         count = len(pixels.leds)
         max_signal_to_noise = np.zeros(count)
         np.maximum.at(max_signal_to_noise, pixels.led, photometry.signal_to_noise)
@@ -524,7 +528,8 @@ class _Search:
             np.bincount(pixels.led, excess_chi2(pixels, rendered, photometry), count), dtype=np.float64
         )
         faint = used & (max_signal_to_noise < MIN_SIGNAL_TO_NOISE)
-        return _ScoringResult(pose, nuisances, converged, step, components, photometry, used, faint, excess, float(np.linalg.norm(off_px, axis=-1).max()))
+        moved = float(np.linalg.norm(off_px, axis=-1).max())
+        return _ScoringResult(pose, nuisances, converged, step, components, photometry, used, faint, excess, moved)
 
     def _damping(self, step: Solution, before: Solution, factor: float) -> float:
         """Factor of a step: a half where it takes back much of the one before."""

@@ -18,8 +18,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.camera.pose import POSE_PARAMETERS, Pose
 from estimator.camera.intrinsics import CAMERA_PARAMETERS, camera_slopes
+from estimator.camera.pose import POSE_PARAMETERS, Pose
 from estimator.camera.projection import ProjectedPoints, project, projection_of, relative_illumination
 from estimator.io.device import Camera, Led
 from estimator.pixels.polygon_raster import MAX_EDGE_PX, EdgePieces, Outlines, RoiStack, cover
@@ -86,7 +86,7 @@ class LedFootprints:
     @property
     def whole(self) -> NDArray[np.bool_]:
         """LEDs, (n,), that are imaged completely and from below."""
-        return np.isfinite(self.to_face).all(axis=(1, 2))
+        return np.asarray(np.isfinite(self.to_face).all(axis=(1, 2)))
 
     def of(self, chosen: NDArray[np.bool_] | Ints) -> "LedFootprints":
         """The footprints of the chosen LEDs."""
@@ -156,7 +156,7 @@ def fall_off(rois: RoiStack, centres_px: Floats, camera: Camera, factors: Ints |
     values = np.nan_to_num(values / relative_illumination(centres_px, camera)[:, None, None])
     cells = np.zeros(rois.cells())
     # Barycentric weights of Chebyshev's first-kind nodes.
-    barycentric = (-1.0) ** k * np.sin(np.pi * (k + 0.5) / FALL_OFF_NODES)
+    barycentric = np.asarray((-1.0) ** k * np.sin(np.pi * (k + 0.5) / FALL_OFF_NODES), dtype=np.float64)
     for roi, value in enumerate(values):
         columns, rows = (
             _interpolation((2 * np.arange(n) + 1) / n - 1, nodes, barycentric)
@@ -256,7 +256,7 @@ class LedImageModel:
 
 
 def _slopes(rims: ProjectedPoints, offsets_m: Floats, camera: Camera) -> Floats:
-    """Derivatives (n, 2, p) of points of rims by the IMAGE_PARAMETERS; `offsets_m` (n, 3) are from the LEDs' centres."""
+    """Derivatives (n, 2, p) of points of rims by the IMAGE_PARAMETERS; `offsets_m` (n, 3) are from their centres."""
     slopes = np.zeros((len(offsets_m), 2, IMAGE_PARAMETERS))
     slopes[:, :, :POSE_PARAMETERS] = rims.slopes
     slopes[:, :, POSE_PARAMETERS:-1] = camera_slopes(rims, camera)

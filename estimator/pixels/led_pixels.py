@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.camera.pose import Pose
 from estimator.camera.projection import project
 from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame, Led, Part
@@ -55,16 +54,16 @@ class LedPixels:
     The readings of a group follow each other, from `starts[k]` to `starts[k + 1]`, (g + 1,); each group has an edge
     pixel. `led` (g,) is the LED of each group, an index to `leds`.
 
-    `index` (n,) is the number of each LED in the map, `model` the image model of the LEDs, `state` the state that the pixels were sorted by, `rendered` the images
-    there. `edges` (e,) are the readings that are edge pixels, `cells` (e,) their cells in `model.rois`. `pixel_counts`
-    (m,) is the number of pixels of a reading, `electrons` (m,) their sum.
+    `index` (n,) is the number of each LED in the map, `model` the image model of the LEDs, `state` the state that the
+    pixels were sorted by, `rendered` the images there. `edges` (e,) are the readings that are edge pixels, `cells` (e,)
+    their cells in `model.rois`. `pixel_counts` (m,) is the number of pixels of a reading, `electrons` (m,) their sum.
 
     With the coordinates (a, b) of a pixel on the face, in half widths from its centre: `background` (m, 4) is the
     lens's fall-off times 1, a, b and a^2 + b^2; `face` (m, 3) is the mean of a, b and a^2 + b^2 - 1/2 over a reading.
     `uniform_light` (m,) is the light inside the LED image summed over the pixels of a reading, 0 for edge pixels, whose
-    light depends on the state. `radius_px` (n,) is half the larger side of an LED image's bounding box. Images may move by `max_move_px`
-    before their pixels have to be sorted anew. `more` says whether other LEDs of the map may be in view, whose images the state does
-    not determine well enough.
+    light depends on the state. `radius_px` (n,) is half the larger side of an LED image's bounding box. Images may move
+    by `max_move_px` before their pixels have to be sorted anew. `more` says whether other LEDs of the map may be in
+    view, whose images the state does not determine well enough.
     """
 
     leds: tuple[Led, ...]
@@ -117,7 +116,8 @@ class _Readings:
 class LedsInView:
     """LEDs of the map whose images overlap the regions read out, under a state of them; see `leds_in_view`.
 
-    `index` (n,) is the number of each in the map. `more` says whether there may be others, whose images the state does not determine well enough.
+    `index` (n,) is the number of each in the map. `more` says whether there may be others, whose images the state does
+    not determine well enough.
     """
 
     leds: tuple[Led, ...]

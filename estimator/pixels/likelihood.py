@@ -1,10 +1,10 @@
 """Likelihood of pixel readings: expected electrons, their variance, and the information about the pose.
 
 A reading is expected to be `background + amplitude x light x (1 + profile)`. Light is the LED's share of the pixels'
-light, dimmed by the lens. The background is the lens's fall-off times a quadratic polynomial (without the product ab and
-the difference a^2 - b^2) in the coordinates a, b on the face: the room's light changes across an LED, and a halo of the
-LED's own light falls off around it. The profile (luminance over the face) is given. Amplitude and background of each
-LED (of each colour, if the sensor has a mosaic) are unknown. Given the image they have a closed form, a linear fit
+light, dimmed by the lens. The background is the lens's fall-off times a quadratic polynomial (without the product ab
+and the difference a^2 - b^2) in the coordinates a, b on the face: the room's light changes across an LED, and a halo of
+the LED's own light falls off around it. The profile (luminance over the face) is given. Amplitude and background of
+each LED (of each colour, if the sensor has a mosaic) are unknown. Given the image they have a closed form, a linear fit
 weighted by 1 / variance under the model; that the background changes by more than its own level is improbable a priori.
 The part of a change of the image that they could explain is subtracted from the information: the Schur complement.
 
@@ -66,10 +66,10 @@ class PhotometricFit:
     """Amplitudes and backgrounds of g groups given the image, and the m readings expected by them.
 
     `basis` (m, 5) are the derivatives of the readings by a group's four background coefficients and its amplitude;
-    `amplitude`, `background` (by the face) and `signal_to_noise` are (g,); `expected` (m,) are electrons; `weight` (m,) is 1 / variance, 0 for
-    readings not used; `covariance` (g, 5, 5) is that of the coefficients, 0 if the readings do not determine them;
-    `level` (g,) is the scale of the background's prior; `deviance` is the mean over the readings of twice the log
-    likelihood ratio of a saturated model, expected to be near 1.
+    `amplitude`, `background` (by the face) and `signal_to_noise` are (g,); `expected` (m,) are electrons; `weight` (m,)
+    is 1 / variance, 0 for readings not used; `covariance` (g, 5, 5) is that of the coefficients, 0 if the readings do
+    not determine them; `level` (g,) is the scale of the background's prior; `deviance` is the mean over the readings of
+    twice the log likelihood ratio of a saturated model, expected to be near 1.
     """
 
     basis: Floats

@@ -61,7 +61,7 @@ class Priors:
         camera = np.zeros(CAMERA_PARAMETERS)
         if uncertainty is not None:
             camera = np.hypot(uncertainty.device_sigmas(), uncertainty.shot_sigmas())
-        ids = sorted({led.luminaire for led in leds if led.luminaire in frame.luminaires} - {None})
+        ids = [key for key in frame.luminaires if any(led.luminaire == key for led in leds)]
         stated = [frame.luminaires[one] for one in ids]
         rows = [[*one.sigma_m, *np.radians(one.sigma_rotation_deg)] for one in stated]
         index = {one: k for k, one in enumerate(ids)}
@@ -79,7 +79,9 @@ class Priors:
             leds=own,
             positions_m=np.array([led.position_m for led in leds]).reshape(-1, 3),
             centres_m=np.array([one.position_m for one in stated]).reshape(-1, 3),
-            luminaire=np.array([index.get(led.luminaire, -1) for led in leds], dtype=np.int64),
+            luminaire=np.array(
+                [-1 if led.luminaire is None else index.get(led.luminaire, -1) for led in leds], dtype=np.int64
+            ),
         )
 
     @property
@@ -163,6 +165,7 @@ class Components:
         return any(abs(a - b) > 0.05 * max(a, b) for a, b in pairs)
 
 
+NO_COMPONENTS = Components()
 # Columns of an LED's own nuisances that have one component.
 COLUMNS_OF_COMPONENT = {"place_m": [0, 1, 2], "size": [3], "profile": [4, 5, 6]}
 # Redundancy of a component below which it is not estimated.
@@ -262,6 +265,11 @@ class Solution:
     information: Floats
 
 
+def _triangle(matrix: Floats) -> Floats:
+    """Triangular factor of QR, of a matrix or of each of n."""
+    return np.asarray(np.linalg.qr(matrix, mode="r"), dtype=np.float64)
+
+
 def square_root(information: Floats, gradient: Floats) -> tuple[Floats, Floats]:
     """Rows (n, p, p) and right-hand sides (n, p) of least squares with the information (n, p, p), gradient (n, p)."""
     diagonal = np.diagonal(information, axis1=1, axis2=2)
@@ -285,9 +293,9 @@ def solve(
 ) -> Solution:
     """Step of pose and nuisances that minimizes the squares of `rows` (n, r, p) x step - `right` (n, r), and priors.
 
-    The columns are the LOCAL_PARAMETERS; `angles` (3,) are the rig's; `damping` (6, 6), if given, is an information that
-    keeps the pose where it is (Levenberg-Marquardt), and is part of `Solution.covariance`. Raises EstimationFailure if the pose is not
-    determined.
+    The columns are the LOCAL_PARAMETERS; `angles` (3,) are the rig's; `damping` (6, 6), if given, is an information
+    that keeps the pose where it is (Levenberg-Marquardt), and is part of `Solution.covariance`. Raises
+    EstimationFailure if the pose is not determined.
     """
     n = len(rows)
     z = now.standardized(priors)
@@ -310,7 +318,7 @@ def solve(
     prior_rows = np.zeros((n, LED_PARAMETERS, system.shape[2]))
     prior_rows[:, :, :LED_PARAMETERS] = np.eye(LED_PARAMETERS)
     prior_rows[:, :, -1] = -z.leds
-    triangles = np.linalg.qr(np.concatenate([prior_rows, system], axis=1), mode="r")
+    triangles = _triangle(np.concatenate([prior_rows, system], axis=1))
     led_rows, rest = triangles[:, :LED_PARAMETERS], triangles[:, LED_PARAMETERS:, LED_PARAMETERS:]
 
     remaining = [rest[priors.luminaire < 0][:, :, LUMINAIRE_PARAMETERS:].reshape(-1, COMMON_PARAMETERS + 1)]
@@ -320,7 +328,7 @@ def solve(
         prior = np.zeros((LUMINAIRE_PARAMETERS, rest.shape[2]))
         prior[:, :LUMINAIRE_PARAMETERS] = np.eye(LUMINAIRE_PARAMETERS)
         prior[:, -1] = -z.luminaires[k]
-        triangle = np.linalg.qr(np.concatenate([prior, block]), mode="r")
+        triangle = _triangle(np.concatenate([prior, block]))
         luminaire_rows[k] = triangle[:LUMINAIRE_PARAMETERS]
         remaining.append(triangle[LUMINAIRE_PARAMETERS:, LUMINAIRE_PARAMETERS:])
     prior = np.zeros((COMMON_PARAMETERS, COMMON_PARAMETERS + 1))
@@ -338,7 +346,7 @@ def solve(
     scale = np.linalg.norm(total[:, :-1], axis=0)
     if not np.isfinite(total).all() or not (scale > 0).all():
         raise EstimationFailure("fit", UNDETERMINED)
-    triangle = np.linalg.qr(np.column_stack([total[:, :-1] / scale, total[:, -1]]), mode="r")
+    triangle = _triangle(np.column_stack([total[:, :-1] / scale, total[:, -1]]))
     R, q = triangle[:COMMON_PARAMETERS, :-1], triangle[:COMMON_PARAMETERS, -1]
     if not np.abs(np.diag(R)).min() > MIN_DETERMINED:
         raise EstimationFailure("fit", UNDETERMINED)
