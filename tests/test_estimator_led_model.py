@@ -7,9 +7,10 @@ import pytest
 from estimator_synthetic import View, description, view_of
 from numpy.typing import NDArray
 
+from estimator.camera.intrinsics import with_errors
 from estimator.camera.pose import Pose
 from estimator.io.device import Camera, DiscLed, Led, SquareLed
-from estimator.pixels.led_model import LedImageModel, led_footprints, rim
+from estimator.pixels.led_model import IMAGE_PARAMETERS, ImageState, LedImageModel, fall_off, led_footprints, rim
 from estimator.pixels.polygon_raster import RoiStack
 from estimator.pixels.psf import LensBlur, disc_diameter_px
 
@@ -33,7 +34,7 @@ def led(shape: str) -> Led:
 
 
 def images(lens: Camera, one: Led, pose: Pose) -> LedImageModel:
-    footprints = led_footprints([one], pose, lens)
+    footprints = led_footprints([one], state(pose, lens))
     first = np.floor(footprints.centre - SIZE_PX / 2).astype(np.int64)
     size = np.array([SIZE_PX])
     rois = RoiStack(first[:, 1], first[:, 0], size, size)
@@ -42,6 +43,15 @@ def images(lens: Camera, one: Led, pose: Pose) -> LedImageModel:
 
 def here(lens: Camera) -> Pose:
     return Pose(np.array(VIEW.position_m), VIEW.R_cam_world)
+
+
+def state(pose: Pose, lens: Camera, leds: int = 1) -> ImageState:
+    return ImageState.as_told(pose, lens, leds)
+
+
+def share_of(model: LedImageModel, pose: Pose, lens: Camera) -> Floats:
+    """The LED's share of each pixel: its light without the lens's fall-off."""
+    return model.rois.roi(model.render(state(pose, lens)).light / model.fall_off, 0)
 
 
 def share_by_points(one: Led, lens: Camera, rois: RoiStack, blur_px: float = 0.0) -> Floats:
@@ -92,7 +102,7 @@ def test_a_sharp_face_covers_what_its_points_do(shape: str, distorted: bool) -> 
     """
     lens = camera(distortion=DISTORTION if distorted else None)
     model = images(lens, led(shape), here(lens))
-    share = model.rois.roi(model.render(here(lens)).share, 0)
+    share = share_of(model, here(lens), lens)
     expected = share_by_points(led(shape), lens, model.rois)
     assert share.sum() == pytest.approx(expected.sum(), rel=1e-3)
     inside = (share > 0) & (share < 1)
@@ -109,12 +119,12 @@ def test_a_defocused_face_is_its_points_spread_over_discs() -> None:
     """
     view = camera(focus_distance_m=1.5)
     one = led("disc")
-    depth = led_footprints([one], here(view), view).defocus_depth_m
+    depth = led_footprints([one], state(here(view), view)).defocus_depth_m
     f_number = float(disc_diameter_px(view, depth)[0]) * view.f_number / 6.0
     lens = view.model_copy(update={"f_number": f_number})
     assert disc_diameter_px(lens, depth) == pytest.approx([6.0])
     model = images(lens, one, here(lens))
-    share = model.rois.roi(model.render(here(lens)).share, 0)
+    share = share_of(model, here(lens), lens)
     expected = share_by_points(one, lens, model.rois, 6.0)
     assert np.abs(share - expected).max() < 0.012
     sharp = share_by_points(one, lens, model.rois)
@@ -132,10 +142,10 @@ def test_slopes_are_what_differences_give(shape: str, changes: dict[str, object]
     one, pose = led(shape), here(lens)
     model = images(lens, one, pose)
     cells = np.arange(model.rois.cells())
-    found = model.render(pose).slopes(cells)
+    found = model.render(state(pose, lens)).slopes(cells)
     for parameter in range(6):
         unit = np.eye(6)[parameter] * (1e-3 / 4000 * (3 if parameter < 3 else 1))
-        ahead, behind = (model.render(pose.moved(sign * unit, lens)).share for sign in (1, -1))
+        ahead, behind = (model.render(state(pose.moved(sign * unit, lens), lens)).light for sign in (1, -1))
         difference = (ahead - behind) / (2 * unit[parameter])
         largest = np.abs(difference).max()
         tolerance = 0.12 if "f_number" in changes else 0.01
@@ -151,17 +161,81 @@ def test_rims_have_the_faces_area_and_go_round_once() -> None:
         assert len(np.unique(points.round(9), axis=0)) == 32
 
 
-def test_illumination_falls_away_from_the_axis() -> None:
-    """cos^4 of a pinhole: the gradient of -4 log(1 + t^2) / 2 by t is -4 t / (1 + t^2), t the tangent off the axis."""
+@pytest.mark.parametrize("distorted", [False, True])
+@pytest.mark.parametrize("factor", [1, 2])
+def test_the_fall_off_is_the_lens_s_in_every_pixel(factor: int, distorted: bool) -> None:
+    """By hand at pixels of a region of 0.5 rad: cos^4 of the ray's angle, over the determinant of the distortion.
+
+    Interpolated at 10 Chebyshev nodes, a function with poles 4 half widths from the middle leaves some 8^-10 = 1e-9 of
+    it, times the order of the poles: far below 1e-6.
+    """
     view = view_of(TARGET, 3.0, 0.0, 0.0, 0.0, size=(80, 60, 4000.0))
-    one = DiscLed(id=1, position_m=(TARGET[0] + 0.9, TARGET[1], TARGET[2]), radius_m=0.012)
-    lens = camera(view)
-    footprints = led_footprints([one], Pose(np.array(view.position_m), view.R_cam_world), lens)
-    assert footprints.illumination_slope[0] == pytest.approx([-4 * 0.3 / 1.09 / 4000, 0.0], rel=1e-3, abs=1e-9)
+    distortion = {"k1": -0.2, "k2": 0.0, "k3": 0.0, "p1": 0.0, "p2": 0.0} if distorted else None
+    lens = camera(view, distortion=distortion)
+    one = np.ones(1, dtype=np.int64)
+    rois = RoiStack(-200 * factor * one, 300 * factor * one, 1900 * factor * one, 2000 * factor * one)
+    centre = np.array([[1300.0, 700.0]])
+    values = rois.roi(fall_off(rois, centre, lens, factor * one), 0)
+
+    def by_hand(u: Floats, v: Floats) -> Floats:
+        # Radius on the sensor r + k1 r^3: its inverse by Newton's steps.
+        radius = np.hypot((u - 40) / 4000, (v - 30) / 4000)
+        k1, r = (-0.2 if distorted else 0.0), radius.copy()
+        for _ in range(20):
+            r -= (r + k1 * r**3 - radius) / (1 + 3 * k1 * r**2)
+        return np.asarray(1 / (1 + r * r) ** 2 / ((1 + 3 * k1 * r**2) * (1 + k1 * r**2)))
+
+    row, column = np.array([3, 800, 1850]) * factor, np.array([5, 900, 1990]) * factor
+    u, v = (column + 0.5) / factor + 300, (row + 0.5) / factor - 200
+    expected = by_hand(u, v) / by_hand(centre[:, 0], centre[:, 1])
+    assert np.ptp(expected) > 0.1
+    np.testing.assert_allclose(values[row, column], expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("distortion", [None, DISTORTION])
+@pytest.mark.parametrize("parameter", range(6, IMAGE_PARAMETERS))
+def test_slopes_by_camera_and_size_are_what_differences_give(
+    parameter: int, distortion: dict[str, float] | None
+) -> None:
+    """As for the pose. The image is within 45 px of the principal point: steps of k1, p1 and p2 are large."""
+    lens, one = camera(distortion=distortion), led("disc")
+    pose = here(lens)
+    model = images(lens, one, pose)
+    found = model.render(state(pose, lens), np.arange(IMAGE_PARAMETERS)).slopes(np.arange(model.rois.cells()))
+    largest = np.abs(found[:, parameter]).max()
+    step = 1e-3 / largest
+
+    def moved(sign: int) -> Floats:
+        errors, size = np.zeros(7), np.ones(1)
+        if parameter < IMAGE_PARAMETERS - 1:
+            errors[parameter - 6] = sign * step
+        else:
+            size = size + sign * step
+        return model.render(ImageState(pose, with_errors(lens, errors), np.zeros((1, 3)), size)).light
+
+    difference = (moved(1) - moved(-1)) / (2 * step)
+    assert np.abs(found[:, parameter] - difference).max() < 0.01 * largest
+
+
+def test_an_led_that_moves_does_as_the_camera_that_moves_back() -> None:
+    """A shift of 1e-3 px of the LED against the slopes by the position, with the opposite sign."""
+    lens, one = camera(), led("square")
+    pose = here(lens)
+    model = images(lens, one, pose)
+    found = model.render(state(pose, lens)).slopes(np.arange(model.rois.cells()))
+    for axis in range(3):
+        shift = np.zeros((1, 3))
+        shift[0, axis] = 1e-3 / 4000 * 3
+        ahead, behind = (model.render(ImageState(pose, lens, sign * shift, np.ones(1))).light for sign in (1, -1))
+        difference = (ahead - behind) / (2 * shift[0, axis])
+        assert np.abs(difference + found[:, axis]).max() < 0.01 * np.abs(difference).max()
 
 
 def test_leds_that_are_not_imaged_have_no_footprint() -> None:
     lens = camera()
     pose = here(lens)
     behind = DiscLed(id=1, position_m=(3.5, 3.6, -5.0), radius_m=0.01)
-    assert np.isnan(led_footprints([behind, led("disc")], pose, lens).centre).any(axis=1).tolist() == [True, False]
+    assert np.isnan(led_footprints([behind, led("disc")], state(pose, lens, 2)).centre).any(axis=1).tolist() == [
+        True,
+        False,
+    ]

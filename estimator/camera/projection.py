@@ -187,6 +187,16 @@ def project(points_m: Floats, pose: Pose, camera: Camera) -> ProjectedPoints:
     return ProjectedPoints(camera.to_pixels(image), slopes, p_cam, _relative_illumination(p_cam, jacobian))
 
 
+def relative_illumination(pixels: Floats, camera: Camera) -> Floats:
+    """Irradiance (n,) of the sensor at pixels (n, 2) by a surface of uniform luminance, up to a common factor.
+
+    NaN outside the lens's valid range. At the image of a point it equals `ProjectedPoints.relative_illumination`.
+    """
+    projection = projection_of(camera)
+    rays = projection.unproject(camera.normalized(pixels))
+    return _relative_illumination(rays, projection.project(rays)[1])
+
+
 def _relative_illumination(p_cam: Floats, jacobian: Floats) -> Floats:
     """cos(theta), by which the pupil is foreshortened, times the solid angle that an area of the sensor subtends.
 

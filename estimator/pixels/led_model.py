@@ -1,8 +1,9 @@
-"""Image model of LEDs under a pose: share of each pixel's light that is an LED's, and its derivatives by the pose.
+"""Image model of LEDs under a pose: an LED's light in each pixel, and its derivatives by the pose.
 
 An LED is modelled by its true face, a horizontal disc or square, so that the model has no eccentricity. Its rim is
 projected point by point with the camera's own lens, including distortion and fish-eyes. The share of each pixel inside
-is exact for the polygon (`polygon_raster`); then the lens blurs it (`psf`).
+is exact for the polygon (`polygon_raster`). The lens dims it towards the image's border, in each pixel by the fall-off
+at its centre (`relative_illumination`), and blurs it (`psf`).
 
 Error of the polygon: a chord of length L deviates from a rim with radius of curvature r by at most L^2 / 8r. The
 polygon is enlarged to the disc's area, so that the mean deviation is zero, and two or more chords a pixel average the
@@ -17,8 +18,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.camera.intrinsics import CAMERA_PARAMETERS, camera_slopes
 from estimator.camera.pose import POSE_PARAMETERS, Pose
-from estimator.camera.projection import project, projection_of
+from estimator.camera.projection import ProjectedPoints, project, projection_of, relative_illumination
 from estimator.io.device import Camera, Led
 from estimator.pixels.polygon_raster import MAX_EDGE_PX, EdgePieces, Outlines, RoiStack, cover
 from estimator.pixels.psf import LensBlur
@@ -31,6 +33,37 @@ COARSE_POINTS = 32
 MIN_POINTS = 128
 # Margin on the number of points: edges must stay within MAX_EDGE_PX while the pose is searched.
 EDGE_MARGIN = 1.25
+# Chebyshev nodes across and down a region at which the lens's fall-off is computed; it is interpolated between them by
+# a polynomial. Over a region of 0.5 rad, cos^4 is then exact to 1e-6 of the light (tested).
+FALL_OFF_NODES = 10
+
+
+IMAGE_PARAMETERS = POSE_PARAMETERS + CAMERA_PARAMETERS + 1
+"""Parameters of LED images: the pose's, the intrinsics', then the relative error of the LED's own size."""
+PROFILE_PARAMETERS = 3
+"""Coefficients of an LED's luminance over its face: of a, b and a^2 + b^2 - 1/2, see `LedPixels`."""
+
+
+@dataclass(frozen=True, eq=False)
+class ImageState:
+    """What determines the images of n LEDs: a pose, a camera, and how the LEDs differ from the map.
+
+    `shifts_m` (n, 3) is added to the LEDs' positions, world metres; `sizes` (n,) multiplies their sizes.
+    """
+
+    pose: Pose
+    camera: Camera
+    shifts_m: Floats
+    sizes: Floats
+
+    @staticmethod
+    def as_told(pose: Pose, camera: Camera, leds: int) -> "ImageState":
+        """LEDs as in the map."""
+        return ImageState(pose, camera, np.zeros((leds, 3)), np.ones(leds))
+
+    def of(self, chosen: NDArray[np.bool_] | Ints) -> "ImageState":
+        """The state of the chosen LEDs."""
+        return ImageState(self.pose, self.camera, self.shifts_m[chosen], self.sizes[chosen])
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +71,8 @@ class LedFootprints:
     """Location of the images of n LEDs, without blur; NaN for LEDs not imaged completely, or seen from above.
 
     `low`, `high` and `centre` (n, 2) are the bounding box of the image and its centre, pixels (u, v). `max_edge_px`
-    (n,) is the longest edge of a rim of COARSE_POINTS points. `illumination_slope` (n, 2) is the derivative by u and v
-    of the irradiance by a surface of uniform luminance, relative to that at the centre, per pixel. `defocus_depth_m`
+    (n,) is the longest edge of a rim of COARSE_POINTS points. `to_face` (n, 2, 2) maps an offset from the centre,
+    pixels, to the face's own coordinates along x and y of the world in half widths, to first order. `defocus_depth_m`
     (n,) is the depth that determines the defocus.
     """
 
@@ -47,36 +80,43 @@ class LedFootprints:
     high: Floats
     centre: Floats
     max_edge_px: Floats
-    illumination_slope: Floats
+    to_face: Floats
     defocus_depth_m: Floats
+
+    @property
+    def whole(self) -> NDArray[np.bool_]:
+        """LEDs, (n,), that are imaged completely and from below."""
+        return np.asarray(np.isfinite(self.to_face).all(axis=(1, 2)))
 
     def of(self, chosen: NDArray[np.bool_] | Ints) -> "LedFootprints":
         """The footprints of the chosen LEDs."""
         return LedFootprints(*(values[chosen] for values in vars(self).values()))
 
 
-def led_footprints(leds: Sequence[Led], pose: Pose, camera: Camera) -> LedFootprints:
-    """Footprints of LEDs under a pose."""
-    centres_m = np.array([led.position_m for led in leds])
-    rims_m = np.stack([rim(led, COARSE_POINTS) for led in leds]) + centres_m[:, None]
+def led_footprints(leds: Sequence[Led], state: ImageState) -> LedFootprints:
+    """Footprints of LEDs under a state."""
+    pose, camera = state.pose, state.camera
+    centres_m = np.array([led.position_m for led in leds]) + state.shifts_m
+    rims_m = np.stack([rim(led, COARSE_POINTS) for led in leds]) * state.sizes[:, None, None] + centres_m[:, None]
     projected = project(rims_m.reshape(-1, 3), pose, camera)
     pixels = projected.pixels.reshape(len(leds), COARSE_POINTS, 2)
     from_above = centres_m[:, 2] <= pose.position_m[2]
     pixels[from_above] = np.nan
     centre = pixels.mean(axis=1)
-    offsets = pixels - centre[:, None]
-    illumination = projected.relative_illumination.reshape(len(leds), COARSE_POINTS)
-    # Linear fit over the rim; the curvature over an LED of 0.01 rad is 1e-4 of the light, and symmetric.
+    half_widths_m = np.array([led.half_width_m for led in leds])
+    # Along x and y an LED moves its image as much as the camera moves it by the opposite way.
+    across = project(centres_m, pose, camera).slopes[:, :, :2] * -half_widths_m[:, None, None]
     with np.errstate(all="ignore"):
-        normal_matrix = np.einsum("nip,niq->npq", offsets, offsets)
-        right = np.einsum("nip,ni->np", offsets, illumination / illumination.mean(axis=1, keepdims=True) - 1)
-        whole = np.isfinite(normal_matrix).all(axis=(1, 2)) & (np.linalg.det(normal_matrix) > 0)
-    slope = np.full((len(leds), 2), np.nan)
-    slope[whole] = np.linalg.solve(normal_matrix[whole], right[whole][:, :, None])[:, :, 0]
+        whole = np.isfinite(pixels).all(axis=(1, 2)) & (np.abs(np.linalg.det(across)) > 0)
+    to_face = np.full((len(leds), 2, 2), np.nan)
+    to_face[whole] = np.linalg.inv(across[whole])
     edges = np.linalg.norm(pixels - np.roll(pixels, -1, axis=1), axis=2).max(axis=1)
     centres_cam = projected.p_cam.reshape(len(leds), COARSE_POINTS, 3).mean(axis=1)
     depth_m = projection_of(camera).defocus_depth_m(centres_cam)
-    return LedFootprints(pixels.min(axis=1), pixels.max(axis=1), centre, edges, slope, depth_m)
+    return LedFootprints(pixels.min(axis=1), pixels.max(axis=1), centre, edges, to_face, depth_m)
+
+
+POSE_ALONE = np.arange(POSE_PARAMETERS)
 
 
 def rim(led: Led, points: int) -> Floats:
@@ -98,17 +138,59 @@ def rim(led: Led, points: int) -> Floats:
     return np.concatenate(sides)
 
 
+def fall_off(rois: RoiStack, centres_px: Floats, camera: Camera, factors: Ints | None = None) -> Floats:
+    """Fall-off (cells,) of the lens's light in the pixels of n regions, 1 at the LED images' centres (n, 2).
+
+    `factors` (n,) are the pixels of the regions per pixel of the sensor along each axis, 1 if None. A pixel outside the
+    lens's valid range gets no light.
+    """
+    k = np.arange(FALL_OFF_NODES)
+    nodes = np.cos(np.pi * (k + 0.5) / FALL_OFF_NODES)
+    steps = np.ones(len(rois.rows), dtype=np.int64) if factors is None else factors
+    low = np.stack([rois.columns, rois.rows], axis=1) / steps[:, None]
+    size = np.stack([rois.widths, rois.heights], axis=1) / steps[:, None]
+    at = low[:, None] + size[:, None] * (1 + nodes[:, None]) / 2  # (n, nodes, 2)
+    shape = (len(low), FALL_OFF_NODES, FALL_OFF_NODES)
+    u, v = np.broadcast_to(at[:, None, :, 0], shape), np.broadcast_to(at[:, :, None, 1], shape)
+    values = relative_illumination(np.column_stack([u.ravel(), v.ravel()]), camera).reshape(shape)
+    values = np.nan_to_num(values / relative_illumination(centres_px, camera)[:, None, None])
+    cells = np.zeros(rois.cells())
+    # Barycentric weights of Chebyshev's first-kind nodes.
+    barycentric = np.asarray((-1.0) ** k * np.sin(np.pi * (k + 0.5) / FALL_OFF_NODES), dtype=np.float64)
+    for roi, value in enumerate(values):
+        columns, rows = (
+            _interpolation((2 * np.arange(n) + 1) / n - 1, nodes, barycentric)
+            for n in (int(rois.widths[roi]), int(rois.heights[roi]))
+        )
+        rois.roi(cells, roi)[:] = rows @ value @ columns.T
+    return cells
+
+
+def _interpolation(at: Floats, nodes: Floats, barycentric: Floats) -> Floats:
+    """Lagrange's polynomials of the nodes (k,) at points (n,), (n, k)."""
+    offset = at[:, None] - nodes
+    on_node = np.abs(offset) < 1e-14
+    weights = barycentric / np.where(on_node, 1.0, offset)
+    weights = np.where(on_node.any(axis=1, keepdims=True), on_node, weights)
+    return np.asarray(weights / weights.sum(axis=1, keepdims=True))
+
+
 @dataclass(frozen=True, eq=False)
 class RenderedLeds:
-    """LED images under one pose: `share` (cells,) of an LED's full light in each cell of a region stack."""
+    """LED images under one pose: `light` (cells,) in each cell of a region stack.
 
-    share: Floats
+    The light of a pixel inside an LED image is the lens's fall-off there, 1 at the LED image's centre. `parameters`
+    (p,) are those that derivatives are by.
+    """
+
+    light: Floats
+    parameters: Ints
     _rois: RoiStack
     _pieces: EdgePieces
     _lens: LensBlur
 
     def slopes(self, cells: Ints) -> Floats:
-        """Derivatives of the share in n cells by the pose, (n, 6)."""
+        """Derivatives of the light in n cells by the p parameters of the model, (n, p)."""
         pieces, lens = self._pieces, self._lens
         if not lens.kernels:
             index = np.full(self._rois.cells(), len(cells))
@@ -119,7 +201,7 @@ class RenderedLeds:
         fine = self._rois.padded(lens.radius_px).subdivided(lens.slope_factors)
         coarsening = (lens.factors // lens.slope_factors)[pieces.roi]
         at = fine.cell(pieces.roi, pieces.row // coarsening, pieces.column // coarsening)
-        slopes = np.empty((len(cells), POSE_PARAMETERS))
+        slopes = np.empty((len(cells), pieces.slopes.shape[1]))
         for parameter, slope in enumerate(pieces.slopes.T):
             sharp: Floats = np.asarray(np.bincount(at, slope / coarsening**2, fine.cells()), dtype=np.float64)
             slopes[:, parameter] = _blurred(sharp, fine, self._rois, lens, lens.slope_kernels)[cells]
@@ -127,9 +209,10 @@ class RenderedLeds:
 
 
 class LedImageModel:
-    """Image model of LEDs, for poses near the one that their footprints were computed for.
+    """Image model of LEDs, for states near the one that their footprints were computed for.
 
-    `rois` holds a region of interest for each LED, in pixels of the sensor.
+    `rois` holds a region of interest for each LED, in pixels of the sensor; `fall_off` (cells,) the lens's fall-off in
+    them, 1 at the LED images' centres.
     """
 
     def __init__(
@@ -137,27 +220,49 @@ class LedImageModel:
     ) -> None:
         """Prepare to render LEDs that are all imaged completely; `lens` is for their depths."""
         self.rois = rois
+        self.fall_off = fall_off(rois, footprints.centre, camera)
         self._camera = camera
         self._lens = lens
+        self._fine = rois.padded(lens.radius_px).subdivided(lens.factors)
+        blurred = len(lens.kernels) > 0
+        self._fine_fall_off = (
+            fall_off(self._fine, footprints.centre, camera, lens.factors) if blurred else self.fall_off
+        )
         needed = np.maximum(MIN_POINTS, EDGE_MARGIN * footprints.max_edge_px * COARSE_POINTS / MAX_EDGE_PX)
         counts = 4 * np.ceil(needed * lens.factors / 4).astype(np.int64)
         last = np.cumsum(counts)
         self._following = np.arange(1, last[-1] + 1)
         self._following[last - 1] = last - counts
         self._led = np.repeat(np.arange(len(leds)), counts)
-        self._rims_m = np.concatenate(
-            [rim(led, n) + np.array(led.position_m) for led, n in zip(leds, counts.tolist(), strict=True)]
-        )
+        self._rims_m = np.concatenate([rim(led, n) for led, n in zip(leds, counts.tolist(), strict=True)])
+        self._centres_m = np.array([led.position_m for led in leds])
 
-    def render(self, pose: Pose) -> RenderedLeds:
-        """Images of all LEDs under a pose, each alone in its region."""
+    def render(self, state: ImageState, parameters: Ints = POSE_ALONE) -> RenderedLeds:
+        """Images of all LEDs under a state, each alone in its region.
+
+        `parameters` are those of the IMAGE_PARAMETERS that derivatives are by.
+        """
         lens, factors = self._lens, self._lens.factors[self._led, None]
-        rims = project(self._rims_m, pose, self._camera)
-        fine = self.rois.padded(lens.radius_px).subdivided(lens.factors)
-        outlines = Outlines(rims.pixels * factors, self._following, self._led, rims.slopes * factors[:, None])
-        covered, pieces = cover(fine, outlines)
-        share = _blurred(covered, fine, self.rois, lens, lens.kernels) if lens.kernels else covered
-        return RenderedLeds(share, self.rois, pieces, lens)
+        offsets_m = self._rims_m * state.sizes[self._led, None]
+        rims = project(self._centres_m[self._led] + state.shifts_m[self._led] + offsets_m, state.pose, state.camera)
+        slopes = _slopes(rims, offsets_m, state.camera)[:, :, parameters]
+        outlines = Outlines(rims.pixels * factors, self._following, self._led, slopes * factors[:, None])
+        covered, pieces = cover(self._fine, outlines)
+        light = covered * self._fine_fall_off
+        pieces = pieces.times(self._fine_fall_off[self._fine.cell(pieces.roi, pieces.row, pieces.column)])
+        if lens.kernels:
+            light = _blurred(light, self._fine, self.rois, lens, lens.kernels)
+        return RenderedLeds(light, parameters, self.rois, pieces, lens)
+
+
+def _slopes(rims: ProjectedPoints, offsets_m: Floats, camera: Camera) -> Floats:
+    """Derivatives (n, 2, p) of points of rims by the IMAGE_PARAMETERS; `offsets_m` (n, 3) are from their centres."""
+    slopes = np.zeros((len(offsets_m), 2, IMAGE_PARAMETERS))
+    slopes[:, :, :POSE_PARAMETERS] = rims.slopes
+    slopes[:, :, POSE_PARAMETERS:-1] = camera_slopes(rims, camera)
+    # A point of the face moves its image as much as the camera moves it by the opposite way.
+    slopes[:, :, -1] = -np.einsum("nij,nj->ni", rims.slopes[:, :, :3], offsets_m)
+    return slopes
 
 
 def _blurred(image: Floats, fine: RoiStack, rois: RoiStack, lens: LensBlur, kernels: Sequence[Floats]) -> Floats:

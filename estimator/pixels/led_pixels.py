@@ -1,7 +1,7 @@
-"""Pixel readings of LED images: edge pixels one by one, uniform pixels inside and around an LED image as sums.
+"""Pixel readings of LED images: edge pixels one by one, uniform pixels inside an LED image as sums.
 
-The sum of Poisson variables is a sufficient statistic of a common mean, so the uniform pixels of an LED's face, and
-those of the background around it, need not be read one by one.
+The sum of Poisson variables is a sufficient statistic of a common mean, so the uniform pixels of an LED's face need not
+be read one by one: each block of them is one reading. Its expectation is exact, a sum over its pixels.
 """
 
 from dataclasses import dataclass
@@ -10,11 +10,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.camera.pose import Pose
 from estimator.camera.projection import project
 from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame, Led, Part
-from estimator.pixels.led_model import LedFootprints, LedImageModel, RenderedLeds, led_footprints
+from estimator.pixels.led_model import (
+    POSE_ALONE,
+    ImageState,
+    LedFootprints,
+    LedImageModel,
+    RenderedLeds,
+    led_footprints,
+)
 from estimator.pixels.polygon_raster import RoiStack
 from estimator.pixels.psf import LensBlur
 
@@ -24,75 +30,122 @@ Mask = NDArray[np.bool_]
 
 # An image may move by nearly this much before its pixels have to be sorted into edge, inside and background again.
 EDGE_PX = 2
-# Width of the background ring around the edge: the ambient light changes little over it.
-RING_PX = 8
+# Pixels up to NEAR_PX beyond those that an LED lights tell the background of its edge. Those further off may show
+# another surface: the panel that LEDs are mounted on ends, and the ceiling or the panel's side begins.
+NEAR_PX = 1
+# Blocks of the uniform pixels of a face along each axis, each summed for a reading: the light changes little over one.
+BLOCKS = 6
 # A pixel whose share of an LED's light is within this of 0 or 1 is uniform.
 UNIFORM_TOLERANCE = 1e-3
 # An LED is used once the pose determines its image to this, one standard deviation.
 MAX_IMAGE_SIGMA_PX = 0.5
 # Share of the pixels inside an LED image that have to be known: read out and not saturated.
 MIN_KNOWN_SHARE = 0.5
+NONE_IN_VIEW = "no LED of the map is in view from the pose that the spots give"
 # Extent of an LED image in half widths: 1.4 for a square's vertex, and the scale of a tilted view varies over a face.
 MAX_EXTENT = 3.0
 
 
 @dataclass(frozen=True, eq=False)
 class LedPixels:
-    """Readings around n LEDs, m in all: the first e are edge pixels, the rest are sums over uniform pixels.
+    """Readings around n LEDs, m in all: edge pixels, and sums over blocks of the uniform pixels inside.
 
     A group of readings has a common amplitude and background: an LED, or an LED's pixels of one colour; there are g.
+    The readings of a group follow each other, from `starts[k]` to `starts[k + 1]`, (g + 1,); each group has an edge
+    pixel. `led` (g,) is the LED of each group, an index to `leds`.
 
-    `model` is the image model of the LEDs, `pose` the pose that the pixels were sorted by, `rendered` the images there.
-    `cells` (e,) are the edge pixels' cells in `model.rois`. `weights` (e,) is the relative illumination of an edge
-    pixel, 1 at the LED image's centre. `pixel_counts` (m,) is the number of pixels of a reading, `electrons` (m,) their
-    sum. `uniform_light` (m - e,) is the light of a full pixel summed over uniform pixels, which does not depend on the
-    pose. `group` (m,) is the group of each reading, ascending over edge pixels; `first_edge` (g,) the first edge pixel
-    of each group, which has at least one; `led` (g,) the LED of each group, an index to `leds`. `more` says whether
-    other LEDs of the map may be in view, whose images the pose does not determine well enough.
+    `index` (n,) is the number of each LED in the map, `model` the image model of the LEDs, `state` the state that the
+    pixels were sorted by, `rendered` the images there. `edges` (e,) are the readings that are edge pixels, `cells` (e,)
+    their cells in `model.rois`. `pixel_counts` (m,) is the number of pixels of a reading, `electrons` (m,) their sum.
+
+    With the coordinates (a, b) of a pixel on the face, in half widths from its centre: `background` (m, 4) is the
+    lens's fall-off times 1, a, b and a^2 + b^2; `face` (m, 3) is the mean of a, b and a^2 + b^2 - 1/2 over a reading.
+    `uniform_light` (m,) is the light inside the LED image summed over the pixels of a reading, 0 for edge pixels, whose
+    light depends on the state. `radius_px` (n,) is half the larger side of an LED image's bounding box. Images may move
+    by `max_move_px` before their pixels have to be sorted anew. `more` says whether other LEDs of the map may be in
+    view, whose images the state does not determine well enough.
     """
 
     leds: tuple[Led, ...]
+    index: Ints
     model: LedImageModel
-    pose: Pose
+    state: ImageState
     rendered: RenderedLeds
+    edges: Ints
     cells: Ints
-    weights: Floats
     pixel_counts: Floats
     electrons: Floats
+    background: Floats
+    face: Floats
     uniform_light: Floats
-    group: Ints
-    first_edge: Ints
+    starts: Ints
     led: Ints
+    radius_px: Floats
+    max_move_px: float
     more: bool
 
+    @property
+    def group(self) -> Ints:
+        """Group of each reading, (m,)."""
+        return np.repeat(np.arange(len(self.led)), np.diff(self.starts))
+
     def sum_by_group(self, values: Floats) -> Floats:
-        """Sums over each group, (..., g), of values (..., m) of all readings, or (..., e) of edge pixels alone."""
-        edges = len(self.cells)
-        sums = np.add.reduceat(values[..., :edges], self.first_edge, axis=-1)
-        if values.shape[-1] > edges:
-            np.add.at(sums.T, self.group[edges:], values[..., edges:].T)  # along the last axis
-        return np.asarray(sums)
+        """Sums over each group, (..., g), of values (..., m)."""
+        return np.asarray(np.add.reduceat(values, self.starts[:-1], axis=-1))
+
+    def light(self, rendered: RenderedLeds) -> Floats:
+        """Light (m,) of each reading, in that of a pixel at the LED image's centre."""
+        light = self.uniform_light.copy()
+        light[self.edges] = rendered.light[self.cells]
+        return light
 
 
-def gather_led_pixels(frame: DeviceFrame, pose: Pose, covariance: Floats) -> LedPixels:
-    """Readings of the LEDs of the map that are in view from a pose with a covariance (6, 6) of its parameters.
+@dataclass(frozen=True, eq=False)
+class _Readings:
+    """Readings of one group; see `LedPixels`."""
 
-    Left out are LEDs whose image is not determined to MAX_IMAGE_SIGMA_PX, saturated pixels, and pixels that another LED
-    of the map illuminates as well. LEDs with a mostly saturated image are left out unless all are: the location of an
-    edge depends on the amplitude, which the unsaturated rim alone determines poorly. Raises EstimationFailure if no
-    reading is left.
+    cells: Ints
+    pixel_counts: Floats
+    electrons: Floats
+    background: Floats
+    face: Floats
+    uniform_light: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class LedsInView:
+    """LEDs of the map whose images overlap the regions read out, under a state of them; see `leds_in_view`.
+
+    `index` (n,) is the number of each in the map. `more` says whether there may be others, whose images the state does
+    not determine well enough.
     """
-    leds, footprints, more = _leds_in_view(frame, pose, covariance)
+
+    leds: tuple[Led, ...]
+    index: Ints
+    state: ImageState
+    footprints: LedFootprints
+    more: bool
+
+
+def gather_led_pixels(frame: DeviceFrame, view: LedsInView, parameters: Ints = POSE_ALONE) -> LedPixels:
+    """Readings of LEDs in view; `parameters` are those that the derivatives of their images are by.
+
+    Left out are saturated pixels, and pixels that another LED of the map illuminates as well. LEDs with a mostly
+    saturated image are left out unless all are: the location of an edge depends on the amplitude, which the unsaturated
+    rim alone determines poorly. Raises EstimationFailure if no reading is left.
+    """
+    leds, state, footprints = view.leds, view.state, view.footprints
     lens = LensBlur(frame.camera, footprints.defocus_depth_m)
-    rois = _rois(frame, footprints, EDGE_PX + RING_PX + lens.radius_px)
+    rois = _rois(frame, footprints, EDGE_PX + lens.radius_px)
     model = LedImageModel(leds, footprints, frame.camera, lens, rois)
-    rendered = model.render(pose)
-    shares = [rois.roi(rendered.share, k) for k in range(len(leds))]
+    rendered = model.render(state, parameters)
+    fall_offs = [rois.roi(model.fall_off, k) for k in range(len(leds))]
+    with np.errstate(all="ignore"):
+        shares = [np.nan_to_num(rois.roi(rendered.light, k) / fall_offs[k]) for k in range(len(leds))]
     masks = [_edge_and_lit(share) for share in shares]
     readings = [_readings(frame, rois, k) for k in range(len(leds))]
     saturated = np.array([_mostly_saturated(share, known) for share, (_, known) in zip(shares, readings, strict=True)])
-    edges: list[tuple[Ints, Floats, Floats]] = []
-    sums: list[tuple[int, float, float, float]] = []
+    groups: list[_Readings] = []
     led_of_group: list[int] = []
     for k in range(len(leds)):
         electrons, known = readings[k]
@@ -100,54 +153,105 @@ def gather_led_pixels(frame: DeviceFrame, pose: Pose, covariance: Floats) -> Led
             continue
         for other in rois.overlapping(k):
             own_slices, other_slices = rois.intersection(k, other)
-            known[own_slices] &= ~masks[other][1][other_slices]
+            known[own_slices] &= ~masks[other].lit[other_slices]
         rows = np.arange(rois.rows[k], rois.rows[k] + rois.heights[k])[:, None]
         columns = np.arange(rois.columns[k], rois.columns[k] + rois.widths[k])
-        (slope_u, slope_v), (u, v) = footprints.illumination_slope[k].tolist(), footprints.centre[k].tolist()
-        weights = (1 + slope_u * (columns + 0.5 - u)) + slope_v * (rows + 0.5 - v)
-        light = shares[k] * weights
-        edge_mask = masks[k][0]
+        (au, av), (bu, bv) = footprints.to_face[k].tolist()
+        u, v = footprints.centre[k].tolist()
+        du, dv = columns + 0.5 - u, rows + 0.5 - v
+        position = _FacePixels(au * du + av * dv, bu * du + bv * dv, fall_offs[k])
         for of_colour in _colours(frame, rows, columns):
-            use = known & of_colour
-            row, column = np.nonzero(use & edge_mask)
+            row, column = np.nonzero(known & of_colour & masks[k].edge & masks[k].near)
             if len(row) == 0:
                 continue
             cells = rois.cell(np.full(len(row), k), row + rois.rows[k], column + rois.columns[k])
-            edges.append((cells, weights[row, column], electrons[row, column]))
-            use &= ~edge_mask
-            inside = use & (shares[k] > 0.5)
-            for uniform in (inside, use & ~inside):
-                if uniform.any():
-                    sum_e, sum_light = float(electrons[uniform].sum()), float(light[uniform].sum())
-                    sums.append((len(led_of_group), float(uniform.sum()), sum_e, sum_light))
+            row_in, column_in = np.nonzero(known & of_colour & ~masks[k].edge & (shares[k] > 0.5))
+            groups.append(_group(position, electrons, cells, (row, column), (row_in, column_in)))
             led_of_group.append(k)
-    if not edges:
-        raise EstimationFailure("fit", "no LED of the map is in view")
-    cells, weights, electrons = (np.concatenate(column) for column in zip(*edges, strict=True))
-    counts = np.array([len(edge[0]) for edge in edges])
-    sum_group, sum_pixels, sum_electrons, sum_of_light = np.array(sums).reshape(-1, 4).T
+    if not groups:
+        raise EstimationFailure("fit", "no pixel of the LEDs in view is usable: all are saturated or overlap others")
+    counts = np.array([len(group.electrons) for group in groups])
+    starts = np.concatenate([[0], np.cumsum(counts)])
+    edges = np.concatenate([first + np.arange(len(g.cells)) for first, g in zip(starts.tolist(), groups, strict=False)])
+
+    def joined(name: str) -> Floats:
+        return np.concatenate([getattr(group, name) for group in groups])
+
     return LedPixels(
         leds=leds,
+        index=view.index,
         model=model,
-        pose=pose,
+        state=state,
         rendered=rendered,
-        cells=cells,
-        weights=weights,
-        pixel_counts=np.concatenate([np.ones(len(cells)), sum_pixels]),
-        electrons=np.concatenate([electrons, sum_electrons]),
-        uniform_light=sum_of_light,
-        group=np.concatenate([np.repeat(np.arange(len(counts)), counts), sum_group.astype(np.int64)]),
-        first_edge=np.cumsum(counts) - counts,
+        edges=edges,
+        cells=np.concatenate([group.cells for group in groups]),
+        pixel_counts=joined("pixel_counts"),
+        electrons=joined("electrons"),
+        background=joined("background"),
+        face=joined("face"),
+        uniform_light=joined("uniform_light"),
+        starts=starts,
         led=np.array(led_of_group),
-        more=more,
+        radius_px=(footprints.high - footprints.low).max(axis=1) / 2,
+        max_move_px=EDGE_PX - 1,
+        more=view.more,
     )
 
 
-def _leds_in_view(frame: DeviceFrame, pose: Pose, covariance: Floats) -> tuple[tuple[Led, ...], LedFootprints, bool]:
-    """LEDs of the map whose images overlap the regions read out, their footprints, and whether there may be more."""
+@dataclass(frozen=True, eq=False)
+class _FacePixels:
+    """A region's pixels, (rows, columns): coordinates `a`, `b` on the face, and the lens's fall-off."""
+
+    a: Floats
+    b: Floats
+    fall_off: Floats
+
+
+def _group(
+    pixels: _FacePixels, electrons: Floats, cells: Ints, edge: tuple[Ints, Ints], inside: tuple[Ints, Ints]
+) -> _Readings:
+    """Readings of the edge pixels and of blocks of the pixels inside the face, both given by (row, column)."""
+    a, b, fall_off = pixels.a[edge], pixels.b[edge], pixels.fall_off[edge]
+    r2 = a * a + b * b
+    background = np.stack([fall_off * basis for basis in (np.ones(len(a)), a, b, r2)], axis=1)
+    face = np.stack([a, b, r2 - 0.5], axis=1)
+    count = np.ones(len(a))
+    light = np.zeros(len(a))
+    a, b, fall_off = (values[inside] for values in vars(pixels).values())
+    r2 = a * a + b * b
+    tile = np.clip(np.floor((a + 1) * BLOCKS / 2), 0, BLOCKS - 1) * BLOCKS
+    tile += np.clip(np.floor((b + 1) * BLOCKS / 2), 0, BLOCKS - 1)
+    _, block = np.unique(tile, return_inverse=True)
+    blocks = int(block.max()) + 1 if len(block) else 0
+
+    def summed(values: Floats) -> Floats:
+        return np.asarray(np.bincount(block, values, blocks), dtype=np.float64)
+
+    sums = np.stack([summed(fall_off * basis) for basis in (np.ones(len(a)), a, b, r2)], axis=1)
+    mean = sums[:, 1:] / sums[:, :1]
+    return _Readings(
+        cells=cells,
+        pixel_counts=np.concatenate([count, summed(np.ones(len(a)))]),
+        electrons=np.concatenate([electrons[edge], summed(electrons[inside])]),
+        background=np.concatenate([background, sums]),
+        face=np.concatenate([face, mean - [0.0, 0.0, 0.5]]),
+        uniform_light=np.concatenate([light, sums[:, 0]]),
+    )
+
+
+def leds_in_view(
+    frame: DeviceFrame, state: ImageState, covariance: Floats, sigma_m: Floats, located: Mask
+) -> LedsInView:
+    """LEDs of the map, n in all, that are in view under a state of them.
+
+    Left out are LEDs whose image is not determined to MAX_IMAGE_SIGMA_PX by the pose, of covariance (6, 6), and by
+    their own position, of standard deviation `sigma_m` (n,), but for those whose image is `located` (n,). Raises
+    EstimationFailure if none is left.
+    """
     low, high = _read_out(frame)
     leds = tuple(frame.leds.values())
-    centres = project(np.array([led.position_m for led in leds]), pose, frame.camera)
+    centres_m = np.array([led.position_m for led in leds]) + state.shifts_m
+    centres = project(centres_m, state.pose, state.camera)
     half_widths_m = np.array([led.half_width_m for led in leds])
     with np.errstate(invalid="ignore"):
         # The image moves with the camera as much as a point of the face moves it from its centre.
@@ -156,17 +260,25 @@ def _leds_in_view(frame: DeviceFrame, pose: Pose, covariance: Floats) -> tuple[t
         near = ((centres.pixels > low - extent_px) & (centres.pixels < high + extent_px)).all(axis=1)
     candidates = np.flatnonzero(near)
     if len(candidates) == 0:
-        raise EstimationFailure("fit", "no LED of the map is in view")
-    footprints = led_footprints([leds[k] for k in candidates], pose, frame.camera)
+        raise EstimationFailure("fit", NONE_IN_VIEW)
+    footprints = led_footprints([leds[k] for k in candidates], state.of(candidates))
     slopes = centres.slopes[candidates]
     with np.errstate(invalid="ignore"):
-        in_view = np.isfinite(footprints.illumination_slope).all(axis=1)
-        in_view &= (footprints.high > low).all(axis=1) & (footprints.low < high).all(axis=1)
-        certain = ((slopes @ covariance) * slopes).sum(axis=(1, 2)) < MAX_IMAGE_SIGMA_PX**2
-    if not (in_view & certain).any():
-        raise EstimationFailure("fit", "no LED of the map is in view")
-    chosen = tuple(leds[k] for k in candidates[in_view & certain])
-    return chosen, footprints.of(in_view & certain), bool((in_view & ~certain).any())
+        in_view = footprints.whole & (footprints.high > low).all(axis=1) & (footprints.low < high).all(axis=1)
+        variance_px2 = ((slopes @ covariance) * slopes).sum(axis=(1, 2)) + (sigma_m * scale)[candidates] ** 2
+        chosen = in_view & ((variance_px2 < MAX_IMAGE_SIGMA_PX**2) | located[candidates])
+    if not in_view.any():
+        raise EstimationFailure("fit", NONE_IN_VIEW)
+    if not chosen.any():
+        sigma_px = float(np.sqrt(variance_px2[in_view].min()))
+        raise EstimationFailure(
+            "fit",
+            f"LEDs of the map in view: {in_view.sum()}, but the best known image to {sigma_px:.1f} px only, "
+            f"needed {MAX_IMAGE_SIGMA_PX} px",
+        )
+    index = candidates[chosen]
+    used = tuple(leds[k] for k in index)
+    return LedsInView(used, index, state.of(index), footprints.of(chosen), bool((in_view & ~chosen).any()))
 
 
 def _read_out(frame: DeviceFrame) -> tuple[Ints, Ints]:
@@ -184,13 +296,26 @@ def _rois(frame: DeviceFrame, footprints: LedFootprints, margin_px: int) -> RoiS
     return RoiStack(first[:, 1], first[:, 0], end[:, 1] - first[:, 1], end[:, 0] - first[:, 0])
 
 
-def _edge_and_lit(share: Floats) -> tuple[Mask, Mask]:
-    """Pixels that may be partly lit by an LED while its image moves by EDGE_PX, and those that may be lit at all."""
+@dataclass(frozen=True, eq=False)
+class _Masks:
+    """Pixels of a region: `edge` may be partly lit by the LED while its image moves by EDGE_PX, `lit` may be lit at
+    all, `near` are at most NEAR_PX beyond the pixels that it lights.
+    """
+
+    edge: Mask
+    lit: Mask
+    near: Mask
+
+
+def _edge_and_lit(share: Floats) -> _Masks:
+    """Masks of a region by the LED's share of each pixel's light, (rows, columns)."""
     lit = share > UNIFORM_TOLERANCE
     partly_lit = lit & (share < 1 - UNIFORM_TOLERANCE)
-    size = np.ones((2 * EDGE_PX + 1, 2 * EDGE_PX + 1), dtype=np.uint8)
-    edge, near_lit = (cv2.dilate(mask.astype(np.uint8), size).astype(bool) for mask in (partly_lit, lit))
-    return edge, near_lit
+    edge, near_lit, near = (
+        cv2.dilate(mask.astype(np.uint8), np.ones((2 * px + 1, 2 * px + 1), dtype=np.uint8)).astype(bool)
+        for mask, px in ((partly_lit, EDGE_PX), (lit, EDGE_PX), (lit, NEAR_PX))
+    )
+    return _Masks(edge, near_lit, near)
 
 
 def _readings(frame: DeviceFrame, rois: RoiStack, k: int) -> tuple[Floats, Mask]:

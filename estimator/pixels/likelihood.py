@@ -1,9 +1,12 @@
 """Likelihood of pixel readings: expected electrons, their variance, and the information about the pose.
 
-A reading is expected to be `background + amplitude x light`, where light is the LED's share of the pixels' light.
-Amplitude and background of each LED (of each colour, if the sensor has a mosaic) are unknown. Given the pose they have
-a closed form, a linear fit weighted by 1 / variance under the model. The part of a change of the pose that they could
-explain is subtracted from the information: the Schur complement.
+A reading is expected to be `background + amplitude x light x (1 + profile)`. Light is the LED's share of the pixels'
+light, dimmed by the lens. The background is the lens's fall-off times a quadratic polynomial (without the product ab
+and the difference a^2 - b^2) in the coordinates a, b on the face: the room's light changes across an LED, and a halo of
+the LED's own light falls off around it. The profile (luminance over the face) is given. Amplitude and background of
+each LED (of each colour, if the sensor has a mosaic) are unknown. Given the image they have a closed form, a linear fit
+weighted by 1 / variance under the model; that the background changes by more than its own level is improbable a priori.
+The part of a change of the image that they could explain is subtracted from the information: the Schur complement.
 
 With `sensor.noise` "full" the variance is shot noise plus the data sheet's dark noise, PRNU and rounding
 (quasi-likelihood). Offsets of whole rows and columns are approximated by independent noise of the pixels. With noise
@@ -16,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.io.device import DeviceFrame
-from estimator.pixels.led_model import RenderedLeds
+from estimator.pixels.led_model import IMAGE_PARAMETERS, PROFILE_PARAMETERS, RenderedLeds
 from estimator.pixels.led_pixels import LedPixels
 
 Floats = NDArray[np.float64]
@@ -27,8 +30,14 @@ Mask = NDArray[np.bool_]
 SATURATION_MARGIN_SIGMA = 5.0
 # Lower limit of a variance, electrons squared: keeps weights finite.
 MIN_VARIANCE_E2 = 1e-3
+# Background coefficients and amplitude of a group.
+COEFFICIENTS = 5
 # Relative determinant below which readings do not determine amplitude and background; they are then not used.
 MIN_DETERMINANT = 1e-9
+# Standard deviations a priori of the background's slopes by a and b, its curvature: relative to
+# the background's level plus HALO_SHARE of the amplitude.
+BACKGROUND_SIGMAS = (0.3, 0.3, 0.05)
+HALO_SHARE = 0.05
 # Limit of an LED's chi-square: its degrees of freedom, its own scatter in standard deviations, and a model error of the
 # edge, at most this share of the LED's light: by an inaccurate blur of the lens, or a shift of 0.05 px.
 CHI2_SIGMA = 5.0
@@ -54,52 +63,83 @@ class Noise:
 
 @dataclass(frozen=True, eq=False)
 class PhotometricFit:
-    """Amplitudes and backgrounds of g groups given the pose, and the m readings expected by them.
+    """Amplitudes and backgrounds of g groups given the image, and the m readings expected by them.
 
-    `light` (m,) is the share of a full pixel's light; `amplitude` and `signal_to_noise` are (g,); `expected` (m,) are
-    electrons; `weight` (m,) is 1 / variance, 0 for readings not used; `covariance` (2, 2, g) is that of background and
-    amplitude, 0 if the readings do not determine them; `deviance` is the mean over the readings of twice the log
-    likelihood ratio of a saturated model, expected to be near 1.
+    `basis` (m, 5) are the derivatives of the readings by a group's four background coefficients and its amplitude;
+    `amplitude`, `background` (by the face) and `signal_to_noise` are (g,); `expected` (m,) are electrons; `weight` (m,)
+    is 1 / variance, 0 for readings not used; `covariance` (g, 5, 5) is that of the coefficients, 0 if the readings do
+    not determine them; `level` (g,) is the scale of the background's prior; `deviance` is the mean over the readings of
+    twice the log likelihood ratio of a saturated model, expected to be near 1.
     """
 
-    light: Floats
+    basis: Floats
     amplitude: Floats
+    background: Floats
     signal_to_noise: Floats
     expected: Floats
     weight: Floats
     covariance: Floats
+    level: Floats
     deviance: float
 
 
 def fit_photometry(
-    pixels: LedPixels, rendered: RenderedLeds, used: Mask, noise: Noise, before: PhotometricFit | None = None
+    pixels: LedPixels,
+    rendered: RenderedLeds,
+    used: Mask,
+    noise: Noise,
+    before: PhotometricFit | None = None,
+    profile: Floats | None = None,
 ) -> PhotometricFit:
-    """Amplitude and background of every group under a pose, weighted by the variances of a previous fit, if any.
+    """Amplitude and background of every group, weighted by the variances of a previous fit, if any.
 
-    `used` (n,) are the LEDs to use.
+    `used` (n,) are the LEDs to use; `profile` (n, 3) are the coefficients of a, b and a^2 + b^2 - 1/2 of each LED's
+    luminance, 0 if None.
     """
     n, y, group = pixels.pixel_counts, pixels.electrons, pixels.group
-    s = np.concatenate([pixels.weights * rendered.share[pixels.cells], pixels.uniform_light])
+    light = pixels.light(rendered)
+    if profile is not None:
+        light = light * (1 + np.einsum("mi,mi->m", pixels.face, profile[pixels.led][group]))
+    basis = np.column_stack([pixels.background, light])
     of_used_led = used[pixels.led][group]
     weight = of_used_led / n if before is None else before.weight
-    products = np.stack([n * n, n * s, s * s, n * y, s * y])
+    level = np.maximum.reduceat(y / n, pixels.starts[:-1]) if before is None else before.level
+    pairs = [(i, j) for i in range(COEFFICIENTS) for j in range(i, COEFFICIENTS)]
+    products = np.stack([basis[:, i] * basis[:, j] for i, j in pairs] + [basis[:, i] * y for i in range(COEFFICIENTS)])
+    normal = np.zeros((len(pixels.led), COEFFICIENTS, COEFFICIENTS))
     # Without variances of a previous fit, iterate: the first weights are a guess.
     for _ in range(3 if before is None else 1):
-        nn, ns, ss, ny, sy = pixels.sum_by_group(products * weight)
-        determinant = nn * ss - ns * ns
-        determined = determinant > MIN_DETERMINANT * nn * ss
-        safe = np.where(determined, determinant, 1.0)
-        covariance = np.stack([ss, -ns, -ns, nn]).reshape(2, 2, -1) * (determined / safe)
-        background, amplitude = np.einsum("ijg,jg->ig", covariance, np.stack([ny, sy]))
-        expected = n * background[group] + s * amplitude[group]
+        sums = pixels.sum_by_group(products * weight)
+        for (i, j), values in zip(pairs, sums, strict=False):
+            normal[:, i, j] = normal[:, j, i] = values
+        determinant = normal[:, 0, 0] * normal[:, -1, -1] - normal[:, 0, -1] ** 2
+        determined = determinant > MIN_DETERMINANT * normal[:, 0, 0] * normal[:, -1, -1]
+        prior = np.maximum(np.outer(level, BACKGROUND_SIGMAS), MIN_VARIANCE_E2) ** -2.0
+        total = normal.copy()
+        slopes = range(1, COEFFICIENTS - 1)
+        total[:, slopes, slopes] += prior
+        total[~determined] = np.eye(COEFFICIENTS)
+        covariance = _inverse(total) * determined[:, None, None]
+        coefficients = np.einsum("gij,jg->gi", covariance, sums[len(pairs) :])
+        expected = np.einsum("mi,mi->m", basis, coefficients[group])
         per_pixel = np.maximum(expected / n, 0.0)
         variance = np.maximum(per_pixel + noise.dark_e2 + noise.prnu2 * per_pixel**2, MIN_VARIANCE_E2)
         unsaturated = per_pixel + SATURATION_MARGIN_SIGMA * np.sqrt(variance) < noise.saturation_e
         weight = np.where(of_used_led & unsaturated & determined[group], 1 / (variance * n), 0.0)
-    sigma = np.sqrt(covariance[1, 1])
+        level = np.maximum(coefficients[:, 0], 0.0) + HALO_SHARE * np.maximum(coefficients[:, -1], 0.0)
+    amplitude = coefficients[:, -1]
+    sigma = np.sqrt(covariance[:, -1, -1])
     signal_to_noise = np.divide(amplitude, sigma, out=np.zeros_like(sigma), where=sigma > 0)
     deviance = _mean_deviance(y[weight > 0], expected[weight > 0], n[weight > 0] * noise.dark_e2)
-    return PhotometricFit(s, amplitude, signal_to_noise, expected, weight, covariance, deviance)
+    return PhotometricFit(
+        basis, amplitude, coefficients[:, 0], signal_to_noise, expected, weight, covariance, level, deviance
+    )
+
+
+def _inverse(matrices: Floats) -> Floats:
+    """Inverses of positive definite matrices (n, k, k), with parameters scaled to equal size."""
+    scale = 1 / np.sqrt(np.diagonal(matrices, axis1=1, axis2=2))
+    return np.asarray(np.linalg.inv(matrices * scale[:, :, None] * scale[:, None]) * scale[:, :, None] * scale[:, None])
 
 
 def _mean_deviance(electrons: Floats, expected: Floats, dark_e2: Floats) -> float:
@@ -110,30 +150,50 @@ def _mean_deviance(electrons: Floats, expected: Floats, dark_e2: Floats) -> floa
     return float(2 * (observed * np.log(observed / mean) - (observed - mean)).mean())
 
 
-def score(pixels: LedPixels, rendered: RenderedLeds, photometry: PhotometricFit) -> tuple[Floats, Floats]:
-    """Information (6, 6) and gradient (6,) of the log likelihood by the pose, amplitudes and backgrounds eliminated.
+def score(
+    pixels: LedPixels, rendered: RenderedLeds, photometry: PhotometricFit, profile: Floats | None = None
+) -> tuple[Floats, Floats]:
+    """Information (n, p, p) and gradient (n, p) of the log likelihood by the LOCAL_PARAMETERS of each of n LEDs.
 
-    Uniform pixels do not depend on the pose.
+    Amplitudes and backgrounds are eliminated. Parameters that `rendered` has no derivatives by have no information; so
+    has the profile if `profile` (n, 3) is None.
     """
-    edges = len(pixels.cells)
-    brightness = pixels.weights * photometry.amplitude[pixels.group[:edges]]
-    slopes = rendered.slopes(pixels.cells) * brightness[:, None]
-    weighted = slopes.T * photometry.weight[:edges]
-    information = weighted @ slopes
-    gradient = weighted @ (pixels.electrons - photometry.expected)[:edges]
-    # Mixed information of the pose and each group's background and amplitude.
-    mixed = pixels.sum_by_group(np.stack([weighted, weighted * photometry.light[:edges]]))
-    explained = np.einsum("ipg,ijg,jqg->pq", mixed, photometry.covariance, mixed, optimize=True)
-    return information - explained, gradient
+    slopes = rendered.slopes(pixels.cells) * photometry.amplitude[pixels.group[pixels.edges]][:, None]
+    if profile is not None:
+        factor = 1 + np.einsum("mi,mi->m", pixels.face, profile[pixels.led][pixels.group])
+        slopes *= factor[pixels.edges][:, None]
+        of_profile = pixels.face * (pixels.light(rendered) * photometry.amplitude[pixels.group])[:, None]
+    residual = photometry.weight * (pixels.electrons - photometry.expected)
+    columns = rendered.parameters
+    if profile is not None:
+        columns = np.concatenate([columns, IMAGE_PARAMETERS + np.arange(PROFILE_PARAMETERS)])
+    count, all_of_them = len(columns), IMAGE_PARAMETERS + PROFILE_PARAMETERS
+    information = np.zeros((len(pixels.leds), all_of_them, all_of_them))
+    gradient = np.zeros((len(pixels.leds), all_of_them))
+    first_edge = np.searchsorted(pixels.edges, pixels.starts)
+    for g, led in enumerate(pixels.led.tolist()):
+        # The edge pixels are the first readings of a group, and the image's shape does not change the others.
+        edge = slice(first_edge[g], first_edge[g + 1])
+        readings = slice(pixels.starts[g], pixels.starts[g + 1])
+        design = np.zeros((readings.stop - readings.start, count))
+        design[: edge.stop - edge.start, : slopes.shape[1]] = slopes[edge]
+        if profile is not None:
+            design[:, slopes.shape[1] :] = of_profile[readings]
+        weighted = design * photometry.weight[readings][:, None]
+        mixed = weighted.T @ photometry.basis[readings]
+        information[led][np.ix_(columns, columns)] += weighted.T @ design - mixed @ photometry.covariance[g] @ mixed.T
+        gradient[led][columns] += design.T @ residual[readings]
+    return information, gradient
 
 
 def excess_chi2(pixels: LedPixels, rendered: RenderedLeds, photometry: PhotometricFit) -> Floats:
     """Excess of each group's chi-square, (g,), over its limit: positive for an LED that the model does not explain."""
-    weight, edges = photometry.weight, len(pixels.cells)
+    weight, edges = photometry.weight, pixels.edges
     chi2 = pixels.sum_by_group((pixels.electrons - photometry.expected) ** 2 * weight)
-    freedom = np.maximum(pixels.sum_by_group((weight > 0).astype(float)) - 2, 0.0)
+    freedom = np.maximum(pixels.sum_by_group((weight > 0).astype(float)) - COEFFICIENTS, 0.0)
     # The model error is largest at the edge: 4 share (1 - share) is 1 at half coverage and 0 on uniform pixels.
-    share = rendered.share[pixels.cells]
-    model_error_e = MODEL_ERROR_SHARE * photometry.amplitude[pixels.group[:edges]] * 4 * share * (1 - share)
-    model_chi2 = pixels.sum_by_group(model_error_e**2 * weight[:edges])
+    share = np.zeros(len(weight))
+    share[edges] = rendered.light[pixels.cells] / pixels.background[edges, 0]
+    model_error_e = MODEL_ERROR_SHARE * photometry.amplitude[pixels.group] * 4 * share * (1 - share)
+    model_chi2 = pixels.sum_by_group(model_error_e**2 * weight)
     return np.asarray(chi2 - freedom - CHI2_SIGMA * np.sqrt(2 * freedom) - model_chi2)

@@ -102,6 +102,10 @@ class EdgePieces:
     column: Ints
     slopes: Floats
 
+    def times(self, factor: Floats) -> "EdgePieces":
+        """The pieces with their derivatives multiplied by a factor for each, (m,)."""
+        return EdgePieces(self.roi, self.row, self.column, self.slopes * factor[:, None])
+
 
 def cover(rois: RoiStack, outlines: Outlines) -> tuple[Floats, EdgePieces]:
     """Covered share of each cell, (cells,), and its derivatives by pieces."""

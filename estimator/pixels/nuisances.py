@@ -1,0 +1,389 @@
+"""Nuisance parameters of LED images, with Gaussian priors, and the step of pose and nuisances that a linear fit gives.
+
+What a device does not know exactly: its intrinsics, the place and rotation of each luminaire, the place of each LED in
+it, the map's origin and scale, the size of each LED and the luminance over its face. Each nuisance z is in units of its
+prior's standard deviation, so that its prior is N(0, 1).
+
+An LED's image depends on the LOCAL parameters: pose, intrinsics, size, profile. An LED that moves by d in the world
+moves its image as the camera does that moves by -d. So the information of each LED about its LOCAL parameters is all
+that the fit needs. Orthogonal elimination (QR) removes first what is an LED's own, then what is a luminaire's: normal
+equations would lose the digits of what a loose prior leaves of a precise measurement.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.camera.intrinsics import CAMERA_PARAMETERS, with_errors
+from estimator.camera.pose import POSE_PARAMETERS, Pose
+from estimator.errors import EstimationFailure
+from estimator.io.device import Camera, DeviceFrame, Led
+from estimator.pixels.led_model import IMAGE_PARAMETERS, PROFILE_PARAMETERS, ImageState
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+LOCAL_PARAMETERS = IMAGE_PARAMETERS + PROFILE_PARAMETERS
+LED_PARAMETERS = 3 + 1 + PROFILE_PARAMETERS
+"""An LED's own: shift along x, y and z of the world, size, profile."""
+LUMINAIRE_PARAMETERS = 6
+"""A luminaire's: shift along x, y and z, rotation about x, y and z."""
+DATUM_PARAMETERS = 4
+"""The map's: shift along x, y and z, scale."""
+COMMON_PARAMETERS = DATUM_PARAMETERS + CAMERA_PARAMETERS + POSE_PARAMETERS
+
+# Directions with less than this share of the largest information of an LED hold rounding errors alone.
+MIN_INFORMATION_SHARE = 1e-13
+
+
+@dataclass(frozen=True, eq=False)
+class Priors:
+    """Standard deviations of the nuisances of n LEDs of l luminaires; 0 for what is known exactly.
+
+    `camera` (7,) in the units of `with_errors`; `datum` (4,) metres and relative scale; `luminaires` (l, 6) metres and
+    radians; `leds` (n, 7): metres, relative size, profile coefficients. `positions_m` (n, 3) are the LEDs' positions by
+    the map, `centres_m` (l, 3) the points that luminaires turn about, `luminaire` (n,) each LED's, -1 for none.
+    """
+
+    camera: Floats
+    datum: Floats
+    luminaires: Floats
+    leds: Floats
+    positions_m: Floats
+    centres_m: Floats
+    luminaire: Ints
+
+    @staticmethod
+    def of(frame: DeviceFrame, leds: tuple[Led, ...]) -> "Priors":
+        """What a frame's device states about itself and these LEDs; what it does not state is taken as known."""
+        uncertainty, datum = frame.camera.uncertainty, frame.map_datum
+        camera = np.zeros(CAMERA_PARAMETERS)
+        if uncertainty is not None:
+            camera = np.hypot(uncertainty.device_sigmas(), uncertainty.shot_sigmas())
+        ids = [key for key in frame.luminaires if any(led.luminaire == key for led in leds)]
+        stated = [frame.luminaires[one] for one in ids]
+        rows = [[*one.sigma_m, *np.radians(one.sigma_rotation_deg)] for one in stated]
+        index = {one: k for k, one in enumerate(ids)}
+        own = np.zeros((len(leds), LED_PARAMETERS))
+        for k, led in enumerate(leds):
+            own[k, :3] = led.sigma_m or (0.0, 0.0, 0.0)
+            own[k, 3] = (led.size_sigma_m or 0.0) / led.half_width_m
+            own[k, 4:6] = led.gradient_sigma or 0.0
+        return Priors(
+            camera=camera,
+            datum=np.zeros(DATUM_PARAMETERS)
+            if datum is None
+            else np.array([*datum.sigma_m, datum.scale_sigma_ppm / 1e6]),
+            luminaires=np.array(rows).reshape(-1, LUMINAIRE_PARAMETERS),
+            leds=own,
+            positions_m=np.array([led.position_m for led in leds]).reshape(-1, 3),
+            centres_m=np.array([one.position_m for one in stated]).reshape(-1, 3),
+            luminaire=np.array(
+                [-1 if led.luminaire is None else index.get(led.luminaire, -1) for led in leds], dtype=np.int64
+            ),
+        )
+
+    @property
+    def exact(self) -> bool:
+        """Whether nothing is uncertain."""
+        return not (self.camera.any() or self.datum.any() or self.luminaires.any() or self.leds.any())
+
+    def position_sigma_m(self) -> Floats:
+        """Standard deviation (n,) of each LED's position along its worst axis, without the datum."""
+        of_luminaire = np.zeros((len(self.leds), 3))
+        has = self.luminaire >= 0
+        chosen = self.luminaire[has]
+        arm_m = np.linalg.norm(self.positions_m[has] - self.centres_m[chosen], axis=1, keepdims=True)
+        of_luminaire[has] = np.hypot(
+            self.luminaires[chosen, :3], self.luminaires[chosen, 3:].max(axis=1, keepdims=True) * arm_m
+        )
+        return np.asarray(np.hypot(self.leds[:, :3], of_luminaire).max(axis=1))
+
+    def only(self, leds: Ints) -> "Priors":
+        """The priors of the LEDs with these indices, and of all luminaires."""
+        return replace(self, leds=self.leds[leds], positions_m=self.positions_m[leds], luminaire=self.luminaire[leds])
+
+    def arms(self) -> Floats:
+        """Derivatives (n, 3, 6) of an LED's shift by its luminaire's nuisances."""
+        slopes = np.zeros((len(self.leds), 3, LUMINAIRE_PARAMETERS))
+        has = self.luminaire >= 0
+        chosen = self.luminaire[has]
+        x, y, z = (self.positions_m[has] - self.centres_m[chosen]).T
+        o = np.zeros_like(x)
+        slopes[has, :, :3] = np.eye(3)
+        # Columns: the cross products of the axes with (x, y, z).
+        slopes[has, :, 3:] = np.array([[o, z, -y], [-z, o, x], [y, -x, o]]).transpose(2, 0, 1)
+        return slopes
+
+    def datum_slopes(self) -> Floats:
+        """Derivatives (n, 3, 4) of an LED's shift by the datum's nuisances."""
+        shift = np.broadcast_to(np.eye(3), (len(self.leds), 3, 3))
+        return np.concatenate([shift, self.positions_m[:, :, None]], axis=2)
+
+
+@dataclass(frozen=True)
+class Components:
+    """Standard deviations that the images of a frame reveal beside those that the device states; 0 for none.
+
+    `place_m` of each LED's x, y and z, metres; `size`, relative; `profile` of each coefficient.
+    """
+
+    place_m: float = 0.0
+    size: float = 0.0
+    profile: float = 0.0
+
+    def added(self, stated: Priors) -> Priors:
+        """Priors with both."""
+        extra = np.array([self.place_m] * 3 + [self.size] + [self.profile] * PROFILE_PARAMETERS)
+        return replace(stated, leds=np.hypot(stated.leds, extra))
+
+    def updated(self, stated: Priors, values: "Nuisances", redundancy: Floats, used: NDArray[np.bool_]) -> "Components":
+        """Components whose priors agree with the values of the LEDs used, (n,), and their redundancy (n, 7).
+
+        Foerstner (1979): the squares of residuals, in units of the variance assumed, over their redundancy. A component
+        of 0 stays 0, and so does one that is not controlled.
+        """
+        total = self.added(stated)
+        z2 = (values.standardized(total).leds ** 2)[used]
+        new = {}
+        for name, columns in COLUMNS_OF_COMPONENT.items():
+            now = getattr(self, name)
+            controlled = float(redundancy[used][:, columns].sum())
+            if now > 0 and controlled > MIN_REDUNDANCY:
+                ratio = float(z2[:, columns].sum()) / controlled
+                variance = (
+                    ratio * (total.leds[used][:, columns] ** 2).mean() - (stated.leds[used][:, columns] ** 2).mean()
+                )
+                now = float(np.sqrt(max(variance, (MIN_COMPONENT * now) ** 2)))
+            new[name] = now
+        return Components(**new)
+
+    def differs(self, other: "Components") -> bool:
+        """Whether a component is other than in `other` by more than a twentieth."""
+        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
+        return any(abs(a - b) > 0.05 * max(a, b) for a, b in pairs)
+
+
+NO_COMPONENTS = Components()
+# Columns of an LED's own nuisances that have one component.
+COLUMNS_OF_COMPONENT = {"place_m": [0, 1, 2], "size": [3], "profile": [4, 5, 6]}
+# Redundancy of a component below which it is not estimated.
+MIN_REDUNDANCY = 0.5
+# Smallest ratio of a component to its former value.
+MIN_COMPONENT = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Nuisances:
+    """Values of the nuisances: true less believed; shapes and units as in `Priors`."""
+
+    camera: Floats
+    datum: Floats
+    luminaires: Floats
+    leds: Floats
+
+    @staticmethod
+    def zero(priors: Priors) -> "Nuisances":
+        """All as the device believes."""
+        return Nuisances(*(np.zeros_like(one) for one in (priors.camera, priors.datum, priors.luminaires, priors.leds)))
+
+    def only(self, leds: Ints) -> "Nuisances":
+        """The values of the LEDs with these indices, and all others."""
+        return replace(self, leds=self.leds[leds])
+
+    def updated(self, leds: Ints, values: "Nuisances") -> "Nuisances":
+        """These with new values, of the LEDs with these indices alone."""
+        of_leds = self.leds.copy()
+        of_leds[leds] = values.leds
+        return replace(values, leds=of_leds)
+
+    def moved(self, step: "Nuisances", factor: float = 1.0) -> "Nuisances":
+        """These plus a step times a factor."""
+        return Nuisances(*(a + factor * b for a, b in zip(vars(self).values(), vars(step).values(), strict=True)))
+
+    def standardized(self, priors: Priors) -> "Nuisances":
+        """These in standard deviations of their priors; 0 for what is known exactly."""
+        sigmas = (priors.camera, priors.datum, priors.luminaires, priors.leds)
+        pairs = zip(vars(self).values(), sigmas, strict=True)
+        return Nuisances(*(np.divide(v, s, out=np.zeros_like(v), where=s > 0) for v, s in pairs))
+
+    def deviance(self, priors: Priors) -> float:
+        """Sum of squares in standard deviations: minus twice the logarithm of the prior."""
+        return float(sum((one**2).sum() for one in vars(self.standardized(priors)).values()))
+
+    def profile(self) -> Floats:
+        """Profile coefficients (n, 3) of the LEDs."""
+        return self.leds[:, 4:]
+
+    def shifts_m(self, priors: Priors) -> Floats:
+        """Shifts (n, 3) of the LEDs from their positions by the map, world metres."""
+        shifts = self.leds[:, :3] + priors.datum_slopes() @ self.datum
+        has = priors.luminaire >= 0
+        shifts[has] += np.einsum("nij,nj->ni", priors.arms()[has], self.luminaires[priors.luminaire[has]])
+        return np.asarray(shifts)
+
+    def state(self, pose: Pose, camera: Camera, priors: Priors) -> ImageState:
+        """State of the LED images under a pose and these nuisances; `camera` is the believed one."""
+        return ImageState(pose, with_errors(camera, self.camera), self.shifts_m(priors), 1 + self.leds[:, 3])
+
+
+@dataclass(frozen=True, eq=False)
+class Gravity:
+    """Prior of the rig's tilts by the accelerometer: means (2,) and standard deviations (2,), radians."""
+
+    tilts: Floats
+    sigma: Floats
+
+    def residual(self, angles: Floats) -> Floats:
+        """Measured minus the rig's (tilt_x, tilt_y, yaw), in standard deviations, (2,)."""
+        residual = self.tilts - angles[:2]
+        return np.asarray((residual - 2 * np.pi * np.round(residual / (2 * np.pi))) / self.sigma)
+
+    def deviance(self, angles: Floats) -> float:
+        """Sum of the squared residuals of the tilts, in standard deviations."""
+        return float((self.residual(angles) ** 2).sum())
+
+
+NO_GRAVITY = Gravity(np.zeros(2), np.full(2, np.inf))
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """A step of pose (6,) and nuisances; covariance (6, 6) of the pose, and of each LED's own nuisances.
+
+    `redundancy` (n, 7) is the share of its prior that each LED's own nuisance keeps, 1 less its variance in prior
+    units. `step2` is the squared length of the step of the pose in standard deviations, `information` (6, 6) the
+    inverse of the pose's covariance.
+    """
+
+    pose_step: Floats
+    step: Nuisances
+    covariance: Floats
+    redundancy: Floats
+    step2: float
+    information: Floats
+
+
+def _triangle(matrix: Floats) -> Floats:
+    """Triangular factor of QR, of a matrix or of each of n."""
+    return np.asarray(np.linalg.qr(matrix, mode="r"), dtype=np.float64)
+
+
+def square_root(information: Floats, gradient: Floats) -> tuple[Floats, Floats]:
+    """Rows (n, p, p) and right-hand sides (n, p) of least squares with the information (n, p, p), gradient (n, p)."""
+    diagonal = np.diagonal(information, axis1=1, axis2=2)
+    scale = np.divide(1.0, np.sqrt(np.maximum(diagonal, 0.0)), out=np.zeros_like(diagonal), where=diagonal > 0)
+    values, vectors = np.linalg.eigh(np.clip(information * scale[:, :, None] * scale[:, None], -1.0, 1.0))
+    kept = values > MIN_INFORMATION_SHARE * values[:, -1:]
+    root = np.sqrt(np.where(kept, values, 0.0))
+    rows = (vectors * root[:, None]).transpose(0, 2, 1) * np.sqrt(np.maximum(diagonal, 0.0))[:, None]
+    right = np.einsum("nij,ni->nj", vectors, gradient * scale)
+    return rows, np.divide(right, root, out=np.zeros_like(right), where=kept)
+
+
+def solve(
+    rows: Floats,
+    right: Floats,
+    priors: Priors,
+    now: Nuisances,
+    gravity: Gravity,
+    angles: Floats,
+    damping: Floats | None = None,
+) -> Solution:
+    """Step of pose and nuisances that minimizes the squares of `rows` (n, r, p) x step - `right` (n, r), and priors.
+
+    The columns are the LOCAL_PARAMETERS; `angles` (3,) are the rig's; `damping` (6, 6), if given, is an information
+    that keeps the pose where it is (Levenberg-Marquardt), and is part of `Solution.covariance`. Raises
+    EstimationFailure if the pose is not determined.
+    """
+    n = len(rows)
+    z = now.standardized(priors)
+    of_camera = slice(POSE_PARAMETERS, POSE_PARAMETERS + CAMERA_PARAMETERS)
+    shifted = -rows[:, :, :3]  # by a shift of the LED
+    own = np.concatenate([shifted, rows[:, :, POSE_PARAMETERS + CAMERA_PARAMETERS :]], axis=2) * priors.leds[:, None]
+    common = np.concatenate(
+        [
+            shifted @ (priors.datum_slopes() * priors.datum),
+            rows[:, :, of_camera] * priors.camera,
+            rows[:, :, :POSE_PARAMETERS],
+        ],
+        axis=2,
+    )
+    arms = priors.arms()
+    has = priors.luminaire >= 0
+    arms[has] *= priors.luminaires[priors.luminaire[has]][:, None]
+    of_luminaire = shifted @ arms
+    system = np.concatenate([own, of_luminaire, common, right[:, :, None]], axis=2)
+    prior_rows = np.zeros((n, LED_PARAMETERS, system.shape[2]))
+    prior_rows[:, :, :LED_PARAMETERS] = np.eye(LED_PARAMETERS)
+    prior_rows[:, :, -1] = -z.leds
+    triangles = _triangle(np.concatenate([prior_rows, system], axis=1))
+    led_rows, rest = triangles[:, :LED_PARAMETERS], triangles[:, LED_PARAMETERS:, LED_PARAMETERS:]
+
+    remaining = [rest[priors.luminaire < 0][:, :, LUMINAIRE_PARAMETERS:].reshape(-1, COMMON_PARAMETERS + 1)]
+    luminaire_rows = {}
+    for k in np.unique(priors.luminaire[has]).tolist():
+        block = rest[priors.luminaire == k].reshape(-1, rest.shape[2])
+        prior = np.zeros((LUMINAIRE_PARAMETERS, rest.shape[2]))
+        prior[:, :LUMINAIRE_PARAMETERS] = np.eye(LUMINAIRE_PARAMETERS)
+        prior[:, -1] = -z.luminaires[k]
+        triangle = _triangle(np.concatenate([prior, block]))
+        luminaire_rows[k] = triangle[:LUMINAIRE_PARAMETERS]
+        remaining.append(triangle[LUMINAIRE_PARAMETERS:, LUMINAIRE_PARAMETERS:])
+    prior = np.zeros((COMMON_PARAMETERS, COMMON_PARAMETERS + 1))
+    known = DATUM_PARAMETERS + CAMERA_PARAMETERS
+    prior[:known, :known] = np.eye(known)
+    prior[:known, -1] = -np.concatenate([z.datum, z.camera])
+    tilt = [known + 3, known + 4]
+    prior[tilt, tilt] = 1 / gravity.sigma
+    prior[tilt, -1] = gravity.residual(angles)
+    total = np.concatenate([prior, *remaining])
+    if damping is not None:
+        held = np.zeros((POSE_PARAMETERS, COMMON_PARAMETERS + 1))
+        held[:, known:-1] = np.linalg.cholesky(damping).T
+        total = np.concatenate([total, held])
+    scale = np.linalg.norm(total[:, :-1], axis=0)
+    if not np.isfinite(total).all() or not (scale > 0).all():
+        raise EstimationFailure("fit", UNDETERMINED)
+    triangle = _triangle(np.column_stack([total[:, :-1] / scale, total[:, -1]]))
+    R, q = triangle[:COMMON_PARAMETERS, :-1], triangle[:COMMON_PARAMETERS, -1]
+    if not np.abs(np.diag(R)).min() > MIN_DETERMINED:
+        raise EstimationFailure("fit", UNDETERMINED)
+    inverse = np.linalg.inv(R) / scale[:, None]
+    covariance = inverse @ inverse.T
+    x = inverse @ q
+
+    of_luminaires = -z.luminaires
+    for k, row in luminaire_rows.items():
+        rhs = row[:, -1] - row[:, LUMINAIRE_PARAMETERS:-1] @ x
+        of_luminaires[k] = np.linalg.solve(row[:, :LUMINAIRE_PARAMETERS], rhs)
+    lead, on_luminaire = led_rows[:, :, :LED_PARAMETERS], led_rows[:, :, LED_PARAMETERS : -COMMON_PARAMETERS - 1]
+    on_common = led_rows[:, :, -COMMON_PARAMETERS - 1 : -1]
+    rhs = led_rows[:, :, -1] - on_common @ x
+    rhs[has] -= np.einsum("nij,nj->ni", on_luminaire[has], of_luminaires[priors.luminaire[has]])
+    of_leds = np.linalg.solve(lead, rhs[:, :, None])[:, :, 0]
+    inverse_lead = np.linalg.inv(lead)
+    # Of what is common, the luminaires' uncertainty is left out.
+    through = inverse_lead @ on_common @ inverse
+    redundancy = 1 - (inverse_lead**2).sum(axis=2) - (through**2).sum(axis=2)
+    pose_step, pose_covariance = x[known:], covariance[known:, known:]
+    root = R[known:, known:] * scale[known:]
+    return Solution(
+        pose_step=pose_step,
+        step=Nuisances(
+            camera=x[DATUM_PARAMETERS:known] * priors.camera,
+            datum=x[:DATUM_PARAMETERS] * priors.datum,
+            luminaires=of_luminaires * priors.luminaires,
+            leds=of_leds * priors.leds,
+        ),
+        covariance=pose_covariance,
+        redundancy=np.clip(redundancy, 0.0, 1.0),
+        step2=float(((root @ pose_step) ** 2).sum()),
+        information=root.T @ root,
+    )
+
+
+UNDETERMINED = "the LEDs in view do not determine a position"
+# Smallest diagonal element of the triangular factor, with columns of unit length, of a determined pose.
+MIN_DETERMINED = 1e-10
