@@ -22,7 +22,7 @@ from vlcrender.sensor.accelerometer import Imu, TiltError
 
 FORMAT_VERSION: Final = 4
 """`version` of dataset.json."""
-DATA_VERSION = 1
+DATA_VERSION = 2
 """`data_version` of the provenance: raised whenever the same recipe gives other bits."""
 
 Triple = tuple[float, float, float]
