@@ -240,7 +240,7 @@ def spot_errors_at(
         ],
         float(np.median(np.linalg.norm(scene.leds.centers_m - at.position_m, axis=1))),
         recipe.regions is not None and recipe.regions.overscan,
-        6 if bound else 2,
+        unknowns=6 if bound else 2,
     )
     if slopes is None:
         return None, None

@@ -12,6 +12,8 @@ unknowns i and j is
 exact for Poisson counts (var = mu); for a sensor with further noise it is the information in the mean, without the
 information in the variance, which goes as 1 / mu. The derivatives with respect to the pose are central differences of
 images whose edges are exact. The accelerometer adds 1 / sigma^2 to each of the two tilts.
+The glare of a lens is known too: an LED's image includes its halo in the group of LEDs that it belongs to; halos of
+other groups are part of the background.
 
 The hybrid bound (Y. Rockah and P. Schultheiss, Array shape calibration using sources in unknown locations, IEEE Trans.
 ASSP 35(3), 1987) lets lens and map err too, by the sigmas of `Uncertainty`: each such error is an unknown with a normal
@@ -68,6 +70,8 @@ OWN = 6
 """Errors of an LED's own: x, y, z, size, and two tilts of its face."""
 
 Render = Callable[[PosedCamera], Sequence[LedPatch]]
+HaloOf = Callable[[Sequence[LedPatch], Roi], Array]
+"""The halo of some patches in a region of the sensor, electrons a second."""
 
 
 def position_bound_m2(
@@ -79,6 +83,7 @@ def position_bound_m2(
     distance_m: float,
     tilt_sigmas_deg: tuple[float, float],
     overscan: bool = False,
+    halo_of: HaloOf | None = None,
 ) -> Array | None:
     """Bound of the covariance of a camera's position, (3, 3), m2, world; None where the frame does not determine it.
 
@@ -86,9 +91,9 @@ def position_bound_m2(
     the LEDs with the camera at poses near this, electrons a second. variance_e2: the regions read out, with the
     variance of each pixel, inf for pixels without information (saturated ones). distance_m: from the camera to the
     LEDs, roughly. tilt_sigmas_deg: standard deviations of the accelerometer on tilt_x and tilt_y; 0 means that both
-    tilts are known. overscan: whether LEDs count beyond the sensor.
+    tilts are known. overscan: whether LEDs count beyond the sensor. halo_of: halos of a lens with glare.
     """
-    slopes = FrameSlopes.rendered(mounted, main, render, exposure_s, variance_e2, distance_m, overscan)
+    slopes = FrameSlopes.rendered(mounted, main, render, exposure_s, variance_e2, distance_m, overscan, halo_of)
     return None if slopes is None else slopes.exact_bound_m2(tilt_sigmas_deg)
 
 
@@ -106,6 +111,8 @@ class FrameSlopes:
     exposure_s: float
     variance_e2: Sequence[RegionImage]
     overscan: bool
+    halo_of: HaloOf | None = None
+    """Halos of a lens with glare."""
 
     @classmethod
     def rendered(
@@ -117,6 +124,7 @@ class FrameSlopes:
         variance_e2: Sequence[RegionImage],
         distance_m: float,
         overscan: bool = False,
+        halo_of: HaloOf | None = None,
         unknowns: int = 6,
     ) -> "FrameSlopes | None":
         """Render a frame's LEDs at the steps of its pose; arguments as in `position_bound_m2`. None without LEDs.
@@ -139,7 +147,7 @@ class FrameSlopes:
                 {patch.led_id: patch for patch in patches_at(moved(main, i, sign * step))} for sign in (1, -1)
             )
             pairs.append((plus, minus))
-        return cls(mounted, main, at_pose, pairs, steps, exposure_s, variance_e2, overscan)
+        return cls(mounted, main, at_pose, pairs, steps, exposure_s, variance_e2, overscan, halo_of)
 
     def exact_bound_m2(self, tilt_sigmas_deg: tuple[float, float]) -> Array | None:
         """Bound of the position, (3, 3), m2, where lens and map are known; None where it is not determined."""
@@ -148,7 +156,9 @@ class FrameSlopes:
             for common, inside, weight in self._parts(box):
                 slopes = np.stack(
                     [
-                        (_image(common, plus, inside) - _image(common, minus, inside)) * self.exposure_s / (2 * step)
+                        (_image(common, plus, inside, self.halo_of) - _image(common, minus, inside, self.halo_of))
+                        * self.exposure_s
+                        / (2 * step)
                         for (plus, minus), step in zip(self.pairs, self.steps, strict=True)
                     ]
                 )
@@ -266,12 +276,12 @@ class FrameSlopes:
 
     def _light(self, roi: Roi, led: LedPatch) -> Array:
         """Light of one LED in a region, electrons."""
-        return _image(roi, {led.led_id: led}, [led]) * self.exposure_s
+        return _image(roi, {led.led_id: led}, [led], self.halo_of) * self.exposure_s
 
     def _slope(self, roi: Roi, unknown: int, led: LedPatch) -> Array:
         """Slope of one LED's light in a region by an unknown of the pose, electrons per m or radian."""
         plus, minus = self.pairs[unknown]
-        difference = _image(roi, plus, [led]) - _image(roi, minus, [led])
+        difference = _image(roi, plus, [led], self.halo_of) - _image(roi, minus, [led], self.halo_of)
         return difference * self.exposure_s / (2 * self.steps[unknown])
 
     def _box_factor(
@@ -455,12 +465,12 @@ def moved(pose: Pose, unknown: int, by: float) -> Pose:
     return Pose((numbers[0], numbers[1], numbers[2]), *numbers[3:])
 
 
-def _image(roi: Roi, patches: Mapping[int, LedPatch], leds: Sequence[LedPatch]) -> Array:
+def _image(roi: Roi, patches: Mapping[int, LedPatch], leds: Sequence[LedPatch], halo_of: HaloOf | None) -> Array:
     """Light of some LEDs in a region, electrons a second: of those in `patches` (by id) that `leds` names."""
-    image = np.zeros((roi.rows, roi.columns))
-    for led in leds:
-        patch = patches.get(led.led_id)
-        if patch is not None and roi.overlaps(patch.roi):
+    found = [patches[led.led_id] for led in leds if led.led_id in patches]
+    image = np.zeros((roi.rows, roi.columns)) if halo_of is None else halo_of(found, roi)
+    for patch in found:
+        if roi.overlaps(patch.roi):
             both = roi.intersection(patch.roi)
             image[roi.slices(both)] += patch.electrons_per_s[patch.roi.slices(both)]
     return image
