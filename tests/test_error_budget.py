@@ -58,6 +58,7 @@ def test_device_and_shot_share_an_unknown_by_their_variances(calibrated: vr.Erro
         assert device.total_mm / shot.total_mm == pytest.approx(ratio, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_datum_adds_its_own_size() -> None:
     """1, 2 and 2 mm: 2.236 mm horizontally, 2 mm vertically, whatever the weights."""
     rows = {row.key: row for row in budget_of("belief.datum.position_mm=[1.0, 2.0, 2.0]").rows}
@@ -67,6 +68,7 @@ def test_datum_adds_its_own_size() -> None:
     assert rows["datum"].sigma == "1, 2, 2 mm"
 
 
+@pytest.mark.slow
 def test_without_a_belief_noise_and_accelerometer_remain() -> None:
     exact = budget_of(bound=True)
     assert [row.key for row in exact.rows] in (["noise", "accelerometer"], ["accelerometer", "noise"])
@@ -75,6 +77,7 @@ def test_without_a_belief_noise_and_accelerometer_remain() -> None:
     assert exact.bound.total_mm < exact.total.total_mm < 3 * exact.bound.total_mm
 
 
+@pytest.mark.slow
 def test_half_the_sigmas_halve_the_error_where_noise_is_small() -> None:
     """All sigmas halved. Noise, 0.2 of 38 mm, stays: the ratio falls by 3/2 (0.2 / 38)^2 = 4e-5 of itself."""
     table = "belief.leds.position_mm=[{0}, {0}, {0}]"

@@ -112,7 +112,8 @@ class FrameSlopes:
     exposure_s: float
     variance_e2: Sequence[RegionImage]
     overscan: bool
-    halo_of: HaloOf | None
+    halo_of: HaloOf | None = None
+    """Halos of a lens with glare."""
 
     @classmethod
     def rendered(
