@@ -3,9 +3,9 @@
 With the slopes J of the spots by the pose, in normalized coordinates, the fit's pose moves by H J^T e, H = (J^T J)^-1,
 for errors e of the spots. With the covariance C of e, by the centroids and by the errors of camera and map that the
 device states, that of the pose is H J^T C J H (the "sandwich" of White 1980). Residuals that are much larger than C
-says are believed: where the map's errors are stated, C is multiplied by their ratio, otherwise each spot has a further
-variance, and a camera that states nothing is one as sold. The fit takes centroids as images of the LEDs' centres: the
-movement by their known difference (`estimator.solvers.reprojection`) adds its square.
+says are taken as they are: where the map's errors are stated, C is multiplied by their ratio, otherwise each spot has
+a further variance, and a camera that states nothing is one as sold. The fit takes centroids as images of the LEDs'
+centres: the movement by their known difference (`estimator.solvers.reprojection`) adds its square.
 """
 
 import numpy as np

@@ -247,15 +247,19 @@ def _snooped_consensus(
     """
     for pose, distance_px in ranked[:MAX_ROBUST_STARTS]:
         spread_px = _spread_px(distance_px)
-        inliers = distance_px <= np.maximum(START_GATE * spread_px, _gate_px(observations, pose))
-        if adapted and not _enough(inliers):
+        near = distance_px <= START_GATE * spread_px
+        within = near | (distance_px <= _gate_px(observations, pose))
+        if adapted and not _enough(within):
             # No majority agrees to the best ones' errors: all spots have errors of one size.
-            inliers = np.isfinite(distance_px)
-            spread_px = float(np.sqrt((distance_px[inliers] ** 2).mean() / 2))
+            within = np.isfinite(distance_px)
+            spread_px = float(np.sqrt((distance_px[within] ** 2).mean() / 2))
         trial = observations
         if adapted and not _scalable(observations):
             trial = replace(observations, added_sigma_px=spread_px)
-        found = _snooped(trial, pose, inliers, adapted)
+        # Wrong identities within the errors stated may be too many for data snooping; the nearest spots have fewer.
+        found = _snooped(trial, pose, within, adapted)
+        if found is None and (near != within).any():
+            found = _snooped(trial, pose, near, adapted)
         if found is not None:
             model, best, inliers = found
             return Consensus(best, (), inliers, _uses_gravity(observations), model, adapted)
