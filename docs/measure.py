@@ -385,9 +385,26 @@ def rivals(measure: Measurement) -> None:
     figure("fisheye, nakazawa2013, vertical, median", length(fisheye.loc["nakazawa2013", "vertical_median_m"]))
 
 
+def self_calibrated(measure: Measurement) -> None:
+    """Frames of a device together: 80 frames of each of five devices, at three levels of knowledge."""
+    heading("level", "variant", "failed", "median (95 % interval)", "RMSE (95 % interval)", "NEES (99 % interval)")
+    for level_name in ("laboratory", "calibrated", "as_sold"):
+        overrides = {"belief.devices": 5, "belief.maps": 4, "poses.count": 400, "bound": False}
+        folder = measure.dataset(f"{level_name}-5-devices", level_name, overrides)
+        scores = measure.scores(folder, ["gravity-fit", "self-calibrated"])
+        for name, score in scores.iterrows():
+            errors = [with_interval(score, "median"), with_interval(score, "rmse")]
+            row(level_name, f"`{name}`", score["failed"], *errors, with_limits(score))
+        together, alone = (scores.loc[name, "error_3d_rmse_m"] for name in ("self-calibrated", "gravity-fit"))
+        figure(f"{level_name}, RMSE of self-calibrated over that of gravity-fit", number(together / alone))
+
+
 SECTIONS: dict[str, Callable[[Measurement], None]] = {
     section.__name__: section
-    for section in (office200, office20, draws, blur, quickstart, table1, stages, accelerometer, rivals)
+    for section in (
+        *(office200, office20, draws, blur, quickstart, table1, stages, accelerometer, rivals),
+        self_calibrated,
+    )
 }
 
 

@@ -24,6 +24,7 @@ from estimator.solvers.uncertainty import AS_SOLD, Parameter, Uncertainty, assum
 VIEW = view_of((3, 3.2, 3.4), 2.0, 15, -10, 30, (4000, 3000, 3000.0))
 POSE = Pose(np.array(VIEW.position_m), VIEW.R_cam_world)
 LEDS_M = grid(3, 3, 0.4, (3, 3.2, 3.4))
+LEDS_M[:, 2] += 0.03 * (np.arange(9) % 5)  # at unequal heights, so that every turn moves every coordinate
 RADIUS_M = 0.03
 SIGMAS = (1e-3, 2e-4, 5.0, 6.0, 0.01, 2e-4, 3e-4)
 STATED = CameraUncertainty(

@@ -53,7 +53,8 @@ def fit_correspondences(frame: DeviceFrame, correspondences: Sequence[Correspond
     agreed = agreement(observe(frame, correspondences))
     estimate = Estimate(agreed.best.pose.position_m, covariance_m2=agreed.covariance_m2, ambiguous=ambiguous(agreed))
     model = agreed.model
-    if model is not None and model.added_sigma_px > 0:
+    # The second: a focal length that nothing vouches for counts in the covariance of the frame alone.
+    if (model is not None and model.added_sigma_px > 0) or agreed.unchecked_m2.any():
         return FittedFrame(estimate, None, 1.0)
     return FittedFrame(estimate, _view(frame, correspondences, agreed), 1.0 if model is None else float(model.scale))
 
