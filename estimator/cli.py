@@ -55,7 +55,12 @@ def variants() -> None:
 
 @app.command
 def run(
-    dataset: Path, /, *, variant: Annotated[list[str] | None, Parameter(negative=())] = None, workers: int = 1
+    dataset: Path,
+    /,
+    *,
+    variant: Annotated[list[str] | None, Parameter(negative=())] = None,
+    workers: int = 1,
+    centroid_sigma: float | None = None,
 ) -> None:
     """Estimate every frame's position and write DATASET/estimates/VARIANT.parquet.
 
@@ -67,6 +72,10 @@ def run(
         Variant to run; may be given several times. Default: all variants.
     workers
         Number of processes; the estimates do not depend on it.
+    centroid_sigma
+        Standard deviation of each coordinate of a centroid, pixels, beside that by the pixels' noise: the size of the
+        errors of camera, map and image that the device does not state. The variants that fit centroids then have the
+        name NAME:centroid-sigma=PIXELS; the others do not change.
     """
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -85,10 +94,25 @@ def run(
                 stack.enter_context(bar)  # not before the dataset is read: an error is one line
             bar.update(task, completed=done, total=total)
 
-        rows = estimator.run(dataset, variant, workers, draw)
+        rows = estimator.run(dataset, _with_centroid_sigma(variant, centroid_sigma), workers, draw)
     for name, of_variant in rows.items():
         ok = sum(row.status == "ok" for row in of_variant)
         print(f"{name}: {ok} of {len(of_variant)} frames ok -> {estimates_path(dataset, name)}")
+
+
+def _with_centroid_sigma(names: list[str] | None, sigma_px: float | None) -> list[str] | None:
+    """Names of variants, those that fit centroids with the option; None for all variants if there is no option."""
+    from estimator.methods.centroid_sigma import OPTION
+    from estimator.methods.gravity_fit import GRAVITY_FIT
+    from estimator.methods.up2p import UP2P
+
+    if sigma_px is None:
+        return names
+    able = (GRAVITY_FIT.name, UP2P.name)
+    chosen = [one.name for one in estimator.variants()] if names is None else names
+    if not set(able) & set(chosen):
+        raise InputError(f"--centroid-sigma: none of the variants uses it; those that do: {', '.join(able)}")
+    return [f"{name}:{OPTION}={sigma_px:.10f}".rstrip("0").rstrip(".") if name in able else name for name in chosen]
 
 
 @app.command

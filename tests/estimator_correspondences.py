@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from estimator_synthetic import Array, View, description
 
-from estimator.io.device import Accelerometer, Camera, DeviceFrame, DiscLed, Sensor
+from estimator.io.device import Accelerometer, Camera, CameraUncertainty, DeviceFrame, DiscLed, Sensor
 from estimator.spots.detect import Spot
 from estimator.spots.identify import Correspondence
 
@@ -14,7 +14,13 @@ POINT_M = 1e-6
 """A radius without eccentricity: at 3 m it lifts an LED by 3e-13 m."""
 
 
-def device(view: View, error_deg: float, rng: np.random.Generator | None = None) -> DeviceFrame:
+EXACT = CameraUncertainty(parameters=(), device_sigma=(), shot_sigma=(), offset_sigma_m=0.0, rotation_sigma_deg=0.0)
+"""Statement of a camera that it is known exactly."""
+
+
+def device(
+    view: View, error_deg: float, rng: np.random.Generator | None = None, uncertainty: CameraUncertainty | None = EXACT
+) -> DeviceFrame:
     """A frame without an image; with `rng` its accelerometer has the error on both tilts that it states."""
     of = description(view, 1, np.zeros((0, 3)), POINT_M)
     off = np.zeros(2) if rng is None else error_deg * rng.standard_normal(2)
@@ -22,7 +28,9 @@ def device(view: View, error_deg: float, rng: np.random.Generator | None = None)
     x, y, z = held.gravity_m_s2.tolist()
     return DeviceFrame(
         parts=(),
-        camera=Camera.model_validate_json(json.dumps(of["cameras"]["main"])),  # type: ignore[index]
+        camera=Camera.model_validate_json(json.dumps(of["cameras"]["main"])).model_copy(  # type: ignore[index]
+            update={"uncertainty": uncertainty}
+        ),
         sensor=Sensor.model_validate(of["sensor"]),
         accelerometer_m_s2=(x, y, z),
         accelerometer=Accelerometer(kind="tilt-error", error_deg=error_deg),

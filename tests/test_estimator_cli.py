@@ -38,6 +38,31 @@ def test_run_takes_some_variants(synthetic_set: Path, tmp_path: Path, capsys: py
     assert capsys.readouterr().out.startswith("pnp: 3 of 3 frames ok")
 
 
+@pytest.mark.parametrize(("sigma", "text"), [("0.50", "0.5"), ("10", "10"), ("0", "0")])
+def test_a_centroid_sigma_goes_to_the_variants_that_use_it(
+    synthetic_set: Path, tmp_path: Path, sigma: str, text: str
+) -> None:
+    folder = copy_of(synthetic_set, tmp_path)
+    assert main(["run", str(folder), "--variant", "pnp", "--variant", "gravity-fit", "--centroid-sigma", sigma]) == 0
+    names = sorted(path.stem for path in (folder / "estimates").iterdir())
+    assert names == [f"gravity-fit:centroid-sigma={text}", "pnp"]
+
+
+@pytest.mark.parametrize(
+    ("variant", "sigma", "message"),
+    [
+        ("pnp", "1", "--centroid-sigma: none of the variants uses it; those that do: gravity-fit, up2p"),
+        ("up2p", "-1", "centroid-sigma='-1' is not a number of pixels from 0 to 1000"),
+        ("up2p", "nan", "centroid-sigma='nan' is not a number of pixels from 0 to 1000"),
+    ],
+)
+def test_a_centroid_sigma_without_a_use_is_refused(
+    synthetic_set: Path, capsys: pytest.CaptureFixture[str], variant: str, sigma: str, message: str
+) -> None:
+    assert main(["run", str(synthetic_set), "--variant", variant, f"--centroid-sigma={sigma}"]) == 2
+    assert message in capsys.readouterr().err
+
+
 def test_variants_are_listed_a_line_each(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["variants"]) == 0
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == list(VARIANTS)

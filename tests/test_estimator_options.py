@@ -66,7 +66,22 @@ def test_all_choices_are_file_names() -> None:
     [
         ("best", f"variant best: unknown; allowed: {', '.join(VARIANTS)}"),
         ("best:spot=centroid", f"variant best:spot=centroid: unknown; allowed: {', '.join(VARIANTS)}"),
-        ("pnp:spot=centroid", "variant pnp:spot=centroid: pnp has no stages to choose; those that have: huynh2016"),
+        (
+            "pnp:spot=centroid",
+            "variant pnp:spot=centroid: pnp has no options; those that have: huynh2016, gravity-fit, up2p",
+        ),
+        (
+            "up2p:spot=centroid",
+            "variant up2p:spot=centroid: 'spot=centroid' is no option; allowed: centroid-sigma=PIXELS",
+        ),
+        *(
+            (
+                f"gravity-fit:centroid-sigma={value}",
+                f"variant gravity-fit:centroid-sigma={value}: "
+                f"centroid-sigma={value!r} is not a number of pixels from 0 to 1000",
+            )
+            for value in ("", "-1", "nan", "1e3", "1001", "0.5,centroid-sigma=1")
+        ),
     ],
 )
 def test_names_there_are_none_of(name: str, message: str) -> None:
@@ -78,3 +93,10 @@ def test_names_there_are_none_of(name: str, message: str) -> None:
 @pytest.mark.parametrize("name", VARIANTS)
 def test_plain_names_are_variants(name: str) -> None:
     assert variant_named(name) is VARIANTS[name]
+
+
+def test_a_centroid_sigma_is_part_of_the_name() -> None:
+    """Two variants of one name are equal, as worker processes need it, and of another value are not."""
+    half, again, one = (variant_named(f"gravity-fit:centroid-sigma={value}") for value in ("0.5", "0.5", "1"))
+    assert half.name == "gravity-fit:centroid-sigma=0.5"
+    assert half == again != one

@@ -9,7 +9,6 @@ from estimator_synthetic import Array, grid, view_of
 from test_estimator_reprojection import bent_spots, fish_eye
 
 from estimator.camera.pose import Pose, rotation
-from estimator.errors import EstimationFailure
 from estimator.methods.gravity_fit import _from_triples as from_triples
 from estimator.methods.gravity_fit import agreement, ambiguous
 from estimator.solvers.reprojection import Fit, Observations, observe
@@ -107,17 +106,31 @@ def test_the_worst_spot_alone_is_removed() -> None:
     assert np.flatnonzero(~found.inliers).tolist() == [3, 6]
 
 
+def sure_of(found: Consensus) -> float:
+    """Squared error of the position in units of the covariance."""
+    error = found.best.pose.position_m - VIEW.position_m
+    return float(error @ np.linalg.solve(found.covariance_m2, error))
+
+
 @pytest.mark.parametrize("spots", [8, 9])
 def test_four_spots_are_not_most_of_eight(spots: int) -> None:
-    """The other four or five are anywhere: no more than half of all agree on a pose."""
+    """The other four or five are anywhere: no more than half of all agree on a pose, and so the answer is by all, and
+    as uncertain as they are. 60 px uniformly to both sides are 35 px, 3 cm at this height.
+    """
     rng = np.random.default_rng(2)
     offsets = np.zeros((9, 2))
     offsets[[1, 3, 5, 7, 4]] = rng.uniform(-60, 60, (5, 2))
     chosen = np.arange(9) != (4 if spots == 8 else 9)
-    with pytest.raises(EstimationFailure, match="position: no pose explains gravity and most of the spots"):
-        agreed(observed(offsets, np.full(9, 0.02)).only(chosen))
+    found = agreed(observed(offsets, np.full(9, 0.02)).only(chosen))
+    assert found.adapted
+    assert 2 * found.inliers.sum() > spots
+    assert np.sqrt(np.trace(found.covariance_m2)) > 0.01
+    # 1e-6 of chi^2 with three degrees of freedom.
+    assert sure_of(found) < 30.7
     offsets[[4, 5]] = 0
-    assert np.flatnonzero(~agreed(observed(offsets, np.full(9, 0.02))).inliers).tolist() == [1, 3, 7]
+    exact = agreed(observed(offsets, np.full(9, 0.02)))
+    assert np.flatnonzero(~exact.inliers).tolist() == [1, 3, 7]
+    assert not exact.adapted
 
 
 def test_three_spots_do_not_outvote_a_fourth() -> None:
@@ -125,18 +138,19 @@ def test_three_spots_do_not_outvote_a_fourth() -> None:
     offsets = np.zeros((9, 2))
     offsets[8] = (20.0, 10.0)
     corners = np.isin(np.arange(9), [0, 2, 6, 8])
-    with pytest.raises(EstimationFailure, match="position: no pose explains gravity and most of the spots"):
-        agreed(observed(offsets, np.full(9, 0.02), 1e-3).only(corners))
+    found = agreed(observed(offsets, np.full(9, 0.02), 1e-3).only(corners))
+    assert found.inliers.all()
+    assert found.adapted
+    assert sure_of(found) < 30.7
 
 
 def test_a_wrong_reading_of_gravity_is_left_out() -> None:
     """Off by 2 deg, said to be good to 0.1 deg, and 9 spots of 0.02 px that fix the tilt to a hundredth of that."""
     seen = observed(np.zeros((9, 2)), np.full(9, 0.02))
     wrong = replace(seen, tilt_rad=seen.tilt_rad + np.radians([2.0, 0.0]))
-    with pytest.raises(EstimationFailure, match="position: no pose explains gravity"):
-        agreed(wrong)
     found = agreement(wrong)
     assert not found.gravity
+    assert found.inliers.all()
     assert agreement(seen).gravity
     np.testing.assert_allclose(found.best.pose.position_m, VIEW.position_m, atol=1e-7)
 

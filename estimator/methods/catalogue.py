@@ -1,14 +1,14 @@
 """Catalogue of this package's variants, by name."""
 
 from estimator.errors import InputError
-from estimator.methods.gravity_fit import GRAVITY_FIT
+from estimator.methods.gravity_fit import GRAVITY_FIT, gravity_fit_with
 from estimator.methods.huynh2016 import HUYNH2016, HUYNH2016_AS_PRINTED, huynh2016_with
 from estimator.methods.kim import KIM
 from estimator.methods.maximum_likelihood import ML
 from estimator.methods.nakazawa2013 import NAKAZAWA2013
 from estimator.methods.pnp import IPPE, PNP, SQPNP
 from estimator.methods.rahman2011 import RAHMAN2011
-from estimator.methods.up2p import UP2P
+from estimator.methods.up2p import UP2P, up2p_with
 from estimator.methods.variant import Variant
 from estimator.methods.yoshino2008 import YOSHINO2008
 
@@ -29,17 +29,17 @@ VARIANTS = {
         ML,
     )
 }
-STAGED = {"huynh2016": huynh2016_with}
-"""Variants whose stages can be chosen after a colon, by name: a function from the whole text to the variant."""
+STAGED = {"huynh2016": huynh2016_with, "gravity-fit": gravity_fit_with, "up2p": up2p_with}
+"""Variants with options after a colon, by name: a function from the whole text to the variant."""
 
 
 def variant_named(name: str) -> Variant:
-    """The variant of a name, or of `NAME:stage=value,...` (`estimator.methods.options`); raises InputError."""
+    """The variant of a name, or of a name with options, `NAME:option=value,...`; raises InputError."""
     base, colon, _ = name.partition(":")
     if colon and base in STAGED:
         return STAGED[base](name)
     if colon and base in VARIANTS:
-        raise InputError(f"variant {name}: {base} has no stages to choose; those that have: {', '.join(STAGED)}")
+        raise InputError(f"variant {name}: {base} has no options; those that have: {', '.join(STAGED)}")
     if name not in VARIANTS:
         raise InputError(f"variant {name}: unknown; allowed: {', '.join(VARIANTS)}")
     return VARIANTS[name]

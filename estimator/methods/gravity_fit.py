@@ -1,9 +1,12 @@
-"""MAP fit: weighted reprojection error with a Gaussian gravity prior.
+"""MAP fit: generalised least squares of the reprojection errors, with a Gaussian gravity prior.
 
-Spots are weighted by the covariance of their centroids, the accelerometer's reading by its standard deviation on each
-tilt axis. The model includes the eccentricity of discs and squares (`estimator.solvers.reprojection`). LEDs in a plane
-have two poses of nearly equal reprojection error, LEDs close to one line a continuum of them; both poses are initial
-values, and gravity decides. Wrong identities are excluded by consensus.
+Spots are weighted by the covariance of their centroids and of the errors of camera and map that the device states
+(`estimator.solvers.uncertainty`), the accelerometer's reading by its standard deviation on each tilt axis. Where the
+device states no errors and the residuals reveal none, camera and map are taken as exact; `estimator.solvers.robust_fit`
+says what is assumed otherwise. The model includes the eccentricity of discs and squares
+(`estimator.solvers.reprojection`). LEDs in a plane have two poses of nearly equal reprojection error, LEDs close to one
+line a continuum of them; both poses are initial values, and gravity decides. Wrong identities are excluded by
+consensus.
 """
 
 from collections.abc import Sequence
@@ -15,10 +18,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.camera.pose import Pose
-from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame
+from estimator.methods.centroid_sigma import with_centroid_sigma
 from estimator.methods.pnp import candidates, in_a_plane
-from estimator.methods.up2p import upright_pose
+from estimator.methods.up2p import upright_pairs, upright_pose
 from estimator.methods.variant import Estimate, Variant
 from estimator.solvers.reprojection import Observations, centroid_images, observe
 from estimator.solvers.robust_fit import Consensus, consensus
@@ -38,27 +41,30 @@ MAX_TRIPLE_STARTS = 3
 MIN_FOR_IPPE = 4
 
 
-def gravity_fit(frame: DeviceFrame) -> Estimate:
-    """Position, its covariance, and whether another position is nearly as likely; raises EstimationFailure."""
-    return fit_correspondences(frame, find_correspondences(frame))
+def gravity_fit(frame: DeviceFrame, centroid_sigma_px: float = 0.0) -> Estimate:
+    """Position, its covariance, and whether another position is nearly as likely; raises EstimationFailure.
+
+    `centroid_sigma_px` is the standard deviation of centroids by errors that the device does not state.
+    """
+    return fit_correspondences(frame, find_correspondences(frame), centroid_sigma_px)
 
 
-def fit_correspondences(frame: DeviceFrame, correspondences: Sequence[Correspondence]) -> Estimate:
-    """The estimate from identified spots; of the frame, camera and accelerometer are used."""
-    agreed = agreement(observe(frame, correspondences))
+def fit_correspondences(
+    frame: DeviceFrame, correspondences: Sequence[Correspondence], centroid_sigma_px: float = 0.0
+) -> Estimate:
+    """The estimate from identified spots; of the frame, camera, accelerometer and map are used."""
+    agreed = agreement(observe(frame, correspondences, centroid_sigma_px))
     return Estimate(agreed.best.pose.position_m, covariance_m2=agreed.covariance_m2, ambiguous=ambiguous(agreed))
 
 
 def agreement(observations: Observations) -> Consensus:
     """Consensus of spots and gravity, or of the spots alone if gravity disagrees; raises EstimationFailure."""
-    starts = _starts(observations)
-    try:
-        return consensus(observations, starts, lambda: _from_triples(observations))
-    except EstimationFailure:
-        if not determine_orientation(observations.leds_m):
-            raise
-        # The accelerometer's reading may be the outlier.
-        return consensus(observations.without_gravity(), starts, lambda: _from_triples(observations))
+
+    def more_starts() -> list[Pose]:
+        return [*upright_pairs(observations), *_from_triples(observations)]
+
+    gravity_optional = determine_orientation(observations.leds_m)
+    return consensus(observations, _starts(observations), more_starts, gravity_optional)
 
 
 def ambiguous(agreed: Consensus) -> bool:
@@ -104,6 +110,11 @@ def _from_triples(observations: Observations) -> list[Pose]:
             if np.isfinite(error):
                 ranked.append((error, len(ranked), pose))
     return [pose for *_, pose in islice(sorted(ranked, key=lambda one: one[:2]), MAX_TRIPLE_STARTS)]
+
+
+def gravity_fit_with(name: str) -> Variant:
+    """The variant `gravity-fit:centroid-sigma=PIXELS`; raises InputError."""
+    return with_centroid_sigma(name, gravity_fit)
 
 
 GRAVITY_FIT = Variant(

@@ -1,7 +1,8 @@
 """Perspective-n-point: position from LEDs and their pixels alone, without gravity. Baseline: OpenCV defaults.
 
 Centroids stand for the images of the LEDs' centres, from which they differ slightly
-(`estimator.solvers.reprojection`), and all have equal weight.
+(`estimator.solvers.reprojection`), and all have equal weight. The covariance is that of such a fit
+(`estimator.solvers.ordinary_covariance`).
 """
 
 from collections.abc import Sequence
@@ -11,17 +12,23 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from estimator.camera.pose import Pose
 from estimator.camera.undistort import pinhole_pixels
 from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame, normalized
+from estimator.io.records import is_covariance
 from estimator.methods.variant import Estimate, Variant
+from estimator.solvers.ordinary_covariance import ordinary_covariance
+from estimator.solvers.reprojection import observe
 from estimator.solvers.trilateration import check_pattern
 from estimator.spots.correspondences import centroids_px, find_correspondences, led_positions_m
+from estimator.spots.identify import Correspondence
 
 Floats = NDArray[np.float64]
 
-# Depth over length of the LEDs' pattern, from which on the model of the planar solver is wrong.
-MAX_PLANE_DEPTH = 1e-3
+# Depth over length of the LEDs' pattern, from which on the planar solver is no use. Its poses are initial values, so
+# that errors of the map, and luminaires that hang a little askew, may lift LEDs out of the plane.
+MAX_PLANE_DEPTH = 0.02
 
 
 def pnp(frame: DeviceFrame) -> Estimate:
@@ -40,13 +47,30 @@ def sqpnp(frame: DeviceFrame) -> Estimate:
 
 
 def _estimate(frame: DeviceFrame, methods: Sequence[int]) -> Estimate:
-    correspondences = find_correspondences(frame)
+    return fit_correspondences(frame, find_correspondences(frame), methods)
+
+
+def fit_correspondences(
+    frame: DeviceFrame,
+    correspondences: Sequence[Correspondence],
+    methods: Sequence[int] = (cv2.SOLVEPNP_SQPNP, cv2.SOLVEPNP_IPPE),
+) -> Estimate:
+    """The estimate from identified spots by OpenCV `methods`; of the frame, the camera is used."""
     pixels = pinhole_pixels(centroids_px(correspondences), frame.camera)
-    return Estimate(position_from_pixels(led_positions_m(correspondences), pixels, frame.camera.matrix(), methods))
+    pose = pose_from_pixels(led_positions_m(correspondences), pixels, frame.camera.matrix(), methods)
+    covariance_m2 = ordinary_covariance(observe(frame, correspondences), pose)
+    return Estimate(
+        pose.position_m, covariance_m2=covariance_m2 if is_covariance(covariance_m2.ravel().tolist()) else None
+    )
 
 
 def position_from_pixels(leds_m: Floats, pixels: Floats, K: Floats, methods: Sequence[int]) -> Floats:
-    """Position, (3,) world metres, from LEDs (n, 3) and their pixels (n, 2) in a pinhole with `K`, by OpenCV `methods`.
+    """Position, (3,) world metres, by `pose_from_pixels`."""
+    return pose_from_pixels(leds_m, pixels, K, methods).position_m
+
+
+def pose_from_pixels(leds_m: Floats, pixels: Floats, K: Floats, methods: Sequence[int]) -> Pose:
+    """Pose from LEDs (n, 3) and their pixels (n, 2) in a pinhole with `K`, by OpenCV `methods`.
 
     Each candidate is refined by Levenberg-Marquardt. Of those with every LED in front of the camera and above it, the
     one with the smallest reprojection error is returned. IPPE is used for LEDs in a plane. Raises EstimationFailure for
@@ -62,7 +86,7 @@ def position_from_pixels(leds_m: Floats, pixels: Floats, K: Floats, methods: Seq
     # OpenCV supports no skew and has another pixel convention: pass normalized coordinates.
     image = np.ascontiguousarray(normalized(pixels, K))
     min_error = np.inf
-    best: Floats | None = None
+    best: Pose | None = None
     for method in methods:
         for R_cam_world, shift in candidates(model, image, method, refined=True):
             p_cam = model @ R_cam_world.T + shift
@@ -70,7 +94,7 @@ def position_from_pixels(leds_m: Floats, pixels: Floats, K: Floats, methods: Seq
             error = float(np.linalg.norm(p_cam[:, :2] / p_cam[:, 2:] - image))
             possible = (p_cam[:, 2] > 0).all() and position_m[2] < leds_m[:, 2].min()
             if possible and error < min_error:
-                min_error, best = error, position_m
+                min_error, best = error, Pose(position_m, R_cam_world)
     if best is None:
         raise EstimationFailure("position", "no pose has the camera below the LEDs and the LEDs in front of it")
     return best
@@ -86,12 +110,17 @@ def candidates(model: Floats, image: Floats, method: int, refined: bool) -> list
     """Candidate poses by an OpenCV method, as (rotation (3, 3), translation (3,)); the method may find none.
 
     `model` (n, 3) are points in metres relative to their centre, `image` (n, 2) their normalized image coordinates.
+    IPPE is given the points projected into their plane; the refinement takes them as they are.
     """
     eye = np.eye(3)
+    given = model
+    if method == cv2.SOLVEPNP_IPPE:
+        normal = np.linalg.svd(model - model.mean(axis=0))[2][2]
+        given = np.ascontiguousarray(model - np.outer((model - model.mean(axis=0)) @ normal, normal))
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 50, 1e-14)
     poses = []
     try:
-        _, vectors, shifts, _ = cv2.solvePnPGeneric(model, image, eye, None, flags=method)
+        _, vectors, shifts, _ = cv2.solvePnPGeneric(given, image, eye, None, flags=method)
         for vector, shift in zip(vectors, shifts, strict=True):
             if refined:
                 vector, shift = cv2.solvePnPRefineLM(model, image, eye, None, vector, shift, criteria)

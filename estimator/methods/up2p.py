@@ -2,9 +2,10 @@
 
 `up2p` is PoseLib's upright two-point solver (Kukelova, Bujnak & Pajdla 2010) inside a RANSAC of this package, because
 PoseLib's Python interface has the solver alone. The solver assumes gravity to be exact, so the error of the reading
-displaces the other spots under the pose of a pair; the gate for inliers includes that displacement. The refinement then
-fits position and orientation to the inliers without gravity. If the inliers do not determine the orientation (fewer
-than four, or on one line), gravity is used as a prior.
+displaces the other spots under the pose of a pair; the gate for inliers includes that displacement, and that by the
+errors of camera and map that the device states. The refinement then fits position and orientation to the inliers
+without gravity. If the inliers do not determine the orientation (fewer than four, or on one line), or the device states
+errors of camera or map, beside which gravity counts, gravity is used as a prior.
 """
 
 from collections.abc import Sequence
@@ -17,6 +18,7 @@ from estimator.camera.leveling import MIN_ELEVATION_SINE
 from estimator.camera.pose import Pose, rotation
 from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame
+from estimator.methods.centroid_sigma import with_centroid_sigma
 from estimator.methods.variant import Estimate, Variant
 from estimator.solvers.reprojection import Observations, centroid_images, observe
 from estimator.solvers.robust_fit import consensus
@@ -41,20 +43,25 @@ MAX_PAIR_STARTS = 3
 Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
-def up2p(frame: DeviceFrame) -> Estimate:
-    """Upright two-point RANSAC and refinement; raises EstimationFailure, also if PoseLib is not installed."""
+def up2p(frame: DeviceFrame, centroid_sigma_px: float = 0.0) -> Estimate:
+    """Upright two-point RANSAC and refinement; raises EstimationFailure, also if PoseLib is not installed.
+
+    `centroid_sigma_px` is the standard deviation of centroids by errors that the device does not state.
+    """
     if poselib is None:
         raise EstimationFailure("up2p", "PoseLib is not installed (pip install vlcrender[poselib])")
-    return fit_correspondences(frame, find_correspondences(frame))
+    return fit_correspondences(frame, find_correspondences(frame), centroid_sigma_px)
 
 
-def fit_correspondences(frame: DeviceFrame, correspondences: Sequence[Correspondence]) -> Estimate:
-    """The estimate from identified spots; of the frame, camera and accelerometer are used."""
-    observations = observe(frame, correspondences)
+def fit_correspondences(
+    frame: DeviceFrame, correspondences: Sequence[Correspondence], centroid_sigma_px: float = 0.0
+) -> Estimate:
+    """The estimate from identified spots; of the frame, camera, accelerometer and map are used."""
+    observations = observe(frame, correspondences, centroid_sigma_px)
     starts = _from_pairs(observations)
-    if determine_orientation(observations.leds_m):
+    if determine_orientation(observations.leds_m) and not observations.correlated:
         observations = observations.without_gravity()
-    agreed = consensus(observations, starts[:1], lambda: starts[1:])
+    agreed = consensus(observations, starts[:1], lambda: [*starts[1:], *upright_pairs(observations)])
     return Estimate(agreed.best.pose.position_m, covariance_m2=agreed.covariance_m2)
 
 
@@ -68,6 +75,8 @@ def _from_pairs(observations: Observations) -> list[Pose]:
         generator = np.random.Generator(np.random.Philox(key=len(pairs)))
         pairs = [pairs[k] for k in generator.choice(len(pairs), MAX_PAIRS, replace=False)]
     gate = GATE_SIGMA * float(observations.tilt_sigma_rad.max()) + GATE_PX * observations.camera.pixel_angle_rad
+    if observations.correlated and (pose := upright_pose(observations)) is not None:
+        gate += GATE_SIGMA * float(np.sqrt(np.diag(observations.covariance(pose)).max()))
     ranked: list[tuple[float, int, Pose]] = []
     for pair in pairs:
         found = poselib.up2p(level[list(pair)] @ Y_UP.T, observations.leds_m[list(pair)] @ Y_UP.T)
@@ -89,24 +98,42 @@ def upright_pose(observations: Observations) -> Pose | None:
     level, above = _leveled(observations)
     if above.sum() < 2:
         return None
-    rays, leds_m = level[above], observations.leds_m[above]
-    image = (rays[:, 0] + 1j * rays[:, 1]) / rays[:, 2]
+    return _upright(rotation(*observations.tilt_rad.tolist()), level[above], observations.leds_m[above])
+
+
+def upright_pairs(observations: Observations) -> list[Pose]:
+    """Upright poses by pairs of spots, at most MAX_PAIRS: initial values for observations with outliers."""
+    level, above = _leveled(observations)
+    tilt = rotation(*observations.tilt_rad.tolist())
+    pairs = list(combinations(np.flatnonzero(above).tolist(), 2))
+    if len(pairs) > MAX_PAIRS:
+        generator = np.random.Generator(np.random.Philox(key=len(pairs)))
+        pairs = [pairs[k] for k in generator.choice(len(pairs), MAX_PAIRS, replace=False)]
+    poses = [_upright(tilt, level[list(pair)], observations.leds_m[list(pair)]) for pair in pairs]
+    return [pose for pose in poses if pose is not None]
+
+
+def _upright(tilt: Floats, level: Floats, leds_m: Floats) -> Pose | None:
+    """Upright pose by least squares from leveled unit vectors (n, 3) to LEDs (n, 3); None if they determine none.
+
+    `tilt` (3, 3) maps leveled axes to the camera's.
+    """
+    image = (level[:, 0] + 1j * level[:, 1]) / level[:, 2]
     planar = leds_m[:, 0] + 1j * leds_m[:, 1]
     spread = planar - planar.mean()
     product = np.vdot(spread, image - image.mean())
     if product == 0:
         return None
     # Rz(yaw) maps x + iy to exp(-i yaw) (x + iy).
-    tilt_x, tilt_y = observations.tilt_rad.tolist()
-    R_cam_world = rotation(tilt_x, tilt_y, -float(np.angle(product)))
-    lines = _rays(observations)[above] @ R_cam_world
-    lines /= np.linalg.norm(lines, axis=1, keepdims=True)
+    turned = product / abs(product)
+    yaw = np.array([[turned.real, -turned.imag, 0.0], [turned.imag, turned.real, 0.0], [0.0, 0.0, 1.0]])
+    lines = level @ yaw
     across = np.eye(3) - lines[:, :, None] * lines[:, None, :]
     try:
         position_m = np.linalg.solve(across.sum(axis=0), (across @ leds_m[:, :, None]).sum(axis=0)[:, 0])
     except np.linalg.LinAlgError:
         return None
-    return Pose(position_m, R_cam_world)
+    return Pose(position_m, tilt @ yaw)
 
 
 def _leveled(observations: Observations) -> tuple[Floats, NDArray[np.bool_]]:
@@ -119,6 +146,11 @@ def _leveled(observations: Observations) -> tuple[Floats, NDArray[np.bool_]]:
 def _rays(observations: Observations) -> Floats:
     """Vectors (n, 3) to the spots at unit depth, camera axes."""
     return np.column_stack([observations.image, np.ones(len(observations.image))])
+
+
+def up2p_with(name: str) -> Variant:
+    """The variant `up2p:centroid-sigma=PIXELS`; raises InputError."""
+    return with_centroid_sigma(name, up2p)
 
 
 UP2P = Variant(

@@ -1,11 +1,26 @@
-"""Robust fit: the pose that explains gravity and all spots, or else the largest consistent set of them (inliers)."""
+"""Robust fit: the pose that explains gravity and the spots, which spots it leaves out, and how large the errors are.
+
+Data snooping (Baarda 1968) finds outliers: each spot's displacement from where the other observations put it is tested
+against its own covariance, and the worst spots are left out until none is beyond OUTLIER_PROBABILITY. Where all spots
+pass with the errors that the device states, that fit is the result. Otherwise several explanations compete, each fitted
+to the spots that it leaves in, from poses that put most spots about right:
+
+- errors as stated, and outliers;
+- stated errors of camera, map and gravity that are larger or smaller by a common factor, estimated from the residuals;
+- where the map's errors are not stated: a further error of each centroid, of a size estimated from the residuals. A
+  camera that states nothing then has the errors of one as sold (`estimator.solvers.uncertainty`), because the
+  residuals hardly reveal a focal length;
+- errors as stated without gravity, where that is optional and contradicts the spots.
+
+The explanation with the largest restricted likelihood is taken; an outlier lies anywhere in OUTLIER_RADIUS.
+"""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.stats import chi2, f
 
 from estimator.camera.pose import Pose
 from estimator.camera.projection import projection_of
@@ -23,6 +38,31 @@ MODEL_ERROR_PX = 0.1
 MIN_SPOTS = 3
 MIN_INLIERS = 4
 MAX_ROBUST_STARTS = 3
+# Standard deviations about a rough pose within which spots take part in data snooping.
+START_GATE = 5.0
+# Median of chi-square with two degrees of freedom.
+CHI2_MEDIAN = 2 * np.log(2)
+# Spots beyond the limit that are excluded together have at least this share of the largest chi-square: a wrong spot
+# pulls the fit, and with it the residuals of true spots.
+MIN_EXCLUDED_SHARE = 0.5
+# Repetitions that estimate the size of errors, by the median of spots with outliers and by all spots without, and the
+# largest change of its square in one.
+ROBUST_ROUNDS = 3
+MOMENT_ROUNDS = 3
+MAX_RATIO = 100.0
+# Share of the image's width within which an outlier may lie anywhere: as far as a decoded pixel may be from a spot.
+OUTLIER_RADIUS = 0.01
+# Inliers, and their share, from which on a pose that they agree on is no chance: ten degrees of freedom.
+MIN_SURE_INLIERS = 8
+MIN_SURE_SHARE = 2 / 3
+# An exact camera has to be a hundred times as likely as one as sold, where it states nothing and errors are revealed.
+CAUTION_CHI2 = 2 * np.log(100)
+# Standard deviations of an error of the camera's intrinsics, one of seven, beyond which the residuals reveal it: by
+# chance in one of 2000 frames.
+MAX_CAMERA_SIGMA = 4.0
+# Relative error of an unstated focal length that the residuals have to be able to reveal for it to be taken as exact:
+# half the smallest that is said of real cameras, 0.1 %, so that one of 0.1 % is missed in one of 30 000 frames at most.
+CHECKED_FOCAL = 5e-4
 # Poses closer than both lead to one minimum.
 SAME_MINIMUM_RAD = 0.01
 SAME_MINIMUM_M = 0.1
@@ -33,67 +73,346 @@ class Consensus:
     """A fitted pose and the spots it is based on.
 
     `best` is the best fit, `others` are fits of other local minima to the same spots, best first; `inliers` (n,) are
-    the spots used; `gravity` says whether the accelerometer was used.
+    the spots used; `gravity` says whether the accelerometer was used. `model` are the observations with the size of
+    errors that explains them, None where all spots are explained as stated; `adapted` says that the residuals gave it.
+    `unchecked_m2` (3, 3) is what a focal length that neither the device nor the residuals vouch for adds to the
+    position's covariance.
     """
 
     best: Fit
     others: tuple[Fit, ...]
     inliers: NDArray[np.bool_]
     gravity: bool
+    model: Observations | None = None
+    adapted: bool = False
+    unchecked_m2: Floats = field(default_factory=lambda: np.zeros((3, 3)))
 
     @property
     def covariance_m2(self) -> Floats:
-        """Covariance of the position, (3, 3).
+        """Covariance of the position, (3, 3), with `unchecked_m2`.
 
-        It is scaled by chi-square per degree of freedom if chi-square is too large by OUTLIER_PROBABILITY.
+        It is scaled by chi-square per degree of freedom if chi-square is too large by OUTLIER_PROBABILITY. With errors
+        of a size by the residuals, of n degrees of freedom, it is that of Student's distribution, n / (n - 2) times.
         """
         freedom = 2 * len(self.best.spots_chi2) + (2 if self.gravity else 0) - 6
+        if self.adapted:
+            return self.best.covariance_m2 * (max(freedom, 3) / (max(freedom, 3) - 2)) + self.unchecked_m2
         total = self.best.chi2
         scale = total / freedom if freedom > 0 and total > chi2.isf(OUTLIER_PROBABILITY, freedom) else 1.0
-        return self.best.covariance_m2 * scale
+        return self.best.covariance_m2 * scale + self.unchecked_m2
+
+    def of_inliers(self) -> Observations:
+        """The observations of the inliers, with the size of errors that explains them."""
+        if self.model is None:
+            raise ValueError("a consensus on all spots as stated has no model")
+        return self.model.only(self.inliers)
 
 
 def consensus(
-    observations: Observations, starts: Sequence[Pose], more_starts: Callable[[], Iterable[Pose]]
+    observations: Observations,
+    starts: Sequence[Pose],
+    more_starts: Callable[[], Iterable[Pose]],
+    gravity_optional: bool = False,
 ) -> Consensus:
-    """Fit from every initial pose; if the best fit does not explain all spots, find the inliers and fit those.
+    """Fit from every initial pose; if the best fit does not explain all spots, find the best explanation.
 
-    `more_starts` gives initial poses for observations with outliers. For a lens that bends straight lines the fit is
-    repeated with centroids corrected by the first pose. Raises EstimationFailure if too few spots agree, or no pose has
-    the LEDs in front of the camera and above it.
+    `more_starts` gives initial poses for observations with outliers. `gravity_optional` says that the accelerometer's
+    reading may be the outlier. For a lens that bends straight lines the fit is repeated with centroids corrected by the
+    first pose. Raises EstimationFailure if too few spots agree, or no pose has the LEDs in front of the camera and
+    above it.
     """
-    agreed = _consensus(observations, starts, more_starts)
+    agreed = _consensus(observations, starts, more_starts, gravity_optional)
     if projection_of(observations.camera).rectilinear:
         return agreed
     poses = [found.pose for found in (agreed.best, *agreed.others)]
-    return _consensus(corrected_for_eccentricity(observations, agreed.best.pose), poses, more_starts)
+    corrected = corrected_for_eccentricity(observations, agreed.best.pose)
+    return _consensus(corrected, poses, more_starts, gravity_optional)
 
 
 def _consensus(
     observations: Observations,
     starts: Sequence[Pose],
     more_starts: Callable[[], Iterable[Pose]],
+    gravity_optional: bool,
 ) -> Consensus:
-    gravity = bool(np.isfinite(observations.tilt_sigma_rad).all())
     everything = np.ones(len(observations.leds_m), dtype=bool)
     if len(everything) < MIN_SPOTS:
         raise EstimationFailure("position", f"LEDs identified: {len(everything)}, needed: {MIN_SPOTS}")
     fits = minima(observations, starts)
     if fits and _explains_all(fits[0], observations):
-        return Consensus(fits[0], fits[1:], everything, gravity)
-    for robust in minima(observations, [*starts, *more_starts()], robust=True)[:MAX_ROBUST_STARTS]:
-        inliers = _explained(robust, observations)
-        while inliers.sum() >= MIN_INLIERS and 2 * inliers.sum() > len(inliers):
-            chosen = observations.only(inliers)
-            fits = minima(chosen, [robust.pose, *starts])
-            if fits and _explains_all(fits[0], chosen):
-                return Consensus(fits[0], fits[1:], inliers, gravity)
-            if not fits or _explained(fits[0], chosen).all():
-                break
-            # Remove the worst spot alone: it pulls the fit, and with it the residuals of true spots.
+        agreed = Consensus(fits[0], fits[1:], everything, _uses_gravity(observations))
+        if _plausible(agreed, observations):
+            return replace(agreed, unchecked_m2=_unchecked_focal_m2(observations, fits[0]))
+        rough = [one.pose for one in fits]
+    else:
+        rough = [*(one.pose for one in fits), *starts, *more_starts()]
+    found = _explanations(observations, rough)
+    limit = chi2.isf(OUTLIER_PROBABILITY, 2)
+    if gravity_optional and not any(one.best.tilt_chi2 <= limit and not one.adapted for one in found):
+        found += _explanations(observations.without_gravity(), rough, sizes=(False,))
+    if not found:
+        raise EstimationFailure("position", "no pose explains gravity and most of the spots")
+    best = min(found, key=lambda one: _score(one, observations))
+    fits = minima(best.of_inliers(), [best.best.pose, *starts])
+    if fits:
+        best = replace(best, best=fits[0], others=fits[1:])
+    return replace(best, unchecked_m2=_unchecked_focal_m2(best.of_inliers(), best.best))
+
+
+def _explanations(
+    observations: Observations, rough: Sequence[Pose], sizes: Sequence[bool] = (False, True)
+) -> list[Consensus]:
+    """Explanations of the spots by errors as stated with outliers, and by errors of a size by the residuals.
+
+    `sizes` says which: False for as stated, True for by the residuals. `rough` are poses to begin with. An explanation
+    with many inliers and few outliers needs no other.
+    """
+    ranked, assumed = _ranked(observations, rough), observations.with_assumed_camera()
+    models = [observations] if assumed is observations else [observations, assumed]
+    attempts = [(model, adapted) for adapted in sizes for model in models]
+    found = []
+    for model, adapted in attempts:
+        explained = _snooped_consensus(model, ranked, adapted)
+        if explained is None:
+            continue
+        # Larger errors than those of centroids are of the map or camera: one that states nothing is then not exact.
+        if model is not assumed and explained.model is not None and explained.model.added_sigma_px > MODEL_ERROR_PX:
+            continue
+        found.append(explained)
+        count = len(explained.inliers)
+        sure = explained.inliers.sum() >= max(MIN_SURE_INLIERS, MIN_SURE_SHARE * count)
+        if sure and not adapted and _plausible(explained, model):
+            break
+    return found
+
+
+def _plausible(agreed: Consensus, observations: Observations) -> bool:
+    """Whether chi-square of inliers and gravity is as the errors say, and the spots do not contradict the camera.
+
+    The camera is contradicted where one of the errors that are assumed of a camera as sold would explain the residuals
+    better by MAX_CAMERA_SIGMA standard deviations.
+    """
+    chosen, best = observations.only(agreed.inliers), agreed.best
+    freedom = _freedom(chosen)
+    if best.tilt_chi2 > chi2.isf(OUTLIER_PROBABILITY, 2) or best.chi2 > chi2.isf(OUTLIER_PROBABILITY, max(freedom, 1)):
+        return False
+    if chosen.correlated or chosen.camera.uncertainty is not None:
+        return True
+    found, errors, priors, _ = _camera_errors(chosen, best)
+    visible = errors < priors
+    return bool((np.abs(found) <= MAX_CAMERA_SIGMA * errors)[visible].all())
+
+
+def _camera_errors(observations: Observations, best: Fit) -> tuple[Floats, Floats, Floats, Floats]:
+    """Errors of the intrinsics (k,) that each by itself explain the residuals of a fit best.
+
+    Also their standard deviations by the residuals, (k,), and as assumed of a camera as sold, (k,), and the derivatives
+    (3, k) of the fitted position by them. The first is the focal length's.
+    """
+    assumed = observations.with_assumed_camera().uncertainty
+    count = len(assumed.intrinsics)
+    slopes = observations.from_pixels @ assumed.slopes_px(best.pose)[:, :, :count]
+    # Residuals are those of the model minus the image: an error of the camera adds its slopes to them.
+    left_open, moved = best.response(slopes)
+    size2 = np.maximum((left_open**2).sum(axis=0), np.finfo(float).tiny)
+    return -(left_open.T @ best.residuals) / size2, 1 / np.sqrt(size2), assumed.sigmas[:count], moved
+
+
+def _unchecked_focal_m2(observations: Observations, best: Fit) -> Floats:
+    """Covariance (3, 3) of the position by the focal length of a camera that states nothing, where it is not checked.
+
+    Residuals that would reveal an error of CHECKED_FOCAL check it, and it is taken as exact: zero. Otherwise it has the
+    mean square error that residuals leave and the camera as sold has.
+    """
+    if observations.correlated or observations.camera.uncertainty is not None:
+        return np.zeros((3, 3))
+    found, errors, priors, moved = _camera_errors(observations, best)
+    if MAX_CAMERA_SIGMA * errors[0] <= CHECKED_FOCAL:
+        return np.zeros((3, 3))
+    weight = priors[0] ** 2 / (priors[0] ** 2 + errors[0] ** 2)
+    mean_square = weight * errors[0] ** 2 + (weight * found[0]) ** 2
+    return np.asarray(mean_square * np.outer(moved[:, 0], moved[:, 0]))
+
+
+def _enough(inliers: NDArray[np.bool_]) -> bool:
+    return bool(inliers.sum() >= MIN_INLIERS and 2 * inliers.sum() > len(inliers))
+
+
+def _snooped_consensus(
+    observations: Observations, ranked: Sequence[tuple[Pose, Floats]], adapted: bool
+) -> Consensus | None:
+    """Spots that pass data snooping, from the pose that puts most of them about right; None if too few do.
+
+    `ranked` are poses and distances by `_ranked`. `adapted`: the size of the errors is estimated from the residuals.
+    """
+    for pose, distance_px in ranked[:MAX_ROBUST_STARTS]:
+        spread_px = _spread_px(distance_px)
+        near = distance_px <= START_GATE * spread_px
+        within = near | (distance_px <= _gate_px(observations, pose))
+        if adapted and not _enough(within):
+            # No majority agrees to the best ones' errors: all spots have errors of one size.
+            within = np.isfinite(distance_px)
+            spread_px = float(np.sqrt((distance_px[within] ** 2).mean() / 2))
+        trial = observations
+        if adapted and not _scalable(observations):
+            trial = replace(observations, added_sigma_px=spread_px)
+        # Wrong identities within the errors stated may be too many for data snooping; the nearest spots have fewer.
+        found = _snooped(trial, pose, within, adapted)
+        if found is None and (near != within).any():
+            found = _snooped(trial, pose, near, adapted)
+        if found is not None:
+            model, best, inliers = found
+            return Consensus(best, (), inliers, _uses_gravity(observations), model, adapted)
+    return None
+
+
+def _ranked(observations: Observations, poses: Sequence[Pose]) -> list[tuple[Pose, Floats]]:
+    """Poses with the distances (n,) of the spots from where they put them, pixels; best half of the spots first.
+
+    The best ones are refitted to that half. A spot with its LED behind the camera is infinitely far.
+    """
+    half = len(observations.leds_m) // 2 + 1
+
+    def judged(pose: Pose) -> tuple[float, Pose, Floats]:
+        distance_px = _distance_px(observations, pose)
+        return float((np.sort(distance_px)[:half] ** 2).sum()), pose, distance_px
+
+    ranked = sorted((judged(pose) for pose in poses), key=lambda one: one[0])
+    ranked = [one for one in ranked if np.isfinite(one[0])][:MAX_ROBUST_STARTS]
+    refitted = []
+    for _, pose, distance_px in ranked:
+        nearest = np.zeros(len(distance_px), dtype=bool)
+        nearest[np.argsort(distance_px, kind="stable")[: max(half, MIN_SPOTS)]] = True
+        chosen = replace(observations.only(nearest), added_sigma_px=_spread_px(distance_px))
+        try:
+            found = fit(chosen, pose)
+        except EstimationFailure:
+            continue
+        if found.pose.position_m[2] < observations.leds_m[:, 2].min():
+            refitted.append(judged(found.pose))
+    both = sorted([*refitted, *ranked], key=lambda one: one[0])
+    return [(pose, distance_px) for cost, pose, distance_px in both if np.isfinite(cost)]
+
+
+def _distance_px(observations: Observations, pose: Pose) -> Floats:
+    image, depth_m = centroid_images(pose, observations.leds_m, observations.lift_m2)
+    offset = np.linalg.solve(observations.from_pixels, (observations.image - image)[:, :, None])[:, :, 0]
+    return np.asarray(np.where(depth_m > 0, np.linalg.norm(offset, axis=1), np.inf))
+
+
+def _spread_px(distance_px: Floats) -> float:
+    """Standard deviation of a coordinate, from the median of distances in the plane; at least MODEL_ERROR_PX."""
+    median = float(np.sort(distance_px)[len(distance_px) // 2])
+    return max(median / float(np.sqrt(2 * np.log(2))), MODEL_ERROR_PX)
+
+
+def _gate_px(observations: Observations, pose: Pose) -> Floats:
+    """Distances (n,) that errors as stated explain, with an upright pose: START_GATE standard deviations, pixels."""
+    count = len(observations.leds_m)
+    blocks = observations.covariance(pose).reshape(count, 2, count, 2)[np.arange(count), :, np.arange(count)]
+    of_tilt = observations.tilt_sigma_rad.max() if _uses_gravity(observations) else 0.0
+    variance = np.trace(blocks, axis1=1, axis2=2) + of_tilt**2
+    return np.asarray(START_GATE * np.sqrt(variance) / observations.camera.pixel_angle_rad)
+
+
+def _scalable(observations: Observations) -> bool:
+    """Whether the map's errors are stated, so that a common factor can explain larger residuals."""
+    return any(parameter.group == "map" for parameter in observations.uncertainty.parameters)
+
+
+def _snooped(
+    observations: Observations, pose: Pose, inliers: NDArray[np.bool_], adapted: bool
+) -> tuple[Observations, Fit, NDArray[np.bool_]] | None:
+    """Data snooping from a pose and the spots to begin with; the observations returned have the size of errors."""
+    model, rounds = observations, ROBUST_ROUNDS if adapted else 0
+    while _enough(inliers):
+        chosen = model.only(inliers)
+        try:
+            for _ in range(rounds):
+                found = fit(chosen, pose)
+                model = _with_errors(model, float(np.median(found.outlier_chi2())) / CHI2_MEDIAN)
+                chosen, pose = model.only(inliers), found.pose
+            found = fit(chosen, pose)
+        except EstimationFailure:
+            return None
+        pose, rounds = found.pose, min(rounds, 1)
+        depth_m = centroid_images(pose, chosen.leds_m, chosen.lift_m2)[1]
+        if not (pose.position_m[2] < chosen.leds_m[:, 2].min() and 2 * (depth_m > 0).sum() > len(depth_m)):
+            return None
+        passes = _passes(found, chosen, adapted)
+        if 2 * passes.sum() < len(passes):
+            return None
+        if not passes.all():
+            displaced = np.where(passes, 0.0, found.outlier_chi2(_model_error(chosen)))
             inliers = inliers.copy()
-            inliers[np.flatnonzero(inliers)[np.argmax(fits[0].spots_chi2)]] = False
-    raise EstimationFailure("position", "no pose explains gravity and most of the spots")
+            inliers[np.flatnonzero(inliers)[displaced >= MIN_EXCLUDED_SHARE * displaced.max()]] = False
+            continue
+        if adapted:
+            model, found = _settled(model, found, inliers)
+        return model, found, inliers
+    return None
+
+
+def _settled(model: Observations, found: Fit, inliers: NDArray[np.bool_]) -> tuple[Observations, Fit]:
+    """The size of errors with which chi-square is its degrees of freedom, and the fit with it."""
+    for _ in range(MOMENT_ROUNDS):
+        freedom = max(_freedom(model.only(inliers)), 1)
+        model = _with_errors(model, found.chi2 / freedom)
+        found = fit(model.only(inliers), found.pose)
+    return model, found
+
+
+def _with_errors(observations: Observations, ratio: float) -> Observations:
+    """Observations whose adapted variance is larger by a ratio."""
+    ratio = min(max(ratio, 1 / MAX_RATIO), MAX_RATIO)
+    if _scalable(observations):
+        tilt_sigma_rad = observations.tilt_sigma_rad * np.sqrt(ratio)
+        return replace(observations, scale=observations.scale * np.sqrt(ratio), tilt_sigma_rad=tilt_sigma_rad)
+    return replace(observations, added_sigma_px=observations.added_sigma_px * np.sqrt(ratio))
+
+
+def _uses_gravity(observations: Observations) -> bool:
+    return bool(np.isfinite(observations.tilt_sigma_rad).all())
+
+
+def _freedom(observations: Observations) -> int:
+    """Degrees of freedom: two numbers a spot and two of gravity, less six of the pose."""
+    return 2 * len(observations.leds_m) + (2 if _uses_gravity(observations) else 0) - 6
+
+
+def _passes(found: Fit, observations: Observations, adapted: bool) -> NDArray[np.bool_]:
+    """Spots (n,) that pass data snooping; with errors of a size by the residuals the test is Fisher's."""
+    freedom = _freedom(observations)
+    limit = 2 * f.isf(OUTLIER_PROBABILITY, 2, max(freedom, 1)) if adapted else chi2.isf(OUTLIER_PROBABILITY, 2)
+    return np.asarray(found.outlier_chi2(_model_error(observations)) <= limit)
+
+
+def _model_error(observations: Observations) -> float:
+    """MODEL_ERROR_PX in normalized coordinates."""
+    return MODEL_ERROR_PX * observations.camera.pixel_angle_rad
+
+
+def _score(agreed: Consensus, observations: Observations) -> float:
+    """Minus twice the logarithm of the restricted likelihood of all spots (in pixels) and gravity.
+
+    Restricted: of what the pose leaves open, so that few spots which a pose fits by chance do not win. An outlier is
+    anywhere within OUTLIER_RADIUS of the image's width, and a wrong reading of gravity in any direction.
+    """
+    model = agreed.model if agreed.model is not None else observations
+    chosen = model.only(agreed.inliers)
+    covariance = chosen.covariance(agreed.best.pose)
+    of_pixels = -2 * np.log(np.abs(np.linalg.det(chosen.from_pixels))).sum()
+    spots = float(np.linalg.slogdet(2 * np.pi * covariance)[1] + of_pixels)
+    radius_px = OUTLIER_RADIUS * observations.camera.width_px
+    outliers = 2 * np.log(np.pi * radius_px**2) * float((~agreed.inliers).sum())
+    tilts = (
+        2 * float(np.log(model.tilt_sigma_rad).sum()) + 2 * np.log(2 * np.pi)
+        if agreed.gravity
+        else 2 * np.log(2 * np.pi)
+    )
+    # Of two explanations that are about as likely, the one that trusts an unstated camera is the bolder.
+    bold = CAUTION_CHI2 if model.camera.uncertainty is None and not model.correlated else 0.0
+    return bold + float(agreed.best.chi2 + spots + agreed.best.log_determinant + outliers + tilts)
 
 
 def minima(observations: Observations, starts: Iterable[Pose], robust: bool = False) -> tuple[Fit, ...]:
@@ -128,7 +447,13 @@ def _same_minimum(one: Pose, other: Pose) -> bool:
 
 def _explains_all(found: Fit, observations: Observations) -> bool:
     """Whether a fit explains all spots and gravity."""
-    return found.tilt_chi2 <= chi2.isf(OUTLIER_PROBABILITY, 2) and bool(_explained(found, observations).all())
+    if found.tilt_chi2 > chi2.isf(OUTLIER_PROBABILITY, 2):
+        return False
+    if observations.correlated:
+        return found.chi2 <= chi2.isf(OUTLIER_PROBABILITY, max(_freedom(observations), 1)) and bool(
+            _passes(found, observations, adapted=False).all()
+        )
+    return bool(_explained(found, observations).all())
 
 
 def _explained(found: Fit, observations: Observations) -> NDArray[np.bool_]:
