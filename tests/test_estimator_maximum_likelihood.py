@@ -485,8 +485,8 @@ def test_a_wrong_focal_length_is_revealed_by_a_wide_tilted_view() -> None:
     leds_m = grid(4, 3, 0.4, TARGET)
     frame = frame_of(view, leds_m, poisson(render(view, leds_m, 0.01, samples=12), 1))
     (fx, skew, cx), (_, fy, cy), last = frame.camera.K
-    believed = frame.camera.model_copy(update={"K": ((1.01 * fx, skew, cx), (0.0, 1.01 * fy, cy), last)})
-    _, nees = errors_of([replace(frame, camera=believed)], view)
+    stated = frame.camera.model_copy(update={"K": ((1.01 * fx, skew, cx), (0.0, 1.01 * fy, cy), last)})
+    _, nees = errors_of([replace(frame, camera=stated)], view)
     assert nees[0] < chi2.ppf(0.999, 3)
 
 

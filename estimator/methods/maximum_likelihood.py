@@ -29,7 +29,7 @@ from estimator.camera.leveling import tilt_from_gravity, tilt_sigmas
 from estimator.camera.pose import POSE_PARAMETERS, Pose
 from estimator.camera.projection import project
 from estimator.errors import EstimationFailure
-from estimator.io.device import Camera, DeviceFrame
+from estimator.io.device import DeviceFrame
 from estimator.methods.gravity_fit import agreement, ambiguous
 from estimator.methods.up2p import upright_pose
 from estimator.methods.variant import Estimate, Variant
@@ -55,8 +55,8 @@ from estimator.pixels.nuisances import (
     solve,
     square_root,
 )
-from estimator.solvers.reprojection import Observations, fit, observe
-from estimator.solvers.robust_fit import Consensus
+from estimator.solvers.reprojection import fit, observe
+from estimator.solvers.uncertainty import assumed_uncertainty
 from estimator.spots.correspondences import find_correspondences
 from estimator.spots.identify import Correspondence
 
@@ -95,8 +95,6 @@ DAMPING_RATIO = 8.0
 MIN_DAMPING = 1e-3
 MIN_FOR_CONSENSUS = 3
 START_STEPS = 10
-# Errors of the spots beside their noise, in turn, until the spots agree on a pose.
-MODEL_ERRORS_PX = (0.0, 0.3, 1.0, 3.0, 10.0, 30.0)
 # Nuisances that no one states: initial standard deviations, and how much an LED's image may differ from the model
 # before it reveals them, beside its noise: shift, size, profile.
 START_COMPONENTS = Components(place_m=5e-3, size=0.01, profile=0.03)
@@ -161,39 +159,22 @@ def ml(frame: DeviceFrame) -> Estimate:
     correspondences = find_correspondences(frame)
     observations = observe(frame, correspondences)
     inliers, use_gravity, is_ambiguous = np.ones(len(observations.leds_m), dtype=bool), True, False
-    model_error_px = 0.0
+    exact = True
     if len(observations.leds_m) < MIN_FOR_CONSENSUS:
         upright = upright_pose(observations)
         if upright is None:
             raise EstimationFailure("position", "too few LEDs identified to fix a position")
         pose = fit(observations, upright).pose
     else:
-        agreed, model_error_px = _agreement(observations)
+        agreed = agreement(observations)
         pose, inliers = agreed.best.pose, agreed.inliers
         use_gravity, is_ambiguous = agreed.gravity, ambiguous(agreed)
+        exact = not agreed.adapted and (agreed.model is None or agreed.model.correlated == observations.correlated)
     gravity = gravity_of(frame) if use_gravity else NO_GRAVITY
     positions = set(map(tuple, observations.leds_m[inliers].tolist()))
     spots = [one for one in correspondences if one.led.position_m in positions]
-    found = _maximize_honestly(frame, gravity, spots, pose, exact=model_error_px == 0)
+    found = _maximize_honestly(frame, gravity, spots, pose, exact)
     return Estimate(found.pose.position_m, covariance_m2=found.covariance[:3, :3], ambiguous=is_ambiguous)
-
-
-def _agreement(observations: Observations) -> tuple[Consensus, float]:
-    """Consensus of spots and gravity, and the smallest model error of the spots, pixels, at which there is one."""
-    for sigma_px in MODEL_ERRORS_PX:
-        try:
-            return agreement(_with_model_error(observations, sigma_px)), sigma_px
-        except EstimationFailure:
-            if sigma_px == MODEL_ERRORS_PX[-1]:
-                raise
-    raise AssertionError
-
-
-def _with_model_error(observations: Observations, sigma_px: float) -> Observations:
-    spread = np.linalg.inv(observations.whitening)
-    error2 = (sigma_px * observations.camera.pixel_angle_rad) ** 2
-    covariance = spread @ spread.transpose(0, 2, 1) + error2 * np.eye(2)
-    return replace(observations, whitening=np.linalg.inv(np.linalg.cholesky(covariance)))
 
 
 def _maximize_honestly(
@@ -222,7 +203,7 @@ def _maximize_honestly(
             return found
         wider = priors
         if revealed.place_m > 0 and frame.camera.uncertainty is None:
-            wider = replace(priors, camera=_as_sold(frame.camera))
+            wider = replace(priors, camera=assumed_uncertainty(frame.camera).device_sigmas())
         start = start_at_spots(frame, gravity, wider, spots, pose, revealed)
         try:
             found = maximize(frame, gravity, wider, start)
@@ -581,17 +562,6 @@ def _unexplained(result: _ScoringResult) -> Mask:
         return result.faint
     excess = np.where(result.used, result.excess, 0.0)
     return np.asarray((excess > 0) & (excess >= MIN_EXCLUDED_SHARE * excess.max()))
-
-
-def _as_sold(camera: Camera) -> Floats:
-    corner_px = np.hypot(camera.width_px, camera.height_px) / 2
-    radius = corner_px / camera.K[0][0]
-    k1, p = (
-        6.0 / camera.pixel_pitch_um / (corner_px * radius**2),
-        1.2 / camera.pixel_pitch_um / (3 * corner_px * radius),
-    )
-    of_lens = [k1, p, p] if camera.projection == "perspective" else [0.0, 0.0, 0.0]
-    return np.array([0.01, 3e-4, 54 / camera.pixel_pitch_um, 54 / camera.pixel_pitch_um, *of_lens])
 
 
 ML = Variant(

@@ -176,7 +176,7 @@ MIN_COMPONENT = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Nuisances:
-    """Values of the nuisances: true less believed; shapes and units as in `Priors`."""
+    """Values of the nuisances: true less stated; shapes and units as in `Priors`."""
 
     camera: Floats
     datum: Floats
@@ -185,7 +185,7 @@ class Nuisances:
 
     @staticmethod
     def zero(priors: Priors) -> "Nuisances":
-        """All as the device believes."""
+        """All as the device states."""
         return Nuisances(*(np.zeros_like(one) for one in (priors.camera, priors.datum, priors.luminaires, priors.leds)))
 
     def only(self, leds: Ints) -> "Nuisances":
@@ -224,7 +224,7 @@ class Nuisances:
         return np.asarray(shifts)
 
     def state(self, pose: Pose, camera: Camera, priors: Priors) -> ImageState:
-        """State of the LED images under a pose and these nuisances; `camera` is the believed one."""
+        """State of the LED images under a pose and these nuisances; `camera` is the stated one."""
         return ImageState(pose, with_errors(camera, self.camera), self.shifts_m(priors), 1 + self.leds[:, 3])
 
 
