@@ -55,7 +55,7 @@ from estimator.pixels.nuisances import (
     solve,
     square_root,
 )
-from estimator.solvers.reprojection import fit, observe
+from estimator.solvers.reprojection import Observations, fit, observe
 from estimator.solvers.uncertainty import assumed_uncertainty
 from estimator.spots.correspondences import find_correspondences
 from estimator.spots.identify import Correspondence
@@ -95,6 +95,8 @@ DAMPING_RATIO = 8.0
 MIN_DAMPING = 1e-3
 MIN_FOR_CONSENSUS = 3
 START_STEPS = 10
+# Error of the spots, beside their noise and START_SIGMA_SHARE, up to which the map may be exact.
+MAX_MODEL_ERROR_PX = 0.3
 # Nuisances that no one states: initial standard deviations, and how much an LED's image may differ from the model
 # before it reveals them, beside its noise: shift, size, profile.
 START_COMPONENTS = Components(place_m=5e-3, size=0.01, profile=0.03)
@@ -169,12 +171,21 @@ def ml(frame: DeviceFrame) -> Estimate:
         agreed = agreement(observations)
         pose, inliers = agreed.best.pose, agreed.inliers
         use_gravity, is_ambiguous = agreed.gravity, ambiguous(agreed)
-        exact = not agreed.adapted and (agreed.model is None or agreed.model.correlated == observations.correlated)
+        # The centroids of large LEDs have model errors of their own, which the pixels do not have.
+        limit_px = MAX_MODEL_ERROR_PX + START_SIGMA_SHARE * _radius_px(observations, pose).max()
+        exact = agreed.model is None or agreed.model.added_sigma_px < limit_px
     gravity = gravity_of(frame) if use_gravity else NO_GRAVITY
     positions = set(map(tuple, observations.leds_m[inliers].tolist()))
     spots = [one for one in correspondences if one.led.position_m in positions]
     found = _maximize_honestly(frame, gravity, spots, pose, exact)
     return Estimate(found.pose.position_m, covariance_m2=found.covariance[:3, :3], ambiguous=is_ambiguous)
+
+
+def _radius_px(observations: Observations, pose: Pose) -> Floats:
+    """Radii (n,) of the LED images, pixels, roughly."""
+    depth_m = np.abs(pose.in_camera(observations.leds_m)[:, 2])
+    # lift_m2 is 4 s^2, r^2 for a disc.
+    return np.asarray(np.sqrt(observations.lift_m2) / depth_m / observations.camera.pixel_angle_rad)
 
 
 def _maximize_honestly(
