@@ -63,6 +63,10 @@ MAX_CAMERA_SIGMA = 4.0
 # Relative error of an unstated focal length that the residuals have to be able to reveal for it to be taken as exact:
 # half the smallest that is said of real cameras, 0.1 %, so that one of 0.1 % is missed in one of 30 000 frames at most.
 CHECKED_FOCAL = 5e-4
+# Largest error of a centroid that is taken as one of map or camera, 3 cm at 3 m, and largest factor of stated errors:
+# larger ones are no explanation.
+MAX_ADDED_RAD = 0.01
+MAX_SCALE = 20.0
 # Poses closer than both lead to one minimum.
 SAME_MINIMUM_RAD = 0.01
 SAME_MINIMUM_M = 0.1
@@ -262,8 +266,16 @@ def _snooped_consensus(
             found = _snooped(trial, pose, near, adapted)
         if found is not None:
             model, best, inliers = found
+            if adapted and not _credible(model):
+                continue
             return Consensus(best, (), inliers, _uses_gravity(observations), model, adapted)
     return None
+
+
+def _credible(model: Observations) -> bool:
+    """Whether errors by the residuals are of a size that a map or camera may have."""
+    added_rad = model.added_sigma_px * model.camera.pixel_angle_rad
+    return bool(added_rad <= MAX_ADDED_RAD and model.scale <= MAX_SCALE)
 
 
 def _ranked(observations: Observations, poses: Sequence[Pose]) -> list[tuple[Pose, Floats]]:
