@@ -107,7 +107,7 @@ PROFILE_TOLERANCE = 3e-3
 REVEALED_PROBABILITY = 1e-9
 # Movement of an image above which its pixels are gathered once more.
 MAX_SETTLED_PX = 0.05
-# Largest number of times that pixels are gathered in one search.
+# Largest number of times that pixels are gathered in one search with nuisances.
 MAX_GATHERS = 12
 # Share of the LEDs in view below which it is not the LEDs that are wrong, but the model.
 MIN_USED_SHARE = 0.75
@@ -352,7 +352,7 @@ def maximize(frame: DeviceFrame, gravity: Gravity, priors: Priors, start: Start)
     wrong, settled = 0, False
     start_information = np.asarray(np.linalg.inv(start.covariance), dtype=np.float64)
     damping = 1.0 if _shape_sigma_px(frame, priors, start) > DAMPED_SIGMA_PX else 0.0
-    for _ in range(MAX_GATHERS):
+    for _ in range(MAX_STEPS if priors.exact else MAX_GATHERS):
         state = nuisances.state(pose, frame.camera, priors)
         view = leds_in_view(frame, state, covariance, components.added(priors).position_sigma_m(), located)
         pixels = gather_led_pixels(frame, view, _parameters(priors))
