@@ -558,13 +558,6 @@ def test_stated_uncertainties_are_read(folder: Path) -> None:
         pytest.param(
             lambda c: c["accelerometer"].update(shot_error_deg=-0.1), "accelerometer.shot_error_deg", id="accelerometer"
         ),
-        pytest.param(
-            lambda c: c["cameras"]["main"].update(
-                distortion={"k1": 0.0, "k2": 0.0, "k3": 0.0, "p1": 0.0, "p2": 0.0, "k4": 0.1}
-            ),
-            "unknown key 'k4'; allowed: k1, k2, k3, p1, p2",
-            id="a coefficient that the model lacks",
-        ),
     ],
 )
 def test_a_wrong_statement_is_refused_by_name(
