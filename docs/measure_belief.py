@@ -1,0 +1,202 @@
+"""Measure the figures of docs/accuracy.md about devices that do not know the world exactly.
+
+    python docs/measure_belief.py [SECTION ...] [--level LEVEL ...] [--frames N] [--variant NAME ...]
+
+Sections: `stated` (the three levels), `wrong_identities` (a tenth of the identities exchanged), `stated_wrongly`
+(standard deviations stated three times too large and too small), `unstated` (a map or a focal length that is wrong, and
+nothing stated). Datasets that are complete are kept, interrupted ones continued; estimates are made anew.
+"""
+
+import argparse
+import json
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from measure import Measurement, figure, heading, length, number, row
+
+import estimator as est
+from estimator.evaluate.score import VariantScore
+
+LEVELS = ("laboratory", "calibrated", "as_sold")
+FITS = ("gravity-fit", "up2p", "pnp", "huynh2016")
+WRONG_SHARE = 0.1
+HEADINGS = ("variant", "failed", "with 4 LEDs or more", "RMSE (95 % interval)", "RMSE / bound", "NEES (99 % interval)")
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """What the command line asks for."""
+
+    measurement: Measurement
+    levels: Sequence[str]
+    frames: int
+    variants: Sequence[str]
+
+    def dataset(self, level: str, **overrides: object) -> Path:
+        """The set of a level, with further overrides in its name."""
+        name = "-".join([level, str(self.frames), *(f"{key}={value}" for key, value in overrides.items())])
+        changes = {f"belief.{key}": value for key, value in overrides.items()}
+        return self.measurement.dataset(name, level, {"poses.count": self.frames, **changes})
+
+    def print_scores(self, folder: Path) -> None:
+        """Estimate, score, and print a row a variant."""
+        est.run(folder, self.variants, self.measurement.workers)
+        heading(*HEADINGS)
+        scores = {of_variant.variant: of_variant for of_variant in est.score(folder).variants}
+        for name in self.variants:
+            print_row(scores[name])
+
+
+def print_row(score: VariantScore) -> None:
+    """Print a variant's row of HEADINGS."""
+    (enough,) = (of for of in score.by_good_leds if of.good_leds == 4)
+    cells: list[object] = [f"`{score.variant}`", f"{score.failed} of {score.frames}"]
+    cells.append(f"{enough.failed} of {enough.frames}")
+    interval = score.rmse_interval
+    if score.error_3d is None or interval is None:
+        row(*cells, "", "", "")
+        return
+    rmse_m = score.error_3d.rmse_m
+    ends = [length(end, rmse_m).rpartition(" ")[0] for end in (interval.low_m, interval.high_m)]
+    cells.append(f"{length(rmse_m)} ({ends[0]} to {ends[1]})")
+    bound = score.against_bound
+    cells.append("" if bound is None or not bound.efficiency else number(1 / bound.efficiency, 4))
+    nees = score.nees
+    cells.append("" if nees is None else f"{nees.mean:.2f} ({nees.low:.2f} to {nees.high:.2f})")
+    row(*cells)
+
+
+def stated(chosen: Chosen) -> None:
+    """Errors of camera, map and accelerometer, stated as they are."""
+    for level in chosen.levels:
+        figure("level", level)
+        folder = chosen.dataset(level)
+        chosen.print_scores(folder)
+        figure("bound, root mean square", length(_bound_rms_m(folder)))
+
+
+def _bound_rms_m(folder: Path) -> float:
+    bounds = [one for one in pq.read_table(folder / "truth.parquet")["bound_m2"].to_pylist() if one is not None]
+    return float(np.sqrt(np.mean([one[0] + one[4] + one[8] for one in bounds])))
+
+
+def wrong_identities(chosen: Chosen) -> None:
+    """A tenth of the decoded identities exchanged for those of other LEDs in view."""
+    for level in chosen.levels:
+        figure("level", level)
+        folder = copied(chosen.dataset(level), f"wrong-{level}")
+        table = pq.read_table(folder / "frames.parquet")
+        generator = np.random.default_rng(1)
+        frames = [_exchanged(spots, generator) for spots in table["spots"].to_pylist()]
+        spots = pa.array(frames, type=table.schema.field("spots").type)
+        place = table.schema.get_field_index("spots")
+        pq.write_table(table.set_column(place, table.schema.field("spots"), spots), folder / "frames.parquet")
+        chosen.print_scores(folder)
+
+
+def _exchanged(spots: list[dict[str, Any]], generator: np.random.Generator) -> list[dict[str, Any]]:
+    """Spots of which WRONG_SHARE, rounded, at least two where there are ten, pass their identities around."""
+    count = round(WRONG_SHARE * len(spots))
+    if count < 2:
+        return spots
+    wrong = generator.choice(len(spots), count, replace=False)
+    led_of = dict(zip(wrong.tolist(), np.roll(wrong, 1).tolist(), strict=True))
+    return [{**spot, "led": spots[led_of.get(index, index)]["led"]} for index, spot in enumerate(spots)]
+
+
+def stated_wrongly(chosen: Chosen) -> None:
+    """Standard deviations stated three times too large, and three times too small; frames and truth are the same."""
+    for level in chosen.levels:
+        for factor in (3.0, 1 / 3):
+            figure("level, stated over true", f"{level}, {factor:.3g}")
+            folder = copied(chosen.dataset(level), f"factor-{factor:.3g}-{level}")
+            device = json.loads((folder / "dataset.json").read_text(encoding="utf-8"))
+            (folder / "dataset.json").write_text(json.dumps(_scaled(device, factor)), encoding="utf-8")
+            chosen.print_scores(folder)
+
+
+def _scaled(device: dict[str, Any], factor: float) -> dict[str, Any]:
+    """dataset.json with every stated standard deviation multiplied."""
+
+    def times(value: Any) -> Any:
+        return [times(one) for one in value] if isinstance(value, list) else value and value * factor
+
+    def change(entry: dict[str, Any], *keys: str) -> None:
+        entry.update({key: times(entry[key]) for key in keys if key in entry})
+
+    for camera in device["cameras"].values():
+        change(camera["uncertainty"], "device_sigma", "shot_sigma", "offset_sigma_m", "rotation_sigma_deg")
+    for luminaire in device["luminaires"]:
+        change(luminaire, "sigma_m", "sigma_rotation_deg")
+    for led in device["led_map"]:
+        change(led, "sigma_m", "radius_sigma_m", "side_sigma_m", "gradient_sigma")
+    change(device["map_datum"] or {}, "sigma_m", "scale_sigma_ppm")
+    change(device["accelerometer"], "error_deg", "device_error_deg", "shot_error_deg")
+    return device
+
+
+def unstated(chosen: Chosen) -> None:
+    """An exact world of which the device has a wrong map, or a wrong focal length, and states nothing."""
+    count = {"poses.count": chosen.frames}
+    exact = chosen.measurement.dataset(f"office200-{chosen.frames}", "office200", count)
+    figure("wrong", "nothing")
+    chosen.print_scores(exact)
+    for map_mm, focal in ((0.3, 0.0), (1.0, 0.0), (10.0, 0.0), (0.0, 1e-3), (0.0, 1e-2)):
+        figure("map wrong by, mm; focal length wrong by", f"{map_mm:g}; {focal:g}")
+        folder = copied(exact, f"wrong-map-{map_mm:g}-focal-{focal:g}")
+        device = json.loads((folder / "dataset.json").read_text(encoding="utf-8"))
+        generator = np.random.default_rng(1)
+        for led in device["led_map"]:
+            led["position_m"] = (led["position_m"] + generator.normal(0, map_mm / 1000, 3)).tolist()
+        for camera in device["cameras"].values():
+            camera["image_distance_mm"] *= 1 + focal
+            camera["K"][0][0] *= 1 + focal
+            camera["K"][1][1] *= 1 + focal
+        (folder / "dataset.json").write_text(json.dumps(device), encoding="utf-8")
+        chosen.print_scores(folder)
+
+
+def copied(dataset: Path, name: str) -> Path:
+    """A copy of a dataset beside it, of which the frames are linked; an older copy is replaced."""
+    folder = dataset.parent / name
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    (folder / "frames").symlink_to((dataset / "frames").resolve())
+    for file in ("dataset.json", *(path.name for path in dataset.glob("*.parquet"))):
+        shutil.copy(dataset / file, folder / file)
+    return folder
+
+
+SECTIONS: dict[str, Callable[[Chosen], None]] = {
+    section.__name__: section for section in (stated, wrong_identities, stated_wrongly, unstated)
+}
+
+
+def main() -> None:
+    """Print the sections that are named, by default all."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("sections", nargs="*", metavar="SECTION", help=f"of {', '.join(SECTIONS)}; default: all")
+    parser.add_argument("--out", type=Path, default=Path("out/measure"), help="folder of the datasets")
+    parser.add_argument("--level", action="append", choices=LEVELS, help="may be repeated; default: all")
+    parser.add_argument("--variant", action="append", help=f"may be repeated; default: {', '.join(FITS)}")
+    parser.add_argument("--frames", type=int, default=400)
+    parser.add_argument("--workers", type=int, default=2)
+    asked = parser.parse_args()
+    unknown = [name for name in asked.sections if name not in SECTIONS]
+    if unknown:
+        parser.error(f"SECTION {unknown[0]}: unknown; allowed: {', '.join(SECTIONS)}")
+    asked.out.mkdir(parents=True, exist_ok=True)
+    chosen = Chosen(Measurement(asked.out, asked.workers), asked.level or LEVELS, asked.frames, asked.variant or FITS)
+    for name in asked.sections or SECTIONS:
+        print(f"\n## {name}: {SECTIONS[name].__doc__}", flush=True)
+        SECTIONS[name](chosen)
+
+
+if __name__ == "__main__":
+    main()
