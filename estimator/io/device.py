@@ -223,12 +223,20 @@ class Luminaire(Row):
     sigma_m: NotNegativeTriple
     sigma_rotation_deg: NotNegativeTriple
 
+    def sigmas(self) -> Floats:
+        """Standard deviations (6,) of the shift along x, y, z, metres, and of the rotation about them, radians."""
+        return np.array([*self.sigma_m, *np.radians(self.sigma_rotation_deg)])
+
 
 class MapDatum(Row):
     """Standard deviations of the map's origin, along x, y, z, and of its scale about the origin, parts per million."""
 
     sigma_m: NotNegativeTriple
     scale_sigma_ppm: NotNegative
+
+    def sigmas(self) -> Floats:
+        """Standard deviations (4,) of the shift along x, y, z, metres, and of the relative scale."""
+        return np.array([*self.sigma_m, 1e-6 * self.scale_sigma_ppm])
 
 
 class Led(Row):
@@ -260,6 +268,27 @@ class Led(Row):
     @abstractmethod
     def mean_square_extent_m2(self) -> float:
         """Mean of x^2 over the face, x measured from the centre along any direction of the face, m^2."""
+
+    @property
+    def shift_by_gradient_m(self) -> float:
+        """Shift s^2 / r of the centre of the light by a gradient of 1, with the mean square extent s^2, metres."""
+        return self.mean_square_extent_m2 / self.half_width_m
+
+    def sigmas(self) -> Floats:
+        """Standard deviations (6,) of the position along x, y, z and of the half width, metres, and of gx and gy.
+
+        What the device does not state counts as exact: 0.
+        """
+        gradient = self.gradient_sigma or 0.0
+        return np.array([*(self.sigma_m or (0.0, 0.0, 0.0)), self.size_sigma_m or 0.0, gradient, gradient])
+
+    def light_sigmas_m(self) -> Floats:
+        """Standard deviations (3,) of the centre of the light within the luminaire along x, y, z, metres.
+
+        They hold those of the position and of the shift by a gradient.
+        """
+        sigmas = self.sigmas()
+        return np.hypot(sigmas[:3], [*(sigmas[4:] * self.shift_by_gradient_m), 0.0])
 
 
 class DiscLed(Led):
