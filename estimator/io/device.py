@@ -166,7 +166,8 @@ class Camera(Row):
 class Sensor(Row):
     """Sensor of a device; keys as in dataset.json: `dn = round(min(e, full_well_e) / gain_e_per_dn) + black_level_dn`.
 
-    Noise other than shot noise is given by standard deviations, as in a data sheet.
+    Noise other than shot noise is given by standard deviations, as in a data sheet. `crosstalk` is the share of a
+    pixel's electrons that its four neighbours collect, a quarter each.
     """
 
     bits: int = Field(ge=1, le=32)
@@ -174,6 +175,7 @@ class Sensor(Row):
     full_well_e: Positive
     black_level_dn: float = Field(ge=0, le=2**32)
     noise: Literal["shot", "none", "full"]
+    crosstalk: float = Field(default=0.0, ge=0, le=1)
     prnu: NotNegative
     dark_current_e_s: NotNegative
     dsnu_e: NotNegative
@@ -497,8 +499,9 @@ def frame(record: Mapping[str, Any]) -> DeviceFrame:
         (x, y, z in camera axes, m/s^2) and `spots` (`{led, u_px, v_px}`) as in frames.parquet; and `parts`, a sequence
         of `{"row": int, "column": int, "image_dn": array}`, where `image_dn` (rows, columns) uint32 holds digital
         numbers and its first pixel is pixel (row, column) of the sensor. NumPy arrays and scalars may stand for lists
-        and numbers. What the device does not state may be missing: `luminaires`, `map_datum`, `device` (0), and in
-        `camera`, `accelerometer` and `led_map` the keys of standard deviations. Other keys are ignored.
+        and numbers. What the device does not state may be missing: `luminaires`, `map_datum`, `device` (0), in
+        `camera`, `accelerometer` and `led_map` the keys of standard deviations, and in `sensor` `crosstalk` (0). Other
+        keys are ignored.
 
     Returns
     -------
