@@ -156,6 +156,10 @@ TRUTH_SCHEMA = pa.schema(
         ("yaw_deg", pa.float64()),
         ("leds", pa.list_(TRUTH_LED)),
         ("bound_m2", pa.list_(pa.float64(), 9)),
+        ("bound_exact_m2", pa.list_(pa.float64(), 9)),
+        ("map", pa.int64()),
+        ("K", pa.list_(pa.float64(), 9)),
+        ("distortion", pa.list_(pa.float64(), 5)),
     ]
 )
 
@@ -206,6 +210,8 @@ def write_dataset(
                 "tilt_x_deg": view.tilt_x_deg,
                 "tilt_y_deg": view.tilt_y_deg,
                 "yaw_deg": view.yaw_deg,
+                "map": 0,
+                "K": view.K.ravel().tolist(),
                 "leds": [
                     {"led": 10 + k, "u_px": pixels[k, 0], "v_px": pixels[k, 1], "visible_fraction": 1.0} for k in seen
                 ],
@@ -249,6 +255,7 @@ def description(view: View, frame_count: int, leds_m: Array, radius_m: float) ->
             **{"bits": 16, "gain_e_per_dn": 1.0, "full_well_e": 60000, "black_level_dn": 0, "noise": "shot"},
             **{"prnu": 0.0, "dark_current_e_s": 0.0, "dsnu_e": 0.0, "read_noise_e": 0.0, "adc_noise_dn": 0.0},
             **{"row_offset_e": 0.0, "column_offset_e": 0.0, "mosaic": "none"},
+            **{"crosstalk": 0.0, "hot_pixel_share": 0.0, "hot_pixel_e_s": 0.0},
         },
         "accelerometer": {"kind": "tilt-error", "error_deg": 0.0, "device_error_deg": None, "shot_error_deg": None},
         "luminaires": [],

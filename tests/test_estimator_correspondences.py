@@ -30,27 +30,37 @@ def squares(frame: DeviceFrame) -> DeviceFrame:
     return replace(frame, leds=leds)
 
 
+def with_crosstalk(frame: DeviceFrame) -> DeviceFrame:
+    return replace(frame, sensor=frame.sensor.model_copy(update={"crosstalk": 0.2}))
+
+
 def full_noise(frame: DeviceFrame) -> DeviceFrame:
     values = {"noise": "full", "read_noise_e": 20.0, "dsnu_e": 15.0, "prnu": 0.02}
     return replace(frame, sensor=frame.sensor.model_copy(update=values))
 
 
 @pytest.mark.parametrize(
-    ("changed", "noise", "any_square"),
+    ("changed", "noise", "any_square", "crosstalk"),
     [
-        pytest.param(lambda frame: frame, (0.0, 0.0, 0.0), False, id="shot noise"),
+        pytest.param(lambda frame: frame, (0.0, 0.0, 0.0), False, 0.0, id="shot noise"),
         # 20^2 + 15^2 and rounding.
-        pytest.param(full_noise, (625.0 + 1 / 12, 0.02, 1 / 12), False, id="full noise"),
-        pytest.param(squares, (0.0, 0.0, 0.0), True, id="squares"),
+        pytest.param(full_noise, (625.0 + 1 / 12, 0.02, 1 / 12), False, 0.0, id="full noise"),
+        pytest.param(squares, (0.0, 0.0, 0.0), True, 0.0, id="squares"),
+        pytest.param(with_crosstalk, (0.0, 0.0, 0.0), False, 0.2, id="crosstalk"),
     ],
 )
 def test_detection_is_told_the_sensor_s_noise_and_the_leds_shape(
-    changed: Callable[[DeviceFrame], DeviceFrame], noise: tuple[float, float, float], any_square: bool
+    changed: Callable[[DeviceFrame], DeviceFrame],
+    noise: tuple[float, float, float],
+    any_square: bool,
+    crosstalk: float,
 ) -> None:
     frame = changed(rendered())
     image = frame.parts[0].image_dn.astype(np.float32)
     readout = Readout(0, 0, image, image, np.zeros(image.shape, bool), *noise)
-    expected = {round(spot.u_px): spot for spot in detect([readout], image.size, 0, any_square=any_square)}
+    expected = {
+        round(spot.u_px): spot for spot in detect([readout], image.size, 0, any_square=any_square, crosstalk=crosstalk)
+    }
     found = find_correspondences(frame)
     assert [one.led.id for one in found] == [10, 11]
     np.testing.assert_array_equal(led_positions_m(found), LEDS)

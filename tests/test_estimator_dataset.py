@@ -115,6 +115,26 @@ def test_a_missing_key_is_named(folder: Path, key: str) -> None:
     assert f"dataset.json: {key}" in refused(folder)
 
 
+@pytest.mark.parametrize(
+    ("key", "place"),
+    [
+        ("luminaires", lambda c: c),
+        ("map_datum", lambda c: c),
+        ("cameras.main.uncertainty", lambda c: c["cameras"]["main"]),
+        ("sensor.crosstalk", lambda c: c["sensor"]),
+        ("accelerometer.device_error_deg", lambda c: c["accelerometer"]),
+        ("led_map.3.radius_sigma_m", lambda c: c["led_map"][3]),
+        ("led_map.3.luminaire", lambda c: c["led_map"][3]),
+    ],
+)
+def test_what_a_device_does_not_state_is_null_and_not_missing(
+    folder: Path, key: str, place: Callable[[dict[str, Any]], dict[str, Any]]
+) -> None:
+    """Keys that `estimator.frame` may lack; every key of dataset.json is always present."""
+    change_json(folder, lambda c: place(c).pop(key.rpartition(".")[2]))
+    assert refused(folder).endswith(f"dataset.json: {key}: Field required")
+
+
 LENS = {"k1": -0.05, "k2": 0.0, "k3": 0.0, "p1": 0.0, "p2": 0.0}
 WRONG_VALUES: list[tuple[str, Callable[[dict[str, Any]], object]]] = [
     ("version", lambda c: c.update(version=1)),
@@ -220,8 +240,9 @@ def test_a_wrong_row_is_named(folder: Path, words: str, change: Callable[[Rows],
 
 def test_a_missing_or_retyped_column_is_named(folder: Path) -> None:
     table = pq.read_table(folder / "frames.parquet")
-    pq.write_table(table.drop_columns(["exposure_s"]), folder / "frames.parquet")
-    assert "column 'exposure_s'" in refused(folder)
+    for column in ("exposure_s", "device"):
+        pq.write_table(table.drop_columns([column]), folder / "frames.parquet")
+        assert f"column '{column}'" in refused(folder)
     numbers = table.set_column(0, "frame", table["frame"].cast(pa.float64()))
     pq.write_table(numbers, folder / "frames.parquet")
     assert "column 'frame' has type double, needed int64" in refused(folder)

@@ -10,6 +10,8 @@ from estimator.io.device import (
     Camera,
     DeviceFrame,
     DiscLed,
+    Luminaire,
+    MapDatum,
     Part,
     Sensor,
     SquareLed,
@@ -159,3 +161,27 @@ def test_ids_of_leds_have_63_bits() -> None:
     for beyond in (2**63, -1):
         with pytest.raises(ValueError, match="Input should be"):
             DiscLed(id=beyond, position_m=(0.0, 0.0, 3.0), radius_m=0.05)
+
+
+def test_a_gradient_over_the_face_moves_the_centre_of_its_light() -> None:
+    """L (1 + g x / a) over a disc of radius a has its centroid at g a / 4, over a square of half side a at g a / 3.
+
+    10 % of 20 mm are 0.5 and 0.667 mm; with 0.3 mm of the position, sqrt(0.3^2 + 0.5^2) = 0.583 mm.
+    """
+    entry = {"id": 1, "position_m": (0.0, 0.0, 3.0), "gradient_sigma": 0.1}
+    disc = DiscLed(**entry, radius_m=0.02, sigma_m=(3e-4, 3e-4, 1e-4))
+    assert disc.light_sigmas_m() == pytest.approx([np.hypot(3e-4, 5e-4), np.hypot(3e-4, 5e-4), 1e-4])
+    assert SquareLed(**entry, side_m=0.04).light_sigmas_m() == pytest.approx([2e-3 / 3, 2e-3 / 3, 0.0])
+    assert DiscLed(id=1, position_m=(0.0, 0.0, 3.0), radius_m=0.02).light_sigmas_m().tolist() == [0.0, 0.0, 0.0]
+
+
+def test_sigmas_are_in_metres_radians_and_parts() -> None:
+    """Each number by itself; what is not stated is 0. The half width of a square is half its side."""
+    place = {"id": 1, "position_m": (0.0, 0.0, 3.0)}
+    square = SquareLed(**place, side_m=0.04, side_sigma_m=2e-3, sigma_m=(1e-3, 2e-3, 3e-3), gradient_sigma=0.1)
+    assert square.sigmas().tolist() == [1e-3, 2e-3, 3e-3, 1e-3, 0.1, 0.1]
+    assert DiscLed(**place, radius_m=0.02, radius_sigma_m=2e-3).sigmas().tolist() == [0, 0, 0, 2e-3, 0, 0]
+    luminaire = Luminaire(**place, sigma_m=(1e-3, 2e-3, 3e-3), sigma_rotation_deg=(18.0, 36.0, 90.0))
+    assert luminaire.sigmas() == pytest.approx([1e-3, 2e-3, 3e-3, np.pi / 10, np.pi / 5, np.pi / 2])
+    datum = MapDatum(sigma_m=(1e-3, 2e-3, 3e-3), scale_sigma_ppm=20.0)
+    assert datum.sigmas() == pytest.approx([1e-3, 2e-3, 3e-3, 2e-5])

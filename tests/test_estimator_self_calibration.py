@@ -10,10 +10,11 @@ from estimator_correspondences import POINT_M
 from estimator_synthetic import Array, View, description, view_of
 from scipy.spatial.transform import Rotation
 
+from estimator.camera.intrinsics import intrinsic_slopes_px, with_errors
 from estimator.camera.pose import Pose
 from estimator.camera.projection import project
 from estimator.evaluate.statistics import Groups, nees
-from estimator.io.device import INTRINSICS, Camera, DiscLed, Luminaire, MapDatum, SquareLed
+from estimator.io.device import INTRINSICS, Camera, DiscLed, Luminaire, MapDatum
 from estimator.solvers.self_calibration import (
     Adjusted,
     Adjustment,
@@ -21,10 +22,7 @@ from estimator.solvers.self_calibration import (
     Unknowns,
     _Frame,
     adjust,
-    erred,
-    led_sigmas_m,
 )
-from estimator.solvers.uncertainty import intrinsic_slopes_px
 
 SIZE = (1600, 1200, 3000.0)
 SIGMA_PX = 0.02
@@ -109,7 +107,7 @@ def device_views(
     bias = size * TILT_DEVICE_RAD * rng.standard_normal(2)
     views, positions_m = [], []
     for pose in poses(count, rng):
-        pixels = project(places, pose, erred(told, of_device + size * rng.standard_normal(7) * SHOT)).pixels
+        pixels = project(places, pose, with_errors(told, of_device + size * rng.standard_normal(7) * SHOT)).pixels
         seen = ((pixels > 5) & (pixels < np.array(SIZE[:2]) - 5)).all(axis=1)
         n = int(seen.sum())
         tilt = pose.rig_angles(told)[:2] + bias + size * TILT_SHOT_RAD * rng.standard_normal(2)
@@ -380,35 +378,3 @@ def test_a_frame_with_nothing_but_wrong_spots_is_left_out(rng: np.random.Generat
     kept = [found.frames[k] for k in others]
     assert None not in kept
     assert max(squares(kept, truth_m[others])) < 40
-
-
-def test_the_intrinsics_errors_are_those_of_the_format(rng: np.random.Generator) -> None:
-    """fx (1 + focal) (1 + aspect / 2), fy (1 + focal) (1 - aspect / 2), cx + cx_px, and coefficients of distortion."""
-    told = camera()
-    true = erred(told, np.array([0.01, 0.002, 3.0, -4.0, 0.1, 0.01, -0.02]))
-    fx, fy = told.K[0][0], told.K[1][1]
-    assert true.K[0] == pytest.approx((fx * 1.01 * 1.001, 0.0, told.K[0][2] + 3))
-    assert true.K[1] == pytest.approx((0.0, fy * 1.01 * 0.999, told.K[1][2] - 4))
-    assert true.distortion is not None
-    assert (true.distortion.k1, true.distortion.k2, true.distortion.p1, true.distortion.p2) == (0.1, 0.0, 0.01, -0.02)
-    p_cam = np.column_stack([rng.uniform(-0.3, 0.3, (20, 2)), np.ones(20)])
-    pose = Pose(np.zeros(3), np.eye(3))
-    at = project(p_cam, pose, true)
-    slopes = intrinsic_slopes_px(p_cam, true.normalized(at.pixels), true)
-    for k in range(7):
-        step = 1e-6 * np.eye(7)[k]
-        # An error on top of an error: the relative ones are to first order of (1 + focal), within 1 %.
-        ends = [project(p_cam, pose, erred(true, sign * step)).pixels for sign in (1, -1)]
-        assert slopes[:, :, k] == pytest.approx((ends[0] - ends[1]) / 2e-6, rel=1e-5, abs=1e-4)
-
-
-def test_a_gradient_over_the_face_moves_the_centre_of_its_light() -> None:
-    """L (1 + g x / a) over a disc of radius a has its centroid at g a / 4, over a square of half side a at g a / 3.
-
-    10 % of 20 mm are 0.5 and 0.667 mm; with 0.3 mm of the position, sqrt(0.3^2 + 0.5^2) = 0.583 mm.
-    """
-    entry = {"id": 1, "position_m": (0.0, 0.0, 3.0), "gradient_sigma": 0.1}
-    disc = DiscLed(**entry, radius_m=0.02, sigma_m=(3e-4, 3e-4, 1e-4))
-    assert led_sigmas_m(disc) == pytest.approx([np.hypot(3e-4, 5e-4), np.hypot(3e-4, 5e-4), 1e-4])
-    assert led_sigmas_m(SquareLed(**entry, side_m=0.04)) == pytest.approx([2e-3 / 3, 2e-3 / 3, 0.0])
-    assert led_sigmas_m(DiscLed(id=1, position_m=(0.0, 0.0, 3.0), radius_m=0.02)).tolist() == [0.0, 0.0, 0.0]

@@ -3,17 +3,16 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.camera.projection import ProjectedPoints
-from estimator.io.device import Camera, Distortion
+from estimator.io.device import INTRINSICS, Camera, Distortion
 
 Floats = NDArray[np.float64]
 
-CAMERA_PARAMETERS = 7
+CAMERA_PARAMETERS = len(INTRINSICS)
 """Errors of focal length and aspect (relative), principal point (u, v; pixels), k1, p1 and p2: order of derivatives."""
 
 
 def with_errors(camera: Camera, errors: Floats) -> Camera:
-    """The camera whose intrinsics differ from those of `camera` by errors (7,): told plus error is true.
+    """The camera whose intrinsics differ from those of `camera` by errors (7,) of INTRINSICS: told plus error is true.
 
     Errors of the distortion do not apply to an equidistant camera and have to be zero there.
     """
@@ -31,19 +30,22 @@ def with_errors(camera: Camera, errors: Floats) -> Camera:
     return camera.model_copy(update={"K": K, "distortion": distortion})
 
 
-def camera_slopes(points: ProjectedPoints, camera: Camera) -> Floats:
-    """Derivatives (n, 2, 7) of the pixels of projected points by errors of the camera's intrinsics."""
-    (fx, _, _), (_, fy, _), _ = camera.K
-    image = camera.normalized(points.pixels)
-    slopes = np.zeros((len(image), 2, CAMERA_PARAMETERS))
-    slopes[:, :, 0] = image * [fx, fy]
-    slopes[:, :, 1] = image * [fx / 2, -fy / 2]
+def intrinsic_slopes_px(p_cam: Floats, image: Floats, camera: Camera) -> Floats:
+    """Derivatives (n, 2, 7) of the pixels of points by the errors of INTRINSICS.
+
+    `p_cam` (n, 3) are the points in camera axes, `image` (n, 2) their normalized image coordinates. An equidistant lens
+    has no k1, p1, p2: their slopes are 0.
+    """
+    K = camera.matrix()
+    slopes = np.zeros((len(p_cam), 2, CAMERA_PARAMETERS))
+    slopes[:, 0, 0], slopes[:, 1, 0] = K[0, 0] * image[:, 0], K[1, 1] * image[:, 1]
+    slopes[:, 0, 1], slopes[:, 1, 1] = slopes[:, 0, 0] / 2, -slopes[:, 1, 0] / 2
     slopes[:, 0, 2] = slopes[:, 1, 3] = 1.0
     if camera.projection == "perspective":
         with np.errstate(all="ignore"):
-            a, b = (points.p_cam[:, :2] / points.p_cam[:, 2:]).T
+            a, b = p_cam[:, 0] / p_cam[:, 2], p_cam[:, 1] / p_cam[:, 2]
         r2 = a * a + b * b
-        slopes[:, 0, 4], slopes[:, 1, 4] = fx * a * r2, fy * b * r2
-        slopes[:, 0, 5], slopes[:, 1, 5] = fx * 2 * a * b, fy * (r2 + 2 * b * b)
-        slopes[:, 0, 6], slopes[:, 1, 6] = fx * (r2 + 2 * a * a), fy * 2 * a * b
+        along_x = np.stack([a * r2, 2 * a * b, r2 + 2 * a * a], axis=1)
+        along_y = np.stack([b * r2, r2 + 2 * b * b, 2 * a * b], axis=1)
+        slopes[:, :, 4:] = K[:2, :2] @ np.stack([along_x, along_y], axis=1)
     return slopes

@@ -2,7 +2,7 @@
 
 import hashlib
 import io
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Literal, Self
 
@@ -31,7 +31,7 @@ from estimator.io.device import (
     luminaires_by_id,
     regions_problem,
 )
-from estimator.io.records import Positive, Row, Triple, first_line, first_problem, read_rows
+from estimator.io.records import Positive, Row, Triple, first_line, first_problem, missing_key, read_rows
 
 FORMAT_VERSION = 4
 SPOT_TYPE = pa.struct([("led", pa.int64()), ("u_px", pa.float64()), ("v_px", pa.float64())])
@@ -48,7 +48,6 @@ FRAME_COLUMNS = {
     "spots": pa.list_(SPOT_TYPE),
     "device": pa.int64(),
 }
-OPTIONAL_COLUMNS = ("device",)
 
 
 class FrameRecord(Row):
@@ -64,7 +63,7 @@ class FrameRecord(Row):
     capturable: bool
     accelerometer_m_s2: Triple
     spots: Annotated[tuple[DecodedSpot, ...], Strict(False)]
-    device: DeviceNumber = 0
+    device: DeviceNumber
 
     @field_validator("file")
     @classmethod
@@ -83,7 +82,10 @@ class _Format(Row):
 
 
 class _Description(Row):
-    """dataset.json without `provenance`, whose seed would give the truth away."""
+    """dataset.json without `provenance`, whose seed would give the truth away.
+
+    No key may be missing, also where `estimator.frame` has a default.
+    """
 
     name: str
     frame_count: int = Field(ge=0, le=INT64_MAX)
@@ -92,8 +94,8 @@ class _Description(Row):
     accelerometer: Accelerometer
     led_map: tuple[AnyLed, ...]
     room_m: tuple[Positive, Positive, Positive]
-    luminaires: tuple[Luminaire, ...] = ()
-    map_datum: MapDatum | None = None
+    luminaires: tuple[Luminaire, ...]
+    map_datum: MapDatum | None
 
     @field_validator("led_map")
     @classmethod
@@ -122,8 +124,8 @@ class Dataset:
     leds: dict[int, AnyLed]
     room_m: tuple[float, float, float]
     frames: tuple[FrameRecord, ...]
-    luminaires: dict[int, Luminaire] = field(default_factory=dict)
-    map_datum: MapDatum | None = None
+    luminaires: dict[int, Luminaire]
+    map_datum: MapDatum | None
 
 
 def read_dataset(path: str | Path) -> Dataset:
@@ -159,6 +161,8 @@ def read_dataset(path: str | Path) -> Dataset:
         if version != FORMAT_VERSION:
             raise InputError(f"{description_path}: version {version} of the format, needed {FORMAT_VERSION}")
         description = _Description.model_validate_json(content)
+        if missing := missing_key(description):
+            raise InputError(f"{description_path}: {missing}: Field required")
     except ValidationError as error:
         raise InputError(f"{description_path}: {first_problem(error)}") from None
     dataset = Dataset(
@@ -169,7 +173,7 @@ def read_dataset(path: str | Path) -> Dataset:
         accelerometer=description.accelerometer,
         leds=leds_by_id(description.led_map),
         room_m=description.room_m,
-        frames=read_rows(folder / "frames.parquet", FRAME_COLUMNS, FrameRecord, OPTIONAL_COLUMNS),
+        frames=read_rows(folder / "frames.parquet", FRAME_COLUMNS, FrameRecord),
         luminaires=luminaires_by_id(description.luminaires, description.led_map),
         map_datum=description.map_datum,
     )

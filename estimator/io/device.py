@@ -166,7 +166,8 @@ class Camera(Row):
 class Sensor(Row):
     """Sensor of a device; keys as in dataset.json: `dn = round(min(e, full_well_e) / gain_e_per_dn) + black_level_dn`.
 
-    Noise other than shot noise is given by standard deviations, as in a data sheet.
+    Noise other than shot noise is given by standard deviations, as in a data sheet. `crosstalk` is the share of a
+    pixel's electrons that its four neighbours collect, a quarter each.
     """
 
     bits: int = Field(ge=1, le=32)
@@ -174,6 +175,7 @@ class Sensor(Row):
     full_well_e: Positive
     black_level_dn: float = Field(ge=0, le=2**32)
     noise: Literal["shot", "none", "full"]
+    crosstalk: float = Field(default=0.0, ge=0, le=1)
     prnu: NotNegative
     dark_current_e_s: NotNegative
     dsnu_e: NotNegative
@@ -223,12 +225,20 @@ class Luminaire(Row):
     sigma_m: NotNegativeTriple
     sigma_rotation_deg: NotNegativeTriple
 
+    def sigmas(self) -> Floats:
+        """Standard deviations (6,) of the shift along x, y, z, metres, and of the rotation about them, radians."""
+        return np.array([*self.sigma_m, *np.radians(self.sigma_rotation_deg)])
+
 
 class MapDatum(Row):
     """Standard deviations of the map's origin, along x, y, z, and of its scale about the origin, parts per million."""
 
     sigma_m: NotNegativeTriple
     scale_sigma_ppm: NotNegative
+
+    def sigmas(self) -> Floats:
+        """Standard deviations (4,) of the shift along x, y, z, metres, and of the relative scale."""
+        return np.array([*self.sigma_m, 1e-6 * self.scale_sigma_ppm])
 
 
 class Led(Row):
@@ -260,6 +270,27 @@ class Led(Row):
     @abstractmethod
     def mean_square_extent_m2(self) -> float:
         """Mean of x^2 over the face, x measured from the centre along any direction of the face, m^2."""
+
+    @property
+    def shift_by_gradient_m(self) -> float:
+        """Shift s^2 / r of the centre of the light by a gradient of 1, with the mean square extent s^2, metres."""
+        return self.mean_square_extent_m2 / self.half_width_m
+
+    def sigmas(self) -> Floats:
+        """Standard deviations (6,) of the position along x, y, z and of the half width, metres, and of gx and gy.
+
+        What the device does not state counts as exact: 0.
+        """
+        gradient = self.gradient_sigma or 0.0
+        return np.array([*(self.sigma_m or (0.0, 0.0, 0.0)), self.size_sigma_m or 0.0, gradient, gradient])
+
+    def light_sigmas_m(self) -> Floats:
+        """Standard deviations (3,) of the centre of the light within the luminaire along x, y, z, metres.
+
+        They hold those of the position and of the shift by a gradient.
+        """
+        sigmas = self.sigmas()
+        return np.hypot(sigmas[:3], [*(sigmas[4:] * self.shift_by_gradient_m), 0.0])
 
 
 class DiscLed(Led):
@@ -468,8 +499,9 @@ def frame(record: Mapping[str, Any]) -> DeviceFrame:
         (x, y, z in camera axes, m/s^2) and `spots` (`{led, u_px, v_px}`) as in frames.parquet; and `parts`, a sequence
         of `{"row": int, "column": int, "image_dn": array}`, where `image_dn` (rows, columns) uint32 holds digital
         numbers and its first pixel is pixel (row, column) of the sensor. NumPy arrays and scalars may stand for lists
-        and numbers. What the device does not state may be missing: `luminaires`, `map_datum`, `device` (0), and in
-        `camera`, `accelerometer` and `led_map` the keys of standard deviations. Other keys are ignored.
+        and numbers. What the device does not state may be missing: `luminaires`, `map_datum`, `device` (0), in
+        `camera`, `accelerometer` and `led_map` the keys of standard deviations, and in `sensor` `crosstalk` (0). Other
+        keys are ignored.
 
     Returns
     -------

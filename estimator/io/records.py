@@ -1,6 +1,6 @@
 """Parquet files as validated rows, and one-line messages about invalid ones."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, TypeVar
 
@@ -75,20 +75,35 @@ def first_problem(error: ValidationError) -> str:
     return f"{where}: {problem['msg']}{got}"
 
 
-def read_rows(
-    path: Path, columns: Mapping[str, pa.DataType], row: type[RowT], optional: Collection[str] = ()
-) -> tuple[RowT, ...]:
-    """Read the named columns of a Parquet file as rows of a model; other columns are ignored.
+def missing_key(value: object) -> str | None:
+    """First key, as `where.key`, that has a default and that a validated value was made without; None if there is none.
 
-    The columns in `optional` may be missing; the model then needs a default.
+    The value is a row, or a list, tuple or mapping with rows in it at any depth.
+    """
+    entries: Iterable[tuple[object, object]] = ()
+    if isinstance(value, Row):
+        for name in type(value).model_fields:
+            if name not in value.model_fields_set:
+                return name
+        entries = vars(value).items()
+    elif isinstance(value, Mapping):
+        entries = value.items()
+    elif isinstance(value, list | tuple):
+        entries = enumerate(value)
+    for where, entry in entries:
+        if missing := missing_key(entry):
+            return f"{where}.{missing}"
+    return None
+
+
+def read_rows(path: Path, columns: Mapping[str, pa.DataType], row: type[RowT]) -> tuple[RowT, ...]:
+    """Read the named columns of a Parquet file as rows of a model; other columns are ignored.
 
     Raises InputError if the file is missing or damaged, a column is missing or of another type, or a value is not
     allowed.
     """
     try:
         with pq.ParquetFile(path) as file:
-            missing = {name for name in optional if name not in file.schema_arrow.names}
-            columns = {name: kind for name, kind in columns.items() if name not in missing}
             _check_columns(path, file.schema_arrow, columns)
             records = file.read(columns=list(columns)).to_pylist()
     except InputError:

@@ -18,8 +18,6 @@ COLUMNS = {
     "map": pa.int64(),
     "leds": pa.list_(pa.struct([("led", pa.int64()), ("visible_fraction", pa.float64())])),
 }
-# Of sets written before there were devices.
-OPTIONAL = ("bound_exact_m2", "map")
 
 # An LED whose image is on the sensor but for rounding.
 WHOLE = 1 - 1e-6
@@ -43,9 +41,9 @@ class TruthRow(Row):
     frame: int
     position_m: Triple
     bound_m2: Covariance | None
-    bound_exact_m2: Covariance | None = None
-    map: int = Field(default=0, ge=0)
-    leds: Annotated[tuple[TrueLed, ...], Strict(False)] = ()
+    bound_exact_m2: Covariance | None
+    map: int = Field(ge=0)
+    leds: Annotated[tuple[TrueLed, ...], Strict(False)]
 
     @property
     def good_leds(self) -> int:
@@ -55,7 +53,7 @@ class TruthRow(Row):
 
 def read_truth(path: Path, frame_count: int) -> tuple[TruthRow, ...]:
     """Read truth.parquet; raises InputError if it is missing or damaged, or has not one row a frame, in order."""
-    rows = read_rows(path, COLUMNS, TruthRow, OPTIONAL)
+    rows = read_rows(path, COLUMNS, TruthRow)
     if [row.frame for row in rows] != list(range(frame_count)):
         raise InputError(f"{path}: {len(rows)} rows, needed one for each of the {frame_count} frames, in order")
     return rows

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from estimator.camera.intrinsics import camera_slopes, with_errors
+from estimator.camera.intrinsics import intrinsic_slopes_px, with_errors
 from estimator.camera.leveling import tilt_from_gravity, tilt_sigmas
 from estimator.camera.pose import POSE_PARAMETERS, Pose
 from estimator.camera.projection import project
@@ -265,7 +265,9 @@ def start_at_spots(
         sigma_px = np.hypot(START_SIGMA_PX, START_SIGMA_SHARE * radius_px)
         rows = np.zeros((len(spots), 2, LOCAL_PARAMETERS))
         rows[:, :, :POSE_PARAMETERS] = images.slopes
-        rows[:, :, POSE_PARAMETERS : IMAGE_PARAMETERS - 1] = camera_slopes(images, camera)
+        rows[:, :, POSE_PARAMETERS : IMAGE_PARAMETERS - 1] = intrinsic_slopes_px(
+            images.p_cam, camera.normalized(images.pixels), camera
+        )
         rows /= sigma_px[:, None, None]
         right = (measured_px - images.pixels) / sigma_px[:, None]
         angles = pose.rig_angles(camera)

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.camera.intrinsics import CAMERA_PARAMETERS, camera_slopes
+from estimator.camera.intrinsics import CAMERA_PARAMETERS, intrinsic_slopes_px
 from estimator.camera.pose import POSE_PARAMETERS, Pose
 from estimator.camera.projection import ProjectedPoints, project, projection_of, relative_illumination
 from estimator.io.device import Camera, Led
@@ -259,7 +259,7 @@ def _slopes(rims: ProjectedPoints, offsets_m: Floats, camera: Camera) -> Floats:
     """Derivatives (n, 2, p) of points of rims by the IMAGE_PARAMETERS; `offsets_m` (n, 3) are from their centres."""
     slopes = np.zeros((len(offsets_m), 2, IMAGE_PARAMETERS))
     slopes[:, :, :POSE_PARAMETERS] = rims.slopes
-    slopes[:, :, POSE_PARAMETERS:-1] = camera_slopes(rims, camera)
+    slopes[:, :, POSE_PARAMETERS:-1] = intrinsic_slopes_px(rims.p_cam, camera.normalized(rims.pixels), camera)
     # A point of the face moves its image as much as the camera moves it by the opposite way.
     slopes[:, :, -1] = -np.einsum("nij,nj->ni", rims.slopes[:, :, :3], offsets_m)
     return slopes

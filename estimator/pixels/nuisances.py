@@ -63,18 +63,15 @@ class Priors:
             camera = np.hypot(uncertainty.device_sigmas(), uncertainty.shot_sigmas())
         ids = [key for key in frame.luminaires if any(led.luminaire == key for led in leds)]
         stated = [frame.luminaires[one] for one in ids]
-        rows = [[*one.sigma_m, *np.radians(one.sigma_rotation_deg)] for one in stated]
+        rows = [one.sigmas() for one in stated]
         index = {one: k for k, one in enumerate(ids)}
         own = np.zeros((len(leds), LED_PARAMETERS))
         for k, led in enumerate(leds):
-            own[k, :3] = led.sigma_m or (0.0, 0.0, 0.0)
-            own[k, 3] = (led.size_sigma_m or 0.0) / led.half_width_m
-            own[k, 4:6] = led.gradient_sigma or 0.0
+            own[k, :6] = led.sigmas()
+            own[k, 3] /= led.half_width_m
         return Priors(
             camera=camera,
-            datum=np.zeros(DATUM_PARAMETERS)
-            if datum is None
-            else np.array([*datum.sigma_m, datum.scale_sigma_ppm / 1e6]),
+            datum=np.zeros(DATUM_PARAMETERS) if datum is None else datum.sigmas(),
             luminaires=np.array(rows).reshape(-1, LUMINAIRE_PARAMETERS),
             leds=own,
             positions_m=np.array([led.position_m for led in leds]).reshape(-1, 3),

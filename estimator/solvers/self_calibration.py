@@ -34,10 +34,10 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from estimator.camera.intrinsics import intrinsic_slopes_px, with_errors
 from estimator.camera.pose import POSE_PARAMETERS, Pose
 from estimator.camera.projection import project
-from estimator.io.device import INTRINSICS, Camera, Distortion, Led, Luminaire, MapDatum
-from estimator.solvers.uncertainty import intrinsic_slopes_px
+from estimator.io.device import INTRINSICS, Camera, Led, Luminaire, MapDatum
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -158,13 +158,13 @@ class Unknowns:
                 rotation_sigma = np.radians(stated.rotation_sigma_deg)
             add("gravity", camera, [float(np.hypot(view.tilt_device_sigma_rad, rotation_sigma))] * 2)
             if view.datum is not None:
-                add("datum", 0, [*view.datum.sigma_m, view.datum.scale_sigma_ppm * 1e-6])
+                add("datum", 0, view.datum.sigmas())
             for led in view.leds:
                 if led.luminaire is not None and led.luminaire in view.luminaires:
                     of = view.luminaires[led.luminaire]
-                    add("luminaire", of.id, [*of.sigma_m, *np.radians(of.sigma_rotation_deg)])
+                    add("luminaire", of.id, of.sigmas())
                 if frames_of_led[led.id] > 1:
-                    add("led", led.id, led_sigmas_m(led))
+                    add("led", led.id, led.light_sigmas_m())
         self.sigma: Floats = np.array(sigma, dtype=np.float64)
         self.kinds = np.array([kind for kind, _, _ in self.names])
         self.frames_of_led = frames_of_led
@@ -183,17 +183,6 @@ class Unknowns:
         if not self.count:
             return np.zeros(places.shape)
         return np.where(places >= 0, (vector * self.sigma)[places], 0.0)
-
-
-def led_sigmas_m(led: Led) -> Floats:
-    """Standard deviations (3,) of the centre of an LED's light within its luminaire, along x, y, z, metres.
-
-    A luminance that rises across the face moves the centre of the light: by `g s^2 / a` with the gradient g a half
-    width a, and the mean square extent s^2.
-    """
-    sigma = np.zeros(3) if led.sigma_m is None else np.array(led.sigma_m, dtype=np.float64)
-    by_gradient = (led.gradient_sigma or 0.0) * led.mean_square_extent_m2 / led.half_width_m
-    return np.hypot(sigma, [by_gradient, by_gradient, 0.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,11 +245,11 @@ class _Frame:
         covariance = self.view.covariance_px2 * self.unknowns.scales.get("spots", 1.0) ** 2
         slopes: Floats | None = None
         for k, led in enumerate(self.view.leds):
-            if self.unknowns.frames_of_led[led.id] > 1 or not led_sigmas_m(led).any():
+            if self.unknowns.frames_of_led[led.id] > 1 or not led.light_sigmas_m().any():
                 continue
             if slopes is None:
                 slopes = project(self.told_m, self.view.pose, self.view.camera).slopes[:, :, :3]
-            by_led = slopes[k] * led_sigmas_m(led) * self.unknowns.scales.get("led", 1.0)
+            by_led = slopes[k] * led.light_sigmas_m() * self.unknowns.scales.get("led", 1.0)
             covariance[k] += by_led @ by_led.T
         return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))
 
@@ -279,7 +268,7 @@ class _Frame:
         """The camera with its errors: those of the device and of the frame."""
         places = self.unknowns.places("camera", self.camera_index, len(INTRINSICS))
         error = self.unknowns.values(places, common) + shot
-        return erred(self.view.camera, error) if error.any() else self.view.camera
+        return with_errors(self.view.camera, error) if error.any() else self.view.camera
 
     def residuals(self, pose: Pose, shot: Floats, common: Floats) -> Floats:
         """Residuals in standard deviations: spots (2n), gravity (2 or none), camera error of the frame."""
@@ -350,20 +339,6 @@ class _Frame:
         of_leds = np.zeros((n, 2, n, 3))
         of_leds[np.arange(n), :, np.arange(n)] = by_position
         return np.concatenate([*parts, of_leds.reshape(n, 2, 3 * n)], axis=2)
-
-
-def erred(camera: Camera, error: Floats) -> Camera:
-    """The camera with errors (7,) of its intrinsics added, in the order of INTRINSICS."""
-    focal, aspect, cx_px, cy_px, k1, p1, p2 = error.tolist()
-    (fx, skew, cx), (_, fy, cy), last = camera.K
-    fx, fy = fx * (1 + focal) * (1 + aspect / 2), fy * (1 + focal) * (1 - aspect / 2)
-    distortion = camera.distortion
-    if k1 or p1 or p2:
-        told = distortion or Distortion(k1=0.0, k2=0.0, k3=0.0, p1=0.0, p2=0.0)
-        changed = {"k1": told.k1 + k1, "p1": told.p1 + p1, "p2": told.p2 + p2}
-        distortion = told.model_copy(update=changed)
-    K = ((fx, skew, cx + cx_px), (0.0, fy, cy + cy_px), last)
-    return camera.model_copy(update={"K": K, "distortion": distortion})
 
 
 def _centroids_px(positions_m: Floats, extent_m: Floats, pose: Pose, camera: Camera) -> Floats:

@@ -23,6 +23,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.camera.intrinsics import intrinsic_slopes_px
 from estimator.camera.pose import Pose
 from estimator.camera.projection import projection_of
 from estimator.io.device import INTRINSICS, Camera, CameraUncertainty, Led, Luminaire, MapDatum
@@ -201,10 +202,9 @@ class _MapParameters:
 
 
 def _add_datum(of_map: _MapParameters, datum: MapDatum | None) -> None:
-    sigma_m, ppm = (datum.sigma_m, datum.scale_sigma_ppm) if datum is not None else ((0.0, 0.0, 0.0), 0.0)
     levers = np.concatenate([np.tile(np.eye(3), (len(of_map.leds_m), 1, 1)), of_map.leds_m[:, :, None]], axis=2)
     names = [*(f"datum_{axis}" for axis in AXES), "datum_scale"]
-    of_map.add(names, [None] * 4, np.array([*sigma_m, 1e-6 * ppm]), levers)
+    of_map.add(names, [None] * 4, np.zeros(4) if datum is None else datum.sigmas(), levers)
 
 
 def _add_luminaires(of_map: _MapParameters, leds: Sequence[Led], luminaires: Mapping[int, Luminaire]) -> None:
@@ -226,8 +226,7 @@ def _add_luminaires(of_map: _MapParameters, leds: Sequence[Led], luminaires: Map
             axis=1,
         )
         levers[of_led != key] = 0.0
-        sigmas = np.array([*luminaire.sigma_m, *np.radians(luminaire.sigma_rotation_deg)])
-        of_map.add(names, [key] * 6, sigmas, levers)
+        of_map.add(names, [key] * 6, luminaire.sigmas(), levers)
 
 
 def _add_leds(of_map: _MapParameters, leds: Sequence[Led]) -> None:
@@ -236,33 +235,10 @@ def _add_leds(of_map: _MapParameters, leds: Sequence[Led]) -> None:
     each = np.zeros((count, 3, count, 3))
     each[np.arange(count), :, np.arange(count)] = np.eye(3)
     names = [f"led_{axis}" for axis in AXES] * count
-    sigma_m = np.array([led.sigma_m or (0.0, 0.0, 0.0) for led in leds]).reshape(-1, 3)
-    of_map.add(names, np.repeat(ids, 3).tolist(), sigma_m.ravel(), each.reshape(count, 3, 3 * count))
-    half_width_m = np.array([led.half_width_m for led in leds])
-    shift_m = np.array([led.mean_square_extent_m2 for led in leds]) / half_width_m
+    sigmas = np.array([led.sigmas() for led in leds]).reshape(-1, 6)
+    of_map.add(names, np.repeat(ids, 3).tolist(), sigmas[:, :3].ravel(), each.reshape(count, 3, 3 * count))
+    shift_m = np.array([led.shift_by_gradient_m for led in leds])
     of_face = (each[:, :, :, :2] * shift_m[:, None, None, None]).reshape(count, 3, 2 * count)
-    gradient = np.repeat([led.gradient_sigma or 0.0 for led in leds], 2)
-    of_map.add(["gradient_x", "gradient_y"] * count, np.repeat(ids, 2).tolist(), gradient, of_face)
+    of_map.add(["gradient_x", "gradient_y"] * count, np.repeat(ids, 2).tolist(), sigmas[:, 4:].ravel(), of_face)
     # The lift is proportional to the half width squared.
-    of_map.add_sizes(ids, np.array([led.size_sigma_m or 0.0 for led in leds]), 2 / half_width_m)
-
-
-def intrinsic_slopes_px(p_cam: Floats, image: Floats, camera: Camera) -> Floats:
-    """Derivatives (n, 2, 7) of the pixels of points by the errors of INTRINSICS.
-
-    `p_cam` (n, 3) are the points in camera axes, `image` (n, 2) their normalized image coordinates. An equidistant lens
-    has no k1, p1, p2: their slopes are 0.
-    """
-    K = camera.matrix()
-    slopes = np.zeros((len(p_cam), 2, len(INTRINSICS)))
-    slopes[:, 0, 0], slopes[:, 1, 0] = K[0, 0] * image[:, 0], K[1, 1] * image[:, 1]
-    slopes[:, 0, 1], slopes[:, 1, 1] = slopes[:, 0, 0] / 2, -slopes[:, 1, 0] / 2
-    slopes[:, 0, 2] = slopes[:, 1, 3] = 1.0
-    if camera.projection == "perspective":
-        with np.errstate(all="ignore"):
-            a, b = p_cam[:, 0] / p_cam[:, 2], p_cam[:, 1] / p_cam[:, 2]
-        r2 = a * a + b * b
-        along_x = np.stack([a * r2, 2 * a * b, r2 + 2 * a * a], axis=1)
-        along_y = np.stack([b * r2, r2 + 2 * b * b, 2 * a * b], axis=1)
-        slopes[:, :, 4:] = K[:2, :2] @ np.stack([along_x, along_y], axis=1)
-    return slopes
+    of_map.add_sizes(ids, sigmas[:, 3], 2 / np.array([led.half_width_m for led in leds]))

@@ -33,7 +33,8 @@ def find_correspondences(
     sensor_px = frame.camera.width_px * frame.camera.height_px
     # A denoiser may move light by its radius: Algorithm 1 as printed does by half of it.
     gate = gate_px(frame.camera.width_px) + denoise_radius_px
-    spots = detect(readouts, sensor_px, denoise_radius_px, decoded_px, any_square, gate, lens_blur(frame.camera))
+    lens = lens_blur(frame.camera)
+    spots = detect(readouts, sensor_px, denoise_radius_px, decoded_px, any_square, gate, lens, sensor.crosstalk)
     return list(identify(spots, frame.spots, frame.leds, gate))
 
 

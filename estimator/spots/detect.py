@@ -144,13 +144,15 @@ def detect(
     any_square: bool = False,
     near_px: float = 40.0,
     lens: LensBlur = SHARP,
+    crosstalk: float = 0.0,
 ) -> tuple[Spot, ...]:
     """Detect LED images in the regions read out of a sensor of `sensor_px` pixels: one full frame, or several.
 
     The brightness scale is measured within `near_px` of `decoded_px` (n, 2), the rough pixels of decoded LEDs, so that
     a brighter light elsewhere does not hide them; without them, or if nothing was read out there, it is the image's
     maximum. `any_square` says that LEDs may be square: the ellipse for the centroid then encloses the square.
-    `lens` says how sharp LED images are. `denoise_radius_px` is the radius of the box that the denoiser averaged over,
+    `lens` says how sharp LED images are, `crosstalk` which share of a pixel's electrons its four neighbours collect.
+    `denoise_radius_px` is the radius of the box that the denoiser averaged over,
     0 for raw images, whose centroids alone are corrected for sampling. An LED image that may be cut by the border of
     its region is reported and flagged. Raises EstimationFailure, which says what was seen in place of LEDs, if there is
     none at all.
@@ -177,7 +179,7 @@ def detect(
         raise EstimationFailure("detect", f"no spot found; {why}")
     if denoise_radius_px > 0:
         return tuple(one.spot for one in measured)
-    return tuple(_corrected_for_sampling(measured, any_square, lens))
+    return tuple(_corrected_for_sampling(measured, any_square, lens, crosstalk))
 
 
 def _spots(readout: Readout, ellipses: Sequence[_Ellipse], denoise_radius_px: int) -> list[_Measured]:
@@ -422,7 +424,9 @@ def _narrowed(readout: Readout, ellipse: _Ellipse, others: list[_Ellipse]) -> _E
     return ellipse
 
 
-def _corrected_for_sampling(spots: Sequence[_Measured], any_square: bool, lens: LensBlur) -> list[Spot]:
+def _corrected_for_sampling(
+    spots: Sequence[_Measured], any_square: bool, lens: LensBlur, crosstalk: float
+) -> list[Spot]:
     """Spots without their sampling errors as far as these are known, the rest in the covariances.
 
     The image of a square depends on its orientation, that of a lens with blur on the blur: there the error is variance
@@ -432,7 +436,8 @@ def _corrected_for_sampling(spots: Sequence[_Measured], any_square: bool, lens: 
         return []
     centroids = np.array([(one.spot.u_px, one.spot.v_px) for one in spots])
     covariances = np.array([one.spot.covariance_px2 for one in spots])
-    moments = np.array([one.moments_px2 for one in spots])
+    # Crosstalk moves a share crosstalk / 4 of the light by a pixel to each side: the centroid stays, by symmetry.
+    moments = np.array([one.moments_px2 for one in spots]) - crosstalk / 2
     noise_px2 = np.diagonal(covariances, axis1=1, axis2=2)
     # A semi-ellipse of half extent a has the second moment a^2 / 4, a line a^2 / 3.
     half_px = np.sqrt((3 if any_square else 4) * np.maximum(moments - PIXEL_VARIANCE, 0.0))

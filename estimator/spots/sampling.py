@@ -26,8 +26,8 @@ Floats = NDArray[np.float64]
 # U(k) / k falls as k^-2.5: the eighth is 0.6 % of the first.
 HARMONICS = np.arange(1.0, 9.0)
 PIXEL_VARIANCE = 1 / 12
-# Relative uncertainty of the half extent that a second moment gives: a gradient of the luminance over the face, a halo
-# and crosstalk change the moment. Ours.
+# Relative uncertainty of the half extent that a second moment gives: a gradient of the luminance over the face and a
+# halo change the moment. Ours.
 SHAPE_UNCERTAINTY = 0.003
 # The light of a smaller image is in one or two pixels, which do not determine its centre and its size.
 MIN_HALF_EXTENT_PX = 0.7
