@@ -30,6 +30,8 @@ docs: $(READY)
 
 figures: $(READY)
 	$(BIN)/python docs/measure.py
+	$(BIN)/python docs/measure_belief.py
+	$(BIN)/python docs/measure_budget.py
 
 bench: $(READY)
 	$(BIN)/python benchmarks/full_frame.py
