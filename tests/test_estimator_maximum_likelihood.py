@@ -7,6 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from estimator_correspondences import EXACT
 from estimator_synthetic import View, description, grid, poisson, render, view_of
 from numpy.typing import NDArray
 from scipy.stats import chi2
@@ -62,6 +63,11 @@ def misread(view: View, frame: DeviceFrame, generator: np.random.Generator) -> D
     return replace(frame, accelerometer_m_s2=tuple((rotation(*tilts) @ [0.0, 0.0, 9.80665]).tolist()))
 
 
+def with_exact_camera(frame: DeviceFrame) -> DeviceFrame:
+    """The device states that its camera is exact."""
+    return replace(frame, camera=frame.camera.model_copy(update={"uncertainty": EXACT}))
+
+
 def off_m(frame: DeviceFrame, view: View) -> float:
     return float(np.linalg.norm(ml(frame).position_m - view.position_m))
 
@@ -94,7 +100,7 @@ def nees_of_draws(view: View, leds_m: Floats, sensor: dict[str, object], draws: 
     generator = np.random.default_rng(7)
     expected = render(view, leds_m, 0.01, 3000.0, samples=SAMPLES)
     plain = frame_of(view, leds_m, np.zeros(expected.shape, dtype=np.uint32))
-    plain = replace(plain, sensor=plain.sensor.model_copy(update=sensor))
+    plain = with_exact_camera(replace(plain, sensor=plain.sensor.model_copy(update=sensor)))
     chip = plain.sensor
     nees = []
     for _ in range(draws):
@@ -155,7 +161,7 @@ def test_leds_cut_by_the_border_are_used() -> None:
     cut = np.abs(pixels[:, 0] - 140.5) > 135
     assert (cut.sum(), (~cut).sum()) == (4, 2)
     wider = np.concatenate([leds_m, [[TARGET[0], TARGET[1], TARGET[2]], [TARGET[0] + 0.1, TARGET[1] + 0.1, TARGET[2]]]])
-    frame = frame_of(view, wider, poisson(render(view, wider, 0.01, samples=SAMPLES), 3))
+    frame = with_exact_camera(frame_of(view, wider, poisson(render(view, wider, 0.01, samples=SAMPLES), 3)))
     uncut = replace(frame, leds={key: led for key, led in frame.leds.items() if key - 10 not in np.flatnonzero(cut)})
     uncut = replace(uncut, spots=tuple(spot for spot in frame.spots if spot.led in uncut.leds))
     with_cut, without = ml(frame), ml(uncut)
@@ -549,6 +555,20 @@ def test_a_wrong_focal_length_is_revealed_by_a_wide_tilted_view() -> None:
     stated = frame.camera.model_copy(update={"K": ((1.01 * fx, skew, cx), (0.0, 1.01 * fy, cy), last)})
     _, nees = errors_of([replace(frame, camera=stated)], view)
     assert nees[0] < chi2.ppf(0.999, 3)
+
+
+def test_a_focal_length_that_no_view_checks_widens_the_covariance() -> None:
+    """Seen from below, a focal length 0.5 % too long is a camera 15 mm further down, to the last pixel. Of a camera as
+    sold, 1 %, that is half a standard deviation of 30 mm; of one that states to be exact, hundreds.
+    """
+    view = view_of(TARGET, 3.0, size=(400, 300, 1500.0))
+    frame = frame_of(view, TWELVE, poisson(render(view, TWELVE, 0.01, samples=12), 1), error_deg=0.01)
+    (fx, skew, cx), (_, fy, cy), last = frame.camera.K
+    told = frame.camera.model_copy(update={"K": ((1.005 * fx, skew, cx), (0.0, 1.005 * fy, cy), last)})
+    unstated = replace(frame, camera=told)
+    _, nees = errors_of([unstated, with_exact_camera(unstated)], view)
+    assert nees[0] < chi2.ppf(0.99, 3)
+    assert nees[1] > 1000
 
 
 def test_reasons_tell_what_is_missing() -> None:

@@ -11,7 +11,8 @@ datum) is estimated with the pose, as nuisances with priors (`estimator.pixels.n
 hybrid bound. What it does not state is taken as exact, unless the images contradict: if LED images are displaced
 against each other by more than their noise explains, or have another size or profile, these become nuisances as well.
 The standard deviation of such a nuisance is that of all LEDs of the frame: a variance component (Foerstner 1979). A
-camera that states nothing is then assumed to be one as sold. A displacement common to all images is not revealed.
+camera that states nothing is then assumed to be one as sold. A displacement common to all images is not revealed. Nor
+is a focal length where the view does not check it: `estimator.solvers.robust_fit` says what it adds to the covariance.
 
 Not modelled: light of other sources beside a smooth background, mechanical vignetting (natural vignetting is), and
 motion. LEDs that the model does not explain are excluded by their goodness of fit.
@@ -174,7 +175,7 @@ def ml(frame: DeviceFrame) -> Estimate:
     correspondences = find_correspondences(frame)
     observations = observe(frame, correspondences)
     inliers, use_gravity, is_ambiguous = np.ones(len(observations.leds_m), dtype=bool), True, False
-    exact = True
+    exact, unchecked_m2 = True, np.zeros((3, 3))
     if len(observations.leds_m) < MIN_FOR_CONSENSUS:
         upright = upright_pose(observations)
         if upright is None:
@@ -183,7 +184,7 @@ def ml(frame: DeviceFrame) -> Estimate:
     else:
         agreed = agreement(observations)
         pose, inliers = agreed.best.pose, agreed.inliers
-        use_gravity, is_ambiguous = agreed.gravity, ambiguous(agreed)
+        use_gravity, is_ambiguous, unchecked_m2 = agreed.gravity, ambiguous(agreed), agreed.unchecked_m2
         # The centroids of large LEDs have model errors of their own, which the pixels do not have.
         limit_px = MAX_MODEL_ERROR_PX + START_SIGMA_SHARE * _radius_px(observations, pose).max()
         exact = agreed.model is None or agreed.model.added_sigma_px < limit_px
@@ -191,7 +192,15 @@ def ml(frame: DeviceFrame) -> Estimate:
     positions = set(map(tuple, observations.leds_m[inliers].tolist()))
     spots = [one for one in correspondences if one.led.position_m in positions]
     found = _maximize_honestly(frame, gravity, spots, pose, exact)
-    return Estimate(found.pose.position_m, covariance_m2=found.covariance[:3, :3], ambiguous=is_ambiguous)
+    covariance_m2 = found.covariance[:3, :3]
+    if not _camera_is_assumed(frame, found.components):
+        covariance_m2 = covariance_m2 + unchecked_m2
+    return Estimate(found.pose.position_m, covariance_m2=covariance_m2, ambiguous=is_ambiguous)
+
+
+def _camera_is_assumed(frame: DeviceFrame, components: Components) -> bool:
+    """Whether a camera that states nothing is taken as one as sold: where the images reveal an inexact place."""
+    return frame.camera.uncertainty is None and components.place_m > 0
 
 
 def _radius_px(observations: Observations, pose: Pose) -> Floats:
@@ -226,7 +235,7 @@ def _maximize_honestly(
         if found is not None and revealed == found.components:
             return found
         wider = priors
-        if revealed.place_m > 0 and frame.camera.uncertainty is None:
+        if _camera_is_assumed(frame, revealed):
             wider = replace(priors, camera=assumed_uncertainty(frame.camera).device_sigmas())
         start = start_at_spots(frame, gravity, wider, spots, pose, revealed)
         try:
