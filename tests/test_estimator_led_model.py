@@ -10,7 +10,16 @@ from numpy.typing import NDArray
 from estimator.camera.intrinsics import with_errors
 from estimator.camera.pose import Pose
 from estimator.io.device import Camera, DiscLed, Led, SquareLed
-from estimator.pixels.led_model import IMAGE_PARAMETERS, ImageState, LedImageModel, fall_off, led_footprints, rim
+from estimator.pixels.led_model import (
+    IMAGE_PARAMETERS,
+    SIZE_PARAMETER,
+    TILT_PARAMETERS,
+    ImageState,
+    LedImageModel,
+    fall_off,
+    led_footprints,
+    rim,
+)
 from estimator.pixels.polygon_raster import RoiStack
 from estimator.pixels.psf import LensBlur, disc_diameter_px
 
@@ -194,7 +203,7 @@ def test_the_fall_off_is_the_lens_s_in_every_pixel(factor: int, distorted: bool)
 
 @pytest.mark.parametrize("distortion", [None, DISTORTION])
 @pytest.mark.parametrize("parameter", range(6, IMAGE_PARAMETERS))
-def test_slopes_by_camera_and_size_are_what_differences_give(
+def test_slopes_by_camera_and_face_are_what_differences_give(
     parameter: int, distortion: dict[str, float] | None
 ) -> None:
     """As for the pose. The image is within 45 px of the principal point: steps of k1, p1 and p2 are large."""
@@ -206,12 +215,14 @@ def test_slopes_by_camera_and_size_are_what_differences_give(
     step = 1e-3 / largest
 
     def moved(sign: int) -> Floats:
-        errors, size = np.zeros(7), np.ones(1)
-        if parameter < IMAGE_PARAMETERS - 1:
+        errors, size, tilts = np.zeros(7), np.ones(1), np.zeros((1, 2))
+        if parameter < SIZE_PARAMETER:
             errors[parameter - 6] = sign * step
-        else:
+        elif parameter == SIZE_PARAMETER:
             size = size + sign * step
-        return model.render(ImageState(pose, with_errors(lens, errors), np.zeros((1, 3)), size)).light
+        else:
+            tilts[0, parameter - TILT_PARAMETERS[0]] = sign * step
+        return model.render(ImageState(pose, with_errors(lens, errors), np.zeros((1, 3)), size, tilts)).light
 
     difference = (moved(1) - moved(-1)) / (2 * step)
     assert np.abs(found[:, parameter] - difference).max() < 0.01 * largest
@@ -226,9 +237,23 @@ def test_an_led_that_moves_does_as_the_camera_that_moves_back() -> None:
     for axis in range(3):
         shift = np.zeros((1, 3))
         shift[0, axis] = 1e-3 / 4000 * 3
-        ahead, behind = (model.render(ImageState(pose, lens, sign * shift, np.ones(1))).light for sign in (1, -1))
+        ahead, behind = (
+            model.render(ImageState(pose, lens, sign * shift, np.ones(1), np.zeros((1, 2)))).light for sign in (1, -1)
+        )
         difference = (ahead - behind) / (2 * shift[0, axis])
         assert np.abs(difference + found[:, axis]).max() < 0.01 * np.abs(difference).max()
+
+
+def test_a_tilted_face_is_the_points_that_it_says() -> None:
+    """Tangents 0.2 along x and -0.1 along y: a square's rim is higher by 0.2 x - 0.1 y, its vertices by 0.3 and 0.1
+    half widths and the opposite.
+    """
+    one = led("square")
+    half_m = one.half_width_m
+    tilted = ImageState(here(camera()), camera(), np.zeros((1, 3)), np.ones(1), np.array([[0.2, -0.1]]))
+    heights_m = tilted.rims_m(rim(one, 4)[None])[0]
+    vertices = {(round(x), round(y)): z for x, y, z in (heights_m / half_m).tolist()}
+    assert vertices == pytest.approx({(1, 1): 0.1, (1, -1): 0.3, (-1, 1): -0.3, (-1, -1): -0.1})
 
 
 def test_leds_that_are_not_imaged_have_no_footprint() -> None:

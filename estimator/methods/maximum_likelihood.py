@@ -11,7 +11,8 @@ datum) is estimated with the pose, as nuisances with priors (`estimator.pixels.n
 hybrid bound. What it does not state is taken as exact, unless the images contradict: if LED images are displaced
 against each other by more than their noise explains, or have another size or profile, these become nuisances as well.
 The standard deviation of such a nuisance is that of all LEDs of the frame: a variance component (Foerstner 1979). A
-camera that states nothing is then assumed to be one as sold. A displacement common to all images is not revealed.
+camera that states nothing is then assumed to be one as sold. A displacement common to all images is not revealed. Nor
+is a focal length where the view does not check it: `estimator.solvers.robust_fit` says what it adds to the covariance.
 
 Not modelled: light of other sources beside a smooth background, mechanical vignetting (natural vignetting is), and
 motion. LEDs that the model does not explain are excluded by their goodness of fit.
@@ -34,19 +35,25 @@ from estimator.methods.gravity_fit import agreement, ambiguous
 from estimator.methods.up2p import upright_pose
 from estimator.methods.variant import Estimate, Variant
 from estimator.pixels.led_model import (
+    COARSE_POINTS,
     IMAGE_PARAMETERS,
     POSE_ALONE,
     PROFILE_PARAMETERS,
+    SIZE_PARAMETER,
+    TILT_PARAMETERS,
     ImageState,
     RenderedLeds,
     rim,
 )
-from estimator.pixels.led_pixels import LedPixels, gather_led_pixels, leds_in_view
+from estimator.pixels.led_pixels import LedPixels, LedsInView, gather_led_pixels, leds_in_view
 from estimator.pixels.likelihood import Noise, PhotometricFit, excess_chi2, fit_photometry, score
 from estimator.pixels.nuisances import (
     LOCAL_PARAMETERS,
     NO_COMPONENTS,
     NO_GRAVITY,
+    PROFILE,
+    SIZE,
+    TILTS,
     Components,
     Gravity,
     Nuisances,
@@ -71,6 +78,9 @@ CONVERGED_STEP2 = 1e-2
 MAX_CIRCLE2 = 1.0
 # Points of a rim whose movement is looked at.
 RIM_POINTS = 4
+# With nuisances a step of the pose may be short while LEDs still move in their images: no rim may move by more. Smaller
+# than the shift that `likelihood` tolerates in an LED's chi-square.
+CONVERGED_PX = 0.02
 # A step that multiplies the mean deviance by more was too long. Smaller increases occur when readings near saturation
 # enter or leave.
 MAX_DEVIANCE_RATIO = 1.01
@@ -87,6 +97,10 @@ MIN_EXCLUDED_SHARE = 0.25
 # are certain at the start.
 START_SIGMA_PX = 0.05
 START_SIGMA_SHARE = 2e-3
+# Radius from which on the area of a spot tells an LED image's size, and the error of that radius. Detection smooths
+# over 5 x 5 pixels, a variance of 2 px^2, which moves the edge of a disc by 2 / (2 r), 0.12 px; blur may do as much.
+MIN_SIZED_PX = 8.0
+START_RADIUS_PX = 0.2
 # Where the initial pose knows rims less well than this, relative to their centres, the search is damped at first: what
 # the images say little of would move far beyond the linearization. Damping starts at the information of the initial
 # pose, and changes by DAMPING_RATIO with the length of a step, down to MIN_DAMPING.
@@ -161,7 +175,7 @@ def ml(frame: DeviceFrame) -> Estimate:
     correspondences = find_correspondences(frame)
     observations = observe(frame, correspondences)
     inliers, use_gravity, is_ambiguous = np.ones(len(observations.leds_m), dtype=bool), True, False
-    exact = True
+    exact, unchecked_m2 = True, np.zeros((3, 3))
     if len(observations.leds_m) < MIN_FOR_CONSENSUS:
         upright = upright_pose(observations)
         if upright is None:
@@ -170,7 +184,7 @@ def ml(frame: DeviceFrame) -> Estimate:
     else:
         agreed = agreement(observations)
         pose, inliers = agreed.best.pose, agreed.inliers
-        use_gravity, is_ambiguous = agreed.gravity, ambiguous(agreed)
+        use_gravity, is_ambiguous, unchecked_m2 = agreed.gravity, ambiguous(agreed), agreed.unchecked_m2
         # The centroids of large LEDs have model errors of their own, which the pixels do not have.
         limit_px = MAX_MODEL_ERROR_PX + START_SIGMA_SHARE * _radius_px(observations, pose).max()
         exact = agreed.model is None or agreed.model.added_sigma_px < limit_px
@@ -178,7 +192,15 @@ def ml(frame: DeviceFrame) -> Estimate:
     positions = set(map(tuple, observations.leds_m[inliers].tolist()))
     spots = [one for one in correspondences if one.led.position_m in positions]
     found = _maximize_honestly(frame, gravity, spots, pose, exact)
-    return Estimate(found.pose.position_m, covariance_m2=found.covariance[:3, :3], ambiguous=is_ambiguous)
+    covariance_m2 = found.covariance[:3, :3]
+    if not _camera_is_assumed(frame, found.components):
+        covariance_m2 = covariance_m2 + unchecked_m2
+    return Estimate(found.pose.position_m, covariance_m2=covariance_m2, ambiguous=is_ambiguous)
+
+
+def _camera_is_assumed(frame: DeviceFrame, components: Components) -> bool:
+    """Whether a camera that states nothing is taken as one as sold: where the images reveal an inexact place."""
+    return frame.camera.uncertainty is None and components.place_m > 0
 
 
 def _radius_px(observations: Observations, pose: Pose) -> Floats:
@@ -213,7 +235,7 @@ def _maximize_honestly(
         if found is not None and revealed == found.components:
             return found
         wider = priors
-        if revealed.place_m > 0 and frame.camera.uncertainty is None:
+        if _camera_is_assumed(frame, revealed):
             wider = replace(priors, camera=assumed_uncertainty(frame.camera).device_sigmas())
         start = start_at_spots(frame, gravity, wider, spots, pose, revealed)
         try:
@@ -252,6 +274,7 @@ def start_at_spots(
     index = np.array([number[one.led.id] for one in spots], dtype=np.int64)
     of_spots, nuisances = priors.only(index), Nuisances.zero(priors).only(index)
     lift_m2 = np.array([4 * one.led.mean_square_extent_m2 for one in spots])
+    by_gradient_m = lift_m2 / 4 / np.array([one.led.half_width_m for one in spots])
     measured_px = np.array([(one.spot.u_px, one.spot.v_px) for one in spots])
     used = np.ones(len(spots), dtype=bool)
     for _ in range(START_STEPS):
@@ -260,14 +283,17 @@ def start_at_spots(
         offset_m = points_m - pose.position_m
         # See `estimator.solvers.reprojection` on the eccentricity of a centroid.
         points_m[:, 2] += lift_m2 * offset_m[:, 2] / (offset_m**2).sum(axis=1)
+        points_m[:, :2] += by_gradient_m[:, None] * nuisances.profile()[:, :2]
         images = project(points_m, pose, camera)
         radius_px = np.sqrt(lift_m2) / np.linalg.norm(offset_m, axis=1) / camera.pixel_angle_rad
         sigma_px = np.hypot(START_SIGMA_PX, START_SIGMA_SHARE * radius_px)
         rows = np.zeros((len(spots), 2, LOCAL_PARAMETERS))
         rows[:, :, :POSE_PARAMETERS] = images.slopes
-        rows[:, :, POSE_PARAMETERS : IMAGE_PARAMETERS - 1] = intrinsic_slopes_px(
+        rows[:, :, POSE_PARAMETERS:SIZE_PARAMETER] = intrinsic_slopes_px(
             images.p_cam, camera.normalized(images.pixels), camera
         )
+        # A gradient of luminance g over a half width r moves a centroid as a shift of the LED by g s^2 / r does.
+        rows[:, :, IMAGE_PARAMETERS : IMAGE_PARAMETERS + 2] = images.slopes[:, :, :2] * -by_gradient_m[:, None, None]
         rows /= sigma_px[:, None, None]
         right = (measured_px - images.pixels) / sigma_px[:, None]
         angles = pose.rig_angles(camera)
@@ -275,10 +301,31 @@ def start_at_spots(
         pose, nuisances = pose.moved(solution.pose_step, camera), nuisances.moved(solution.step)
         if solution.step2 < CONVERGED_STEP2:
             break
+    sizes = _sizes_of_spots(spots, nuisances.state(pose, frame.camera, of_spots), components.added(of_spots))
+    nuisances.leds[:, SIZE] = sizes
     located = np.zeros(len(priors.leds), dtype=bool)
     located[index] = True
     everything = Nuisances.zero(priors).updated(index, nuisances)
     return Start(pose, everything, solution.covariance, located, components)
+
+
+def _sizes_of_spots(spots: Sequence[Correspondence], state: ImageState, priors: Priors) -> Floats:
+    """Relative errors (n,) of the LEDs' sizes, from the areas of their spots, weighted by their priors."""
+    sigma = priors.leds[:, SIZE]
+    if not sigma.any():
+        return np.zeros(len(spots))
+    rims_m = state.rims_m(np.stack([rim(one.led, COARSE_POINTS) for one in spots])) + (
+        priors.positions_m[:, None] + state.shifts_m[:, None]
+    )
+    u, v = project(rims_m.reshape(-1, 3), state.pose, state.camera).pixels.reshape(len(spots), COARSE_POINTS, 2).T
+    area_px = np.abs((u * np.roll(v, -1, axis=0) - v * np.roll(u, -1, axis=0)).sum(axis=0)) / 2
+    whole = np.array([not (one.spot.touches_border or one.spot.saturated) for one in spots]) & (
+        area_px >= np.pi * MIN_SIZED_PX**2
+    )
+    area_px[~whole] = 1.0
+    seen_px = np.where(whole, [float(one.spot.area_px) for one in spots], area_px)
+    weight = sigma**2 / (sigma**2 + START_RADIUS_PX**2 * np.pi / area_px)
+    return np.asarray(np.where(whole, weight * (np.sqrt(seen_px / area_px) - 1), 0.0))
 
 
 def _tuned(
@@ -329,7 +376,7 @@ def _revealed(frame: DeviceFrame, gravity: Gravity, priors: Priors, found: Maxim
 
     # A shift of the principal point is one of the image.
     shift = [POSE_PARAMETERS + 2, POSE_PARAMETERS + 3]
-    size, of_profile = [IMAGE_PARAMETERS - 1], [IMAGE_PARAMETERS + k for k in range(PROFILE_PARAMETERS)]
+    size, of_profile = [SIZE_PARAMETER], [IMAGE_PARAMETERS + k for k in range(PROFILE_PARAMETERS)]
     z = result.nuisances.standardized(had.added(priors).only(pixels.index))
     of_priors = gravity.deviance(result.pose.rig_angles(frame.camera)) + float(
         (z.camera**2).sum() + (z.datum**2).sum() + (z.luminaires**2).sum() + (z.leds[result.used, :3] ** 2).sum()
@@ -350,14 +397,17 @@ def maximize(frame: DeviceFrame, gravity: Gravity, priors: Priors, start: Start)
     pose, nuisances, covariance, located = start.pose, start.nuisances, start.covariance, start.located.copy()
     components = start.components
     excluded = np.zeros(len(priors.leds), dtype=bool)
-    before: Mask | None = None
+    max_settled_px = MAX_SETTLED_PX if priors.exact else np.inf
     wrong, settled = 0, False
     start_information = np.asarray(np.linalg.inv(start.covariance), dtype=np.float64)
     damping = 1.0 if _shape_sigma_px(frame, priors, start) > DAMPED_SIGMA_PX else 0.0
-    for _ in range(MAX_STEPS if priors.exact else MAX_GATHERS):
+
+    def in_view() -> LedsInView:
         state = nuisances.state(pose, frame.camera, priors)
-        view = leds_in_view(frame, state, covariance, components.added(priors).position_sigma_m(), located)
-        pixels = gather_led_pixels(frame, view, _parameters(priors))
+        return leds_in_view(frame, state, covariance, components.added(priors).position_sigma_m(), located)
+
+    for _ in range(MAX_STEPS if priors.exact else MAX_GATHERS):
+        pixels = gather_led_pixels(frame, in_view(), _parameters(components.added(priors)))
         located[pixels.index] = True
         used = ~excluded[pixels.index]
         search = _Search(frame, pixels, gravity, priors.only(pixels.index), start_information, damping)
@@ -369,22 +419,20 @@ def maximize(frame: DeviceFrame, gravity: Gravity, priors: Priors, start: Start)
                 break
             result = search.run(used, result.pose, result.nuisances, result.components)
         pose, nuisances = result.pose, nuisances.updated(pixels.index, result.nuisances)
-        components = result.components
+        components, damping = result.components, result.damping
         excluded[pixels.index[~used]] = True
-        # Which pixels are next to an edge depends on where it was when they were gathered.
-        if result.converged and (result.moved_px < MAX_SETTLED_PX or settled):
+        # Which pixels are next to an edge depends on where it was when they were gathered. Beside nuisances that is
+        # nothing.
+        if result.converged and (result.moved_px < max_settled_px or settled):
             covariance = result.solution.covariance
             if not np.trace(covariance[:3, :3]) < MAX_SIGMA_M**2:
                 raise EstimationFailure("fit", "the LEDs in view do not determine a position")
-            now = np.zeros(len(priors.leds), dtype=bool)
-            now[pixels.index] = True
-            if not pixels.more or (before is not None and (now == before).all()):
+            # The better known pose may determine the images of more LEDs.
+            if not pixels.more or np.array_equal(pixels.index, in_view().index):
                 ids = tuple(sorted(led.id for led, use in zip(pixels.leds, used, strict=True) if use))
                 return Maximum(
                     pose, nuisances, covariance, ids, components, _model_is_wrong(wrong, len(ids)), result, pixels
                 )
-            # The better known pose may determine the images of more LEDs.
-            before = now
         settled = result.converged
     raise EstimationFailure("fit", DIVERGED)
 
@@ -412,9 +460,10 @@ def _model_is_wrong(wrong: int, used: int) -> bool:
 
 
 def _parameters(priors: Priors) -> Ints:
-    """The IMAGE_PARAMETERS to estimate: the pose, intrinsics with a prior, and sizes because of the background."""
+    """The IMAGE_PARAMETERS to estimate: pose, intrinsics and tilts with a prior, sizes because of the background."""
     of_camera = POSE_PARAMETERS + np.flatnonzero(priors.camera)
-    return np.concatenate([POSE_ALONE, of_camera, [IMAGE_PARAMETERS - 1]])
+    of_face = [SIZE_PARAMETER, *(TILT_PARAMETERS if priors.leds[:, TILTS].any() else ())]
+    return np.concatenate([POSE_ALONE, of_camera, of_face])
 
 
 @dataclass(frozen=True, eq=False)
@@ -423,7 +472,7 @@ class _ScoringResult:
 
     `converged` says whether the maximum was reached, and not the limit of validity of the gathered pixels. `used`,
     `faint` (used, but with a low signal-to-noise ratio) and `excess` (of chi-square over its limit) are by LED, (n,).
-    `moved_px` is the largest movement of an image since its pixels were gathered.
+    `moved_px` is the largest movement of an image since its pixels were gathered, `damping` that of the next step.
     """
 
     pose: Pose
@@ -436,6 +485,7 @@ class _ScoringResult:
     faint: Mask
     excess: Floats
     moved_px: float
+    damping: float
 
 
 class _Search:
@@ -474,7 +524,7 @@ class _Search:
         for _ in range(MAX_STEPS):
             state = nuisances.state(pose, camera, priors)
             rendered = self._rendered(state)
-            profile = nuisances.profile() if priors.leds[:, 4:].any() else None
+            profile = nuisances.profile() if priors.leds[:, PROFILE].any() else None
             angles = pose.rig_angles(camera)
             candidate = fit_photometry(pixels, rendered, used, self._noise, photometry, profile)
             of_priors = self._gravity.deviance(angles) + nuisances.deviance(priors)
@@ -501,6 +551,7 @@ class _Search:
             factor *= min(1.0, pixels.max_move_px / max(moved_px, 1e-12))
             short = moved_px < pixels.max_move_px
             converged = step.step2 * factor**2 < CONVERGED_STEP2 and short and damping == 0
+            converged &= priors.exact or moved_px < CONVERGED_PX
             if damping > 0:
                 damping *= DAMPING_RATIO ** (-1 if short else moved_px > 4 * pixels.max_move_px)
                 damping = damping if damping > MIN_DAMPING else 0.0
@@ -515,6 +566,7 @@ class _Search:
                 raise EstimationFailure("fit", DIVERGED)
         assert step is not None
         assert photometry is not None
+        self._first_damping = damping
         count = len(pixels.leds)
         max_signal_to_noise = np.zeros(count)
         np.maximum.at(max_signal_to_noise, pixels.led, photometry.signal_to_noise)
@@ -523,7 +575,9 @@ class _Search:
         )
         faint = used & (max_signal_to_noise < MIN_SIGNAL_TO_NOISE)
         moved = float(np.linalg.norm(off_px, axis=-1).max())
-        return _ScoringResult(pose, nuisances, converged, step, components, photometry, used, faint, excess, moved)
+        return _ScoringResult(
+            pose, nuisances, converged, step, components, photometry, used, faint, excess, moved, damping
+        )
 
     def _damping(self, step: Solution, before: Solution, factor: float) -> float:
         """Factor of a step: a half where it takes back much of the one before."""
@@ -541,7 +595,7 @@ class _Search:
         share = np.divide(background, amplitude, out=np.zeros_like(amplitude), where=amplitude > 0)
         size_px = np.linalg.norm(self._origin_px - self._origin_px.mean(axis=1, keepdims=True), axis=-1).mean(axis=1)
         leds = self._priors.leds.copy()
-        leds[:, 3] = np.hypot(leds[:, 3], BACKGROUND_EDGE_PX * np.minimum(share, 1.0) / size_px)
+        leds[:, SIZE] = np.hypot(leds[:, SIZE], BACKGROUND_EDGE_PX * np.minimum(share, 1.0) / size_px)
         return replace(self._priors, leds=leds)
 
     def _rendered(self, state: ImageState) -> RenderedLeds:
@@ -562,7 +616,7 @@ class _Search:
     def _rims_px(self, state: ImageState) -> Floats:
         """Points of the rims, (n, RIM_POINTS, 2)."""
         centres_m = self._centres_m + state.shifts_m
-        points_m = centres_m[:, None] + self._rims_m * state.sizes[:, None, None]
+        points_m = centres_m[:, None] + state.rims_m(self._rims_m)
         return project(points_m.reshape(-1, 3), state.pose, state.camera).pixels.reshape(-1, RIM_POINTS, 2)
 
 

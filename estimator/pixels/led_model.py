@@ -38,8 +38,12 @@ EDGE_MARGIN = 1.25
 FALL_OFF_NODES = 10
 
 
-IMAGE_PARAMETERS = POSE_PARAMETERS + CAMERA_PARAMETERS + 1
-"""Parameters of LED images: the pose's, the intrinsics', then the relative error of the LED's own size."""
+FACE_PARAMETERS = 3
+"""Parameters of a face: the relative error of its size, then its two tilts, see `ImageState`."""
+IMAGE_PARAMETERS = POSE_PARAMETERS + CAMERA_PARAMETERS + FACE_PARAMETERS
+"""Parameters of LED images: the pose's, the intrinsics', then those of the LED's own face."""
+SIZE_PARAMETER = IMAGE_PARAMETERS - FACE_PARAMETERS
+TILT_PARAMETERS = (SIZE_PARAMETER + 1, SIZE_PARAMETER + 2)
 PROFILE_PARAMETERS = 3
 """Coefficients of an LED's luminance over its face: of a, b and a^2 + b^2 - 1/2, see `LedPixels`."""
 
@@ -48,22 +52,30 @@ PROFILE_PARAMETERS = 3
 class ImageState:
     """What determines the images of n LEDs: a pose, a camera, and how the LEDs differ from the map.
 
-    `shifts_m` (n, 3) is added to the LEDs' positions, world metres; `sizes` (n,) multiplies their sizes.
+    `shifts_m` (n, 3) is added to the LEDs' positions, world metres; `sizes` (n,) multiplies their sizes. `tilts` (n, 2)
+    are tangents: at (x, y) from its centre a face is tilts[:, 0] x + tilts[:, 1] y higher than a level one.
     """
 
     pose: Pose
     camera: Camera
     shifts_m: Floats
     sizes: Floats
+    tilts: Floats
 
     @staticmethod
     def as_told(pose: Pose, camera: Camera, leds: int) -> "ImageState":
         """LEDs as in the map."""
-        return ImageState(pose, camera, np.zeros((leds, 3)), np.ones(leds))
+        return ImageState(pose, camera, np.zeros((leds, 3)), np.ones(leds), np.zeros((leds, 2)))
 
     def of(self, chosen: NDArray[np.bool_] | Ints) -> "ImageState":
         """The state of the chosen LEDs."""
-        return ImageState(self.pose, self.camera, self.shifts_m[chosen], self.sizes[chosen])
+        return ImageState(self.pose, self.camera, self.shifts_m[chosen], self.sizes[chosen], self.tilts[chosen])
+
+    def rims_m(self, level_m: Floats) -> Floats:
+        """Points of the faces relative to their centres, (n, k, 3), from those of level faces by the map."""
+        rims_m = level_m * self.sizes[:, None, None]
+        rims_m[:, :, 2] += np.einsum("nki,ni->nk", rims_m[:, :, :2], self.tilts)
+        return rims_m
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +109,7 @@ def led_footprints(leds: Sequence[Led], state: ImageState) -> LedFootprints:
     """Footprints of LEDs under a state."""
     pose, camera = state.pose, state.camera
     centres_m = np.array([led.position_m for led in leds]) + state.shifts_m
-    rims_m = np.stack([rim(led, COARSE_POINTS) for led in leds]) * state.sizes[:, None, None] + centres_m[:, None]
+    rims_m = state.rims_m(np.stack([rim(led, COARSE_POINTS) for led in leds])) + centres_m[:, None]
     projected = project(rims_m.reshape(-1, 3), pose, camera)
     pixels = projected.pixels.reshape(len(leds), COARSE_POINTS, 2)
     from_above = centres_m[:, 2] <= pose.position_m[2]
@@ -243,7 +255,7 @@ class LedImageModel:
         `parameters` are those of the IMAGE_PARAMETERS that derivatives are by.
         """
         lens, factors = self._lens, self._lens.factors[self._led, None]
-        offsets_m = self._rims_m * state.sizes[self._led, None]
+        offsets_m = state.of(self._led).rims_m(self._rims_m[:, None])[:, 0]
         rims = project(self._centres_m[self._led] + state.shifts_m[self._led] + offsets_m, state.pose, state.camera)
         slopes = _slopes(rims, offsets_m, state.camera)[:, :, parameters]
         outlines = Outlines(rims.pixels * factors, self._following, self._led, slopes * factors[:, None])
@@ -259,9 +271,12 @@ def _slopes(rims: ProjectedPoints, offsets_m: Floats, camera: Camera) -> Floats:
     """Derivatives (n, 2, p) of points of rims by the IMAGE_PARAMETERS; `offsets_m` (n, 3) are from their centres."""
     slopes = np.zeros((len(offsets_m), 2, IMAGE_PARAMETERS))
     slopes[:, :, :POSE_PARAMETERS] = rims.slopes
-    slopes[:, :, POSE_PARAMETERS:-1] = intrinsic_slopes_px(rims.p_cam, camera.normalized(rims.pixels), camera)
+    slopes[:, :, POSE_PARAMETERS:-FACE_PARAMETERS] = intrinsic_slopes_px(
+        rims.p_cam, camera.normalized(rims.pixels), camera
+    )
     # A point of the face moves its image as much as the camera moves it by the opposite way.
-    slopes[:, :, -1] = -np.einsum("nij,nj->ni", rims.slopes[:, :, :3], offsets_m)
+    slopes[:, :, -FACE_PARAMETERS] = -np.einsum("nij,nj->ni", rims.slopes[:, :, :3], offsets_m)
+    slopes[:, :, -FACE_PARAMETERS + 1 :] = -rims.slopes[:, :, 2:3] * offsets_m[:, None, :2]
     return slopes
 
 

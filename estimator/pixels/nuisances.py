@@ -1,13 +1,13 @@
 """Nuisance parameters of LED images, with Gaussian priors, and the step of pose and nuisances that a linear fit gives.
 
 What a device does not know exactly: its intrinsics, the place and rotation of each luminaire, the place of each LED in
-it, the map's origin and scale, the size of each LED and the luminance over its face. Each nuisance z is in units of its
-prior's standard deviation, so that its prior is N(0, 1).
+it, the map's origin and scale, the size and the tilts of each LED's face and the luminance over it. Each nuisance z is
+in units of its prior's standard deviation, so that its prior is N(0, 1).
 
-An LED's image depends on the LOCAL parameters: pose, intrinsics, size, profile. An LED that moves by d in the world
-moves its image as the camera does that moves by -d. So the information of each LED about its LOCAL parameters is all
-that the fit needs. Orthogonal elimination (QR) removes first what is an LED's own, then what is a luminaire's: normal
-equations would lose the digits of what a loose prior leaves of a precise measurement.
+An LED's image depends on the LOCAL parameters: pose, intrinsics, size, tilts, profile. An LED that moves by d in the
+world moves its image as the camera does that moves by -d. So the information of each LED about its LOCAL parameters is
+all that the fit needs. Orthogonal elimination (QR) removes first what is an LED's own, then what is a luminaire's:
+normal equations would lose the digits of what a loose prior leaves of a precise measurement.
 """
 
 from dataclasses import dataclass, replace
@@ -19,20 +19,26 @@ from estimator.camera.intrinsics import CAMERA_PARAMETERS, with_errors
 from estimator.camera.pose import POSE_PARAMETERS, Pose
 from estimator.errors import EstimationFailure
 from estimator.io.device import Camera, DeviceFrame, Led
-from estimator.pixels.led_model import IMAGE_PARAMETERS, PROFILE_PARAMETERS, ImageState
+from estimator.pixels.led_model import FACE_PARAMETERS, IMAGE_PARAMETERS, PROFILE_PARAMETERS, ImageState
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 LOCAL_PARAMETERS = IMAGE_PARAMETERS + PROFILE_PARAMETERS
-LED_PARAMETERS = 3 + 1 + PROFILE_PARAMETERS
-"""An LED's own: shift along x, y and z of the world, size, profile."""
+LED_PARAMETERS = 3 + FACE_PARAMETERS + PROFILE_PARAMETERS
+"""An LED's own: shift along x, y and z of the world, size, two tilts of the face, profile."""
+SIZE, TILTS, PROFILE = 3, slice(4, 6), slice(6, LED_PARAMETERS)
+"""Columns of an LED's own size, tilts and profile."""
 LUMINAIRE_PARAMETERS = 6
 """A luminaire's: shift along x, y and z, rotation about x, y and z."""
 DATUM_PARAMETERS = 4
 """The map's: shift along x, y and z, scale."""
 COMMON_PARAMETERS = DATUM_PARAMETERS + CAMERA_PARAMETERS + POSE_PARAMETERS
 
+# A map that errs does not say how level the LEDs hang: standard deviation of a face's tangents, next to no knowledge.
+# Luminaires hang by some 0.1 to 1 deg, and real rims are not perfectly round. Taken as level, a face would tell the
+# camera's tilt to 0.01 deg, better than the place of the LEDs does.
+FREE_TILT = 1.0
 # Directions with less than this share of the largest information of an LED hold rounding errors alone.
 MIN_INFORMATION_SHARE = 1e-13
 
@@ -42,8 +48,9 @@ class Priors:
     """Standard deviations of the nuisances of n LEDs of l luminaires; 0 for what is known exactly.
 
     `camera` (7,) in the units of `with_errors`; `datum` (4,) metres and relative scale; `luminaires` (l, 6) metres and
-    radians; `leds` (n, 7): metres, relative size, profile coefficients. `positions_m` (n, 3) are the LEDs' positions by
-    the map, `centres_m` (l, 3) the points that luminaires turn about, `luminaire` (n,) each LED's, -1 for none.
+    radians; `leds` (n, 9): metres, relative size, tilts, profile coefficients. `positions_m` (n, 3) are the LEDs'
+    positions by the map, `centres_m` (l, 3) the points that luminaires turn about, `luminaire` (n,) each LED's, -1 for
+    none.
     """
 
     camera: Floats
@@ -67,12 +74,17 @@ class Priors:
         index = {one: k for k, one in enumerate(ids)}
         own = np.zeros((len(leds), LED_PARAMETERS))
         for k, led in enumerate(leds):
-            own[k, :6] = led.sigmas()
-            own[k, 3] /= led.half_width_m
+            sigmas = led.sigmas()
+            own[k, :3] = sigmas[:3]
+            own[k, SIZE] = sigmas[3] / led.half_width_m
+            own[k, PROFILE][:2] = sigmas[4:]
+        of_luminaire = np.array(rows).reshape(-1, LUMINAIRE_PARAMETERS)
+        if own[:, :3].any() or of_luminaire.any():
+            own[:, TILTS] = FREE_TILT
         return Priors(
             camera=camera,
             datum=np.zeros(DATUM_PARAMETERS) if datum is None else datum.sigmas(),
-            luminaires=np.array(rows).reshape(-1, LUMINAIRE_PARAMETERS),
+            luminaires=of_luminaire,
             leds=own,
             positions_m=np.array([led.position_m for led in leds]).reshape(-1, 3),
             centres_m=np.array([one.position_m for one in stated]).reshape(-1, 3),
@@ -123,7 +135,8 @@ class Priors:
 class Components:
     """Standard deviations that the images of a frame reveal beside those that the device states; 0 for none.
 
-    `place_m` of each LED's x, y and z, metres; `size`, relative; `profile` of each coefficient.
+    `place_m` of each LED's x, y and z, metres, which leaves the faces' tilts free; `size`, relative; `profile` of each
+    coefficient.
     """
 
     place_m: float = 0.0
@@ -132,11 +145,14 @@ class Components:
 
     def added(self, stated: Priors) -> Priors:
         """Priors with both."""
-        extra = np.array([self.place_m] * 3 + [self.size] + [self.profile] * PROFILE_PARAMETERS)
-        return replace(stated, leds=np.hypot(stated.leds, extra))
+        extra = np.array([self.place_m] * 3 + [self.size] + [0.0] * 2 + [self.profile] * PROFILE_PARAMETERS)
+        leds = np.hypot(stated.leds, extra)
+        if self.place_m > 0:
+            leds[:, TILTS] = FREE_TILT
+        return replace(stated, leds=leds)
 
     def updated(self, stated: Priors, values: "Nuisances", redundancy: Floats, used: NDArray[np.bool_]) -> "Components":
-        """Components whose priors agree with the values of the LEDs used, (n,), and their redundancy (n, 7).
+        """Components whose priors agree with the values of the LEDs used, (n,), and their redundancy (n, 9).
 
         Foerstner (1979): the squares of residuals, in units of the variance assumed, over their redundancy. A component
         of 0 stays 0, and so does one that is not controlled.
@@ -164,7 +180,7 @@ class Components:
 
 NO_COMPONENTS = Components()
 # Columns of an LED's own nuisances that have one component.
-COLUMNS_OF_COMPONENT = {"place_m": [0, 1, 2], "size": [3], "profile": [4, 5, 6]}
+COLUMNS_OF_COMPONENT = {"place_m": [0, 1, 2], "size": [SIZE], "profile": list(range(LED_PARAMETERS)[PROFILE])}
 # Redundancy of a component below which it is not estimated.
 MIN_REDUNDANCY = 0.5
 # Smallest ratio of a component to its former value.
@@ -211,7 +227,7 @@ class Nuisances:
 
     def profile(self) -> Floats:
         """Profile coefficients (n, 3) of the LEDs."""
-        return self.leds[:, 4:]
+        return self.leds[:, PROFILE]
 
     def shifts_m(self, priors: Priors) -> Floats:
         """Shifts (n, 3) of the LEDs from their positions by the map, world metres."""
@@ -222,7 +238,8 @@ class Nuisances:
 
     def state(self, pose: Pose, camera: Camera, priors: Priors) -> ImageState:
         """State of the LED images under a pose and these nuisances; `camera` is the stated one."""
-        return ImageState(pose, with_errors(camera, self.camera), self.shifts_m(priors), 1 + self.leds[:, 3])
+        sizes, tilts = 1 + self.leds[:, SIZE], self.leds[:, TILTS]
+        return ImageState(pose, with_errors(camera, self.camera), self.shifts_m(priors), sizes, tilts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,7 +266,7 @@ NO_GRAVITY = Gravity(np.zeros(2), np.full(2, np.inf))
 class Solution:
     """A step of pose (6,) and nuisances; covariance (6, 6) of the pose, and of each LED's own nuisances.
 
-    `redundancy` (n, 7) is the share of its prior that each LED's own nuisance keeps, 1 less its variance in prior
+    `redundancy` (n, 9) is the share of its prior that each LED's own nuisance keeps, 1 less its variance in prior
     units. `step2` is the squared length of the step of the pose in standard deviations, `information` (6, 6) the
     inverse of the pose's covariance.
     """
