@@ -58,6 +58,14 @@ def test_device_and_shot_share_an_unknown_by_their_variances(calibrated: vr.Erro
         assert device.total_mm / shot.total_mm == pytest.approx(ratio, rel=1e-9)
 
 
+def test_an_estimator_that_trusts_lens_and_map_is_right_where_they_are_exact() -> None:
+    """The accelerometer alone errs, and its error is stated to both estimators: they are the same."""
+    of_tilts = budget_of("belief.accelerometer={device_error_deg=0.3}")
+    assert {row.key for row in of_tilts.rows} == {"accelerometer_device", "noise"}
+    for row in of_tilts.rows:
+        assert row.trusting.total_mm == pytest.approx(row.share.total_mm, rel=1e-9)
+
+
 @pytest.mark.slow
 def test_datum_adds_its_own_size() -> None:
     """1, 2 and 2 mm: 2.236 mm horizontally, 2 mm vertically, whatever the weights."""

@@ -145,12 +145,13 @@ def test_the_noise_of_a_dark_pixel_by_hand() -> None:
 
 
 def test_halos_that_touch_do_not_add_up() -> None:
-    """Two faces of 5 px radius, 6 px apart, the second ten times brighter: the ring about the first holds half of the
-    second, whose pixels are left out. Without noise the amplitudes are the ones rendered, to four times the mean over
-    a hundred edge pixels of 0.3 / 100^1.5 of 40 000 e, 1.2 e.
+    """Two faces of 5 px radius, 1 px apart, the second ten times brighter: readings go to 1 px beyond the pixels that a
+    face lights, so those about the first hold the edge of the second, whose pixels are left out. Without noise the
+    amplitudes are the ones rendered, to four times the mean over a hundred edge pixels of 0.3 / 100^1.5 of 40 000 e,
+    1.2 e.
     """
     view = view_of(TARGET, 3.0, 0.0, 0.0, 0.0)
-    leds = np.array(TARGET) + [[-0.016, 0.0, 0.0], [0.016, 0.0, 0.0]]
+    leds = np.array(TARGET) + [[-0.011, 0.0, 0.0], [0.011, 0.0, 0.0]]
     image = np.rint(render(view, leds, 0.01, [4040.0, 40040.0], samples=100)).astype(np.uint32)
     frame = frame_of(view, leds, image)
     pixels = gathered(frame, Pose(np.array(view.position_m), view.R_cam_world))

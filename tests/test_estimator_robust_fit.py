@@ -14,6 +14,7 @@ from estimator.methods.gravity_fit import _from_triples as from_triples
 from estimator.methods.gravity_fit import agreement, ambiguous
 from estimator.solvers.reprojection import Fit, Observations, observe
 from estimator.solvers.robust_fit import Consensus, consensus, minima
+from estimator.solvers.robust_fit import _snooped as data_snooping
 
 LEDS = grid(3, 3, 0.3, (3, 2, 3.0))
 VIEW = view_of((3, 2, 3.0), 2.8, 25, -15, 40, (4000, 3000, 3000.0))
@@ -57,6 +58,23 @@ def test_three_spots_alone_cannot_widen_their_covariance() -> None:
     """Six numbers for six parameters leave nothing to judge by."""
     lone = Consensus(fitted(1e3, np.full(3, 300.0)), (), np.ones(3, dtype=bool), gravity=False)
     np.testing.assert_allclose(lone.covariance_m2, np.diag([1.0, 2.0, 3.0]))
+
+
+@pytest.mark.parametrize(("spots", "ratio"), [(6, 8 / 6), (4, 4 / 2), (3, 3.0)])
+def test_errors_by_the_residuals_give_the_covariance_of_student_s_distribution(spots: int, ratio: float) -> None:
+    """n / (n - 2) with n = 2 spots + 2 of gravity - 6 degrees of freedom, at least three, whatever chi-square is."""
+    best = fitted(1e3, np.full(spots, 1e3 / spots))
+    found = Consensus(best, (), np.ones(spots, dtype=bool), gravity=True, adapted=True)
+    np.testing.assert_allclose(found.covariance_m2, ratio * np.diag([1.0, 2.0, 3.0]), rtol=1e-12)
+
+
+@pytest.mark.parametrize("adapted", [False, True])
+def test_an_unchecked_focal_length_adds_its_covariance_unscaled(adapted: bool) -> None:
+    """Neither the scale of chi-square, 500, nor Student's, 2, applies to it."""
+    best, unchecked_m2 = fitted(2e3, np.full(4, 500.0)), np.outer([0.0, 1.0, 20.0], [0.0, 1.0, 20.0])
+    found = Consensus(best, (), np.ones(4, dtype=bool), True, adapted=adapted, unchecked_m2=unchecked_m2)
+    scale = 2.0 if adapted else 500.0
+    np.testing.assert_allclose(found.covariance_m2, scale * np.diag([1.0, 2.0, 3.0]) + unchecked_m2, rtol=1e-12)
 
 
 @pytest.mark.parametrize(("sigma_px", "what"), [(1.0, "noise"), (0.05, "the image model")])
@@ -107,6 +125,15 @@ def test_the_worst_spot_alone_is_removed() -> None:
     assert np.flatnonzero(~found.inliers).tolist() == [3, 6]
 
 
+def test_data_snooping_leaves_out_the_spot_that_is_off() -> None:
+    """From all nine spots, of 0.2 px, and one of them off by 4 px, which pulls the fit."""
+    offsets = np.zeros((9, 2))
+    offsets[4] = (2.4, -3.2)
+    found = data_snooping(observed(offsets, np.full(9, 0.2)), TRUTH, np.ones(9, dtype=bool), adapted=False)
+    assert found is not None
+    assert np.flatnonzero(~found[2]).tolist() == [4]
+
+
 def sure_of(found: Consensus) -> float:
     """Squared error of the position in units of the covariance."""
     error = found.best.pose.position_m - VIEW.position_m
@@ -128,6 +155,18 @@ def test_four_spots_are_not_most_of_eight(spots: int) -> None:
     exact = agreed(observed(offsets, np.full(9, 0.02)))
     assert np.flatnonzero(~exact.inliers).tolist() == [1, 3, 7]
     assert not exact.adapted
+
+
+def test_four_sharp_spots_are_not_most_of_eight() -> None:
+    """Four spots of 0.02 px hold the fit against four of 5 px, off by 100 px or 20 sigma each: half of all pass."""
+    offsets, sigma_px = np.zeros((9, 2)), np.full(9, 0.02)
+    offsets[[1, 3, 5, 7]] = 100 * np.array([[0.6, 0.8], [-0.8, 0.6], [0.0, -1.0], [0.8, -0.6]])
+    sigma_px[[1, 3, 5, 7]] = 5.0
+    seen = observed(offsets, sigma_px)
+    with pytest.raises(EstimationFailure, match="position: no pose explains gravity and most of the spots"):
+        agreed(seen.only(np.arange(9) != 4))
+    found = agreed(seen)
+    assert np.flatnonzero(~found.inliers).tolist() == [1, 3, 5, 7]
 
 
 def test_three_spots_do_not_outvote_a_fourth() -> None:

@@ -324,13 +324,15 @@ def test_intervals_by_devices_are_as_wide_as_frames_that_share_errors_make_them(
 def test_a_resample_draws_whole_devices() -> None:
     """Two devices of equal errors, 1 and 3: an RMSE of a resample is 1, sqrt(5) or 3, so the limits are 1 and 3.
 
-    In two maps with one device each as well. One device of many frames is resampled by frames.
+    In two maps with one device each as well. By frames, all 16 of a resample would be of one device once in 2^16. One
+    device of many frames is resampled by frames.
     """
-    for of_map in ([0, 0, 0, 0], [0, 0, 1, 1]):
-        found = rmse_interval([1.0, 1.0, 3.0, 3.0], Groups.of([0, 0, 1, 1], of_map))
+    errors, of_device = [1.0] * 8 + [3.0] * 8, [0] * 8 + [1] * 8
+    for of_map in ([0] * 16, of_device):
+        found = rmse_interval(errors, Groups.of(of_device, of_map))
         assert found is not None
         assert (found.low_m, found.high_m) == (pytest.approx(1.0), pytest.approx(3.0))
-        assert median_interval([1.0, 1.0, 3.0, 3.0], Groups.of([0, 0, 1, 1], of_map)) == found
+        assert median_interval(errors, Groups.of(of_device, of_map)) == found
     values = np.random.default_rng(3).normal(size=30).tolist()
     assert rmse_interval(values, Groups.of([4] * 30, [0] * 30)) == rmse_interval(values)
 
