@@ -178,7 +178,7 @@ def median_errors_m(directory: Path) -> dict[str, float]:
 
 @pytest.mark.slow
 def test_a_distorted_set_is_estimated_as_well_as_a_straight_one(tmp_path: Path) -> None:
-    """The same poses and LEDs through a lens that moves image points at the corners, 250 px off the centre, by 7 px.
+    """Nearly the same poses through a lens that moves image points at the corners, 250 px off the centre, by 7 px.
 
     Taking it out stretches an error at the corner by 1 / (1 - 3 |k1| r^2) = 1.09 and moves the centroid of a disc of
     5 px by 4 |k1| r (5 / 1500)^2 / 4 = 2e-6, 0.003 px, below the shot noise of some 0.01 px. What remains is other
@@ -191,7 +191,9 @@ def test_a_distorted_set_is_estimated_as_well_as_a_straight_one(tmp_path: Path) 
     poses = [
         pq.read_table(tmp_path / name / "truth.parquet")["position_m"].to_pylist() for name in ("straight", "bent")
     ]
-    assert poses[0] == poses[1]
+    # A pose images its target at a pixel drawn at random: the lens turns that into 7 px or less, at 3 m 14 mm.
+    assert np.abs(np.subtract(*poses)).max() < 7 / 1500 * 3.0
+    assert poses[0] != poses[1]
     straight, found = median_errors_m(tmp_path / "straight"), median_errors_m(tmp_path / "bent")
     path = tmp_path / "bent/dataset.json"
     told = json.loads(path.read_text())
