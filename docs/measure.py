@@ -57,10 +57,10 @@ class Measurement:
     out: Path
     workers: int
 
-    def dataset(self, name: str, recipe: str, overrides: Mapping[str, object] | None = None) -> Path:
+    def dataset(self, name: str, recipe: str, overrides: Mapping[str, object] | None = None, scale: int = 1) -> Path:
         """The folder of a dataset, made if it is not there."""
         self._say(name)
-        vr.generate(recipe, self.out / name, overrides=overrides, workers=self.workers)
+        vr.generate(recipe, self.out / name, overrides=overrides, workers=self.workers, scale=scale)
         return self.out / name
 
     def scores(self, folder: Path, variants: Sequence[str]) -> pd.DataFrame:

@@ -4,13 +4,14 @@
 
 Sections: `stated` (the three levels), `wrong_identities` (a tenth of the identities exchanged), `stated_wrongly`
 (standard deviations stated three times too large and too small), `unstated` (a map or a focal length that is wrong, and
-nothing stated). Datasets that are complete are kept, interrupted ones continued; estimates are made anew.
+nothing stated), `hall` (luminaires of 60 cm), `effects` (a halo, uneven faces, small spots). Datasets that are complete
+are kept, interrupted ones continued; estimates are made anew.
 """
 
 import argparse
 import json
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,8 @@ from estimator.evaluate.score import VariantScore
 LEVELS = ("laboratory", "calibrated", "as_sold")
 FITS = ("gravity-fit", "up2p", "pnp", "huynh2016")
 WRONG_SHARE = 0.1
+SMALL_SPOT_SCALES = (4, 8, 20, 40)
+"""LED images of office200 are some 58 px high at full size, 14 to 1.5 px here."""
 HEADINGS = ("variant", "failed", "with 4 LEDs or more", "RMSE (95 % interval)", "RMSE / bound", "NEES (99 % interval)")
 
 
@@ -43,6 +46,12 @@ class Chosen:
         name = "-".join([level, str(self.frames), *(f"{key}={value}" for key, value in overrides.items())])
         changes = {f"belief.{key}": value for key, value in overrides.items()}
         return self.measurement.dataset(name, level, {"poses.count": self.frames, **changes})
+
+    def scaled(self, recipe: str, scale: int, overrides: Mapping[str, object] | None = None) -> Path:
+        """The set of a recipe with `scale` x `scale` pixels in one; scale and overrides are in its name."""
+        overrides = overrides or {}
+        name = "-".join([recipe, *(f"{key}={value}" for key, value in overrides.items()), f"scale={scale}"])
+        return self.measurement.dataset(name, recipe, overrides, scale)
 
     def print_scores(self, folder: Path) -> None:
         """Estimate, score, and print a row a variant."""
@@ -162,6 +171,41 @@ def unstated(chosen: Chosen) -> None:
         chosen.print_scores(folder)
 
 
+def hall(chosen: Chosen) -> None:
+    """Luminaires of 60 x 60 cm, all exact: full size, and four pixels by four in one."""
+    for scale in (1, 4):
+        figure("scale", scale)
+        chosen.print_scores(chosen.scaled("hall", scale))
+
+
+def effects(chosen: Chosen) -> None:
+    """A halo of 5 % of the light, faces with a gradient of 4 %, and small spots; all else is exact."""
+    count = {"poses.count": chosen.frames}
+    figure("effect", "halo of 5 %")
+    chosen.print_scores(chosen.scaled("office200", 1, {**count, "camera.glare.share": 0.05}))
+    gradient = chosen.scaled("office200", 1, {**count, "belief.leds.gradient_percent": 4.0})
+    figure("effect", "gradient of 4 %, stated")
+    chosen.print_scores(gradient)
+    figure("effect", "gradient of 4 %, nothing stated")
+    silent = copied(gradient, f"silent-{gradient.name}")
+    device = json.loads((silent / "dataset.json").read_text(encoding="utf-8"))
+    (silent / "dataset.json").write_text(json.dumps(_with_nothing_stated(device)), encoding="utf-8")
+    chosen.print_scores(silent)
+    for scale in SMALL_SPOT_SCALES:
+        figure("effect", f"scale {scale}")
+        chosen.print_scores(chosen.scaled("office200", scale, count))
+
+
+def _with_nothing_stated(device: dict[str, Any]) -> dict[str, Any]:
+    """dataset.json of a device that is told no standard deviation but its accelerometer's."""
+    for camera in device["cameras"].values():
+        camera["uncertainty"] = None
+    for led in device["led_map"]:
+        led.update({key: None for key in led if "sigma" in key})
+    device["accelerometer"].update({"device_error_deg": None, "shot_error_deg": None})
+    return {**device, "luminaires": [], "map_datum": None}
+
+
 def copied(dataset: Path, name: str) -> Path:
     """A copy of a dataset beside it, of which the frames are linked; an older copy is replaced."""
     folder = dataset.parent / name
@@ -174,7 +218,7 @@ def copied(dataset: Path, name: str) -> Path:
 
 
 SECTIONS: dict[str, Callable[[Chosen], None]] = {
-    section.__name__: section for section in (stated, wrong_identities, stated_wrongly, unstated)
+    section.__name__: section for section in (stated, wrong_identities, stated_wrongly, unstated, hall, effects)
 }
 
 
