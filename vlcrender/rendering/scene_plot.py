@@ -47,6 +47,14 @@ def show_pose(scene: Scene, camera: Camera) -> PosedCamera:
     return best
 
 
+def footprint_m(posed: PosedCamera, z_m: float) -> NDArray[np.float64]:
+    """What a camera sees of the plane at height z_m: x and y of the four corners of its image, (4, 2) metres."""
+    size = np.array([posed.camera.width_px, posed.camera.height_px])
+    rays = posed.rays_world(size * np.array([[0, 0], [1, 0], [1, 1], [0, 1]]))
+    reach = (z_m - posed.position_m[2]) / rays[:, 2]
+    return np.asarray(posed.position_m[:2] + rays[:, :2] * reach[:, None])
+
+
 def draw(scene: Scene, camera: Camera, path: Path, reference: bool = False) -> None:
     """Write a PNG with the floor plan and the image from `show_pose`.
 
@@ -67,7 +75,6 @@ def draw(scene: Scene, camera: Camera, path: Path, reference: bool = False) -> N
 
 
 def _draw_plan(axes: Axes, scene: Scene, posed: PosedCamera) -> EllipseCollection:
-    camera, pose = posed.camera, posed.pose
     x_m, y_m, z_m = scene.room_m
     undersides = [s for s in scene.surfaces if s.name.endswith("underside")]
     axes.add_patch(Rectangle((0, 0), x_m, y_m, fill=False, lw=1.5))
@@ -95,12 +102,9 @@ def _draw_plan(axes: Axes, scene: Scene, posed: PosedCamera) -> EllipseCollectio
     )
     discs.set_array(leds.luminances_cd_m2)
     axes.add_collection(discs)
-    size = np.array([camera.width_px, camera.height_px])
-    rays = posed.rays_world(size * np.array([[0, 0], [1, 0], [1, 1], [0, 1]]))
-    reach = (scene.leds.centers_m[:, 2].mean() - pose.position_m[2]) / rays[:, 2]
-    footprint = np.array(pose.position_m[:2]) + rays[:, :2] * reach[:, None]
+    footprint = footprint_m(posed, float(scene.leds.centers_m[:, 2].mean()))
     axes.add_collection(PolyCollection([footprint], facecolors="none", edgecolors="tab:blue", linewidths=1.5))
-    axes.plot(*pose.position_m[:2], "+", color="tab:blue", ms=10)
+    axes.plot(*posed.pose.position_m[:2], "+", color="tab:blue", ms=10)
     axes.set(
         xlim=(-0.02 * x_m, 1.02 * x_m),
         ylim=(1.02 * y_m, -0.02 * y_m),
