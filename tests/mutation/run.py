@@ -40,6 +40,10 @@ OUT = ROOT / "out/mutants"
 PACKAGES = ("vlcrender", "estimator")
 MAX_TEST_S = 240.0
 """Recorded time of the tests that one mutant is held against; the quickest are taken."""
+NEAR = 0.1
+"""Tests of a module find most of its mutants: their times are weighted by this."""
+BAKING = tuple(f"vlcrender/{floor}" for floor in ("light", "scene", "camera", "config", "core", "sensor"))
+"""Mutants here may change the light of rooms; all others share one cache of it."""
 PATIENCE = 4.0
 """A mutant that takes this many times the recorded time, and a minute, hangs: killed."""
 
@@ -128,14 +132,18 @@ class Map:
                 lines.setdefault(line, set()).update(tests)
 
     def tests(self, file: str, line: int) -> tuple[list[str], float]:
-        """Tests that execute a line, those of its module first, then the quickest, and their time.
+        """Tests that execute a line, the quickest first (one of its module counts as NEAR of its time), and their time.
 
         For a line that runs at import, the tests of the whole file.
         """
         lines = self._rows.get(file, {})
         near = lines.get(line) or set().union(*lines.values()) if lines else set()
         module = Path(file).stem
-        ordered = sorted(near, key=lambda test: (module not in test.split("::")[0], self._times.get(test, 1.0), test))
+
+        def cost(test: str) -> float:
+            return self._times.get(test, 1.0) * (NEAR if module in test.split("::")[0] else 1.0)
+
+        ordered = sorted(near, key=lambda test: (cost(test), test))
         total, taken = 0.0, []
         for test in ordered:
             total += self._times.get(test, 1.0)
@@ -212,7 +220,8 @@ def judge(mutant: Mutant, tests: Map, sandboxes: Sandboxes) -> dict[str, object]
     try:
         target.write_text(mutant.source)
         command = [sys.executable, "-P", "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "--no-header", *names]
-        with tempfile.TemporaryDirectory() as cache:
+        with tempfile.TemporaryDirectory() as own:
+            cache = own if mutant.file.startswith(BAKING) else str(OUT / "cache")
             done = subprocess.run(
                 command,
                 cwd=root,
