@@ -17,6 +17,7 @@ from vlcrender.camera.rig import Mounted
 from vlcrender.camera.shutter import Shutter
 from vlcrender.config.toml_model import Settings
 from vlcrender.dataset.belief import CAMERA_PARAMETERS, CameraSigmas, Sigmas
+from vlcrender.dataset.downlink_entry import DownlinkEntry
 from vlcrender.scene.as_built import Luminaires
 from vlcrender.scene.leds import Leds
 from vlcrender.sensor.accelerometer import Imu, TiltError
@@ -342,6 +343,7 @@ class DatasetFile(Settings):
     """None where devices know of LEDs only what the LEDs send."""
     luminaires: tuple[LuminaireEntry, ...]
     map_datum: MapDatumEntry | None
+    downlink: DownlinkEntry | None
     room_m: Triple
     provenance: dict[str, Any]
 
