@@ -46,6 +46,7 @@ from vlcrender.dataset.true_world import built_leds, device_of_pose, device_rows
 from vlcrender.dataset.verify import extra_folders, missing_files, verify
 from vlcrender.errors import InputError
 from vlcrender.light.lightmap import Lightmap, bake, room_mesh
+from vlcrender.modulation.flicker import flicker_of, flicker_warning
 from vlcrender.rendering.electron_rates import ElectronRates
 from vlcrender.rendering.renderer import check_inside, share_cores
 from vlcrender.scene.as_built import luminaires_of
@@ -105,6 +106,9 @@ def generate(
     # Into the cache, from which every worker reads it.
     light = bake(plan.scene, progress=lambda step, share: report(Progress(step, share, 1.0)))
     _warn_of_coarse_steps(plan, light)
+    flickers = flicker_warning(flicker_of(plan.scene.leds.transmitters))
+    if flickers is not None:
+        warn_once(log, f"scene: {flickers}")
     with (directory / "journal.jsonl").open("a", encoding="utf-8") as journal:
         for record in _records(job, missing, workers, scheduler):
             done[record.frame] = record
