@@ -106,9 +106,7 @@ def generate(
     # Into the cache, from which every worker reads it.
     light = bake(plan.scene, progress=lambda step, share: report(Progress(step, share, 1.0)))
     _warn_of_coarse_steps(plan, light)
-    flickers = flicker_warning(flicker_of(plan.scene.leds.transmitters))
-    if flickers is not None:
-        warn_once(log, f"scene: {flickers}")
+    _warn_of_flicker(plan)
     with (directory / "journal.jsonl").open("a", encoding="utf-8") as journal:
         for record in _records(job, missing, workers, scheduler):
             done[record.frame] = record
@@ -140,6 +138,13 @@ def _warn_of_coarse_steps(plan: Plan, light: Lightmap) -> None:
             f"{steps:.2f} of it: below {MIN_NOISE_STEPS} neighbouring pixels have the same rounding error; raise "
             "sensor.iso, or sensor.bits with a smaller sensor.gain_e_per_dn, or choose a smaller --scale",
         )
+
+
+def _warn_of_flicker(plan: Plan) -> None:
+    """Warn where LEDs of the scene flicker beyond the low risk of IEEE 1789."""
+    warning = flicker_warning(flicker_of(plan.scene.leds.transmitters))
+    if warning is not None:
+        warn_once(log, f"{plan.recipe.scene}: {warning}")
 
 
 def _records(job: Job, frames: list[int], workers: int, scheduler: str | None) -> Iterator[FrameRecord]:
