@@ -24,6 +24,7 @@ from vlcrender.core.warn_once import warn_once
 from vlcrender.dataset.downlink_entry import downlink_entry
 from vlcrender.dataset.files import FRAMES, sha256_of, whole_file, write_json
 from vlcrender.dataset.frame_job import Job, make_frame, make_frames, poses_of
+from vlcrender.dataset.light_checks import light_warnings
 from vlcrender.dataset.progress import FRAMES_STAGE, Progress, ProgressCallback
 from vlcrender.dataset.recipe import Plan, Recipe
 from vlcrender.dataset.schema import (
@@ -48,6 +49,7 @@ from vlcrender.dataset.true_world import built_leds, device_of_pose, device_rows
 from vlcrender.dataset.verify import extra_folders, missing_files, verify
 from vlcrender.errors import InputError
 from vlcrender.light.lightmap import Lightmap, bake, room_mesh
+from vlcrender.modulation.flicker import flicker_of, flicker_warning
 from vlcrender.rendering.electron_rates import ElectronRates
 from vlcrender.rendering.readout import RollingPoses
 from vlcrender.rendering.renderer import check_inside, share_cores
@@ -110,6 +112,9 @@ def generate(
     # Into the cache, from which every worker reads it.
     light = bake(plan.scene, progress=lambda step, share: report(Progress(step, share, 1.0)))
     _warn_of_coarse_steps(plan, light)
+    _warn_of_flicker(plan)
+    for warning in light_warnings(plan.recipe, plan.scene):
+        warn_once(log, warning)
     with (directory / "journal.jsonl").open("a", encoding="utf-8") as journal:
         for record in _records(job, _bursts(missing, plan.recipe), workers, scheduler):
             done[record.frame] = record
@@ -141,6 +146,13 @@ def _warn_of_coarse_steps(plan: Plan, light: Lightmap) -> None:
             f"{steps:.2f} of it: below {MIN_NOISE_STEPS} neighbouring pixels have the same rounding error; raise "
             "sensor.iso, or sensor.bits with a smaller sensor.gain_e_per_dn, or choose a smaller --scale",
         )
+
+
+def _warn_of_flicker(plan: Plan) -> None:
+    """Warn where LEDs of the scene flicker beyond the low risk of IEEE 1789."""
+    warning = flicker_warning(flicker_of(plan.scene.leds.transmitters))
+    if warning is not None:
+        warn_once(log, f"{plan.recipe.scene}: {warning}")
 
 
 def _bursts(frames: list[int], recipe: Recipe) -> list[list[int]]:
@@ -305,10 +317,12 @@ def _finish(plan: Plan, directory: Path, provenance: dict[str, Any], records: li
     write_table(directory / "frames.parquet", [record.device for record in records], FrameRow)
     write_table(directory / "truth.parquet", [record.truth for record in records], TruthRow)
     sigmas = luminaires = None
+    told_map = recipe.map == "given"
     if recipe.belief is not None:
         sigmas = recipe.belief.stated_sigmas(recipe.cameras, recipe.accelerometer)
-        luminaires = luminaires_of(scene.settings, scene.leds)
+        luminaires = luminaires_of(scene.settings, scene.leds) if told_map else None
         write_table(directory / "truth_devices.parquet", device_rows(recipe), DeviceTruthRow)
+    if recipe.belief is not None or not told_map:
         write_table(directory / "truth_map.parquet", map_rows(recipe, scene), MapTruthRow)
     dataset = DatasetFile(
         format="vlcrender-dataset",
@@ -322,10 +336,10 @@ def _finish(plan: Plan, directory: Path, provenance: dict[str, Any], records: li
         sensor=SensorEntry(**recipe.sensor.acting()),
         accelerometer=accelerometer_entry(recipe.accelerometer, sigmas),
         gyroscope=gyroscope_entry(recipe.gyroscope),
-        led_map=led_map(scene.leds, luminaires, sigmas),
+        led_map=led_map(scene.leds, luminaires, sigmas) if told_map else None,
         luminaires=() if luminaires is None or sigmas is None else luminaire_entries(luminaires, sigmas),
         map_datum=None if sigmas is None else map_datum_entry(sigmas),
-        downlink=downlink_entry(scene.leds),
+        downlink=downlink_entry(scene.leds, recipe.demodulation),
         room_m=scene.settings.room.size_m,
         provenance=provenance,
     )
