@@ -396,7 +396,7 @@ def test_a_gyroscope_has_the_noise_of_each_shot_and_the_bias_of_its_device(tmp_p
         ]
     )
     assert (biases - true).std(axis=0, ddof=1) == pytest.approx(np.full(3, np.radians(1.0)), rel=5 / np.sqrt(2 * count))
-    own = gyro_rad_s(recipe, quiet, 0, 0) - true
+    own = gyro_rad_s(recipe, gyroscope.model_copy(update={"noise_deg_s": 0.0}), 0, 0) - true
     assert shots.mean(axis=0) == pytest.approx(own, abs=5 * np.radians(0.3) / np.sqrt(count))
 
 
