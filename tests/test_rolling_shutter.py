@@ -1,6 +1,8 @@
 """Rolling shutters: gains of lines against sums over time, the room's flicker, lines of a moving camera, bursts."""
 
+import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,18 +15,21 @@ from vlcrender.api import _renderer
 from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.rig import mounted_cameras
-from vlcrender.camera.roi import Roi
+from vlcrender.camera.roi import RegionImage, Roi
 from vlcrender.camera.vignetting import relative_illumination
 from vlcrender.dataset import frame_job
+from vlcrender.dataset.light_checks import light_warnings
 from vlcrender.dataset.motion import Motion, poses_during
 from vlcrender.dataset.recipe import Plan
-from vlcrender.dataset.schema import FrameRow, TruthRow
+from vlcrender.dataset.schema import FrameRow, MapTruthRow, TruthRow
 from vlcrender.dataset.tables import read_table, write_table
 from vlcrender.dataset.true_world import gyro_rad_s
+from vlcrender.errors import InputError
 from vlcrender.modulation.exposure import LineGains, MeanWave
 from vlcrender.modulation.transmission import led_waves
 from vlcrender.modulation.wave import CosineWave, TwoLevelWave, Wave
-from vlcrender.rendering.expected_image import gain_in
+from vlcrender.rendering.crlb import position_bound_m2
+from vlcrender.rendering.expected_image import LedPatch, gain_in
 from vlcrender.rendering.readout import RollingPoses
 from vlcrender.rendering.renderer import Renderer
 from vlcrender.scene.loader import Scene, load_scene
@@ -254,7 +259,7 @@ def frames_of(folder: Path) -> tuple[list[FrameRow], list[TruthRow]]:
     return read_table(folder / "frames.parquet", FrameRow), read_table(folder / "truth.parquet", TruthRow)
 
 
-BURSTS = ("repeats=2", "burst={frames=3,frame_rate_hz=25.0}", "gyroscope={noise_deg_s=0.3,bias_deg_s=1.0}")
+BURSTS = ("repeats=2", "burst={frames=3,frame_rate_hz=30.0}", "gyroscope={noise_deg_s=0.3,bias_deg_s=1.0}")
 RIG = "rig=[{ name = 'beside', offset_m = [0.1, 0.02, 0.0], tilt_x_deg = 5.0, yaw_deg = 30.0 }]"
 MOTION = "motion={angular_velocity_deg_s=[4.0,-3.0,8.0],linear_velocity_m_s=[0.2,-0.1,0.3]}"
 
@@ -283,8 +288,8 @@ def test_a_burst_is_shot_at_its_frame_rate_and_two_bursts_start_at_random(bursts
     assert [row.pose for row in frames] == [0] * 12 + [1] * 12
     starts_s = np.array([row.start_s for row in frames]).reshape(4, 3, 2)
     assert (starts_s[:, :, 0] == starts_s[:, :, 1]).all()
-    assert starts_s[:, :, 0] - starts_s[:, :1, 0] == pytest.approx(np.tile([0.0, 0.04, 0.08], (4, 1)), abs=1e-12)
-    assert (np.diff(starts_s[:, 0, 0]) > 0.08).all()
+    assert starts_s[:, :, 0] - starts_s[:, :1, 0] == pytest.approx(np.tile([0.0, 1 / 30, 2 / 30], (4, 1)), abs=1e-12)
+    assert (np.diff(starts_s[:, 0, 0]) > 2 / 30).all()
     phases = [led.phase for row in truth[::6] for led in row.leds[:1]]
     assert len({round(phase, 6) for phase in phases if phase is not None}) == 4
 
@@ -545,3 +550,130 @@ def test_verify_tells_a_column_that_contradicts(moving: Path, tmp_path: Path, na
     write_table(folder / "frames.parquet", frames, FrameRow)
     write_table(folder / "truth.parquet", truth, TruthRow)
     assert any(line in problem for problem in vr.verify(folder))
+
+
+def test_the_bound_of_striped_leds_is_that_of_their_lit_lines(tmp_path: Path) -> None:
+    """A direct call with each patch times its gains, in another frame of a burst; expected images are float32, 6e-8."""
+    burst = ("burst={frames=2,frame_rate_hz=30.0}", "poses.count=1", "bound=true", "exposure_s=0.9e-6")
+    plan = plan_of(tmp_path, *ROLLING, *burst)
+    vr.generate(plan, tmp_path / "set")
+    frames, truth = frames_of(tmp_path / "set")
+    bounds = []
+    for number in (0, 1):
+        row = truth[number]
+        assert row.bound_m2 is not None
+        pose = Pose(row.position_m, row.tilt_x_deg, row.tilt_y_deg, row.yaw_deg)
+        (mounted,) = plan.recipe.cameras
+        exposure_s = frames[number].exposure_s
+        waves = led_waves(plan.scene.leds.transmitters, plan.recipe.seed)
+        starts_s = frames[number].start_s + mounted.camera.line_starts_s()
+        gains = LineGains(waves, starts_s, exposure_s)
+        renderer = Renderer(plan.scene)
+
+        def striped(posed: PosedCamera, gains: LineGains = gains, renderer: Renderer = renderer) -> list[LedPatch]:
+            return [
+                replace(
+                    patch,
+                    electrons_per_s=patch.electrons_per_s * gains[patch.led_id][patch.row : patch.roi.end_row],
+                )
+                for patch in renderer.led_patches(posed)
+            ]
+
+        variance = RegionImage(Roi.of_sensor(mounted.camera), pixels(tmp_path / f"set/expected/{number:06d}.exr"))
+        distance_m = float(np.median(np.linalg.norm(plan.scene.leds.centers_m - row.position_m, axis=1)))
+        bound = position_bound_m2(mounted, pose, striped, exposure_s, [variance], distance_m, (0.1, 0.1))
+        assert bound is not None
+        found = np.array(row.bound_m2).reshape(3, 3)
+        assert found == pytest.approx(bound, rel=1e-5, abs=1e-5 * np.trace(bound))
+        bounds.append(np.trace(found))
+    assert abs(bounds[1] / bounds[0] - 1) > 0.01
+
+
+REFUSED = {
+    "overlapping frames": (["burst={frames=2,frame_rate_hz=40.0}"], r"burst.frame_rate_hz = 40: a frame takes 29.9"),
+    "overscan": (['regions={kind="leds",overscan=true}'], r"overscan = true: camera 'main' has a rolling shutter"),
+    "map without pixels": (
+        ['map="sent"'],
+        r'map = "sent": the map comes out of the light; set demodulation = "pixels"',
+    ),
+    "map from codes": (['map="sent"', 'demodulation="pixels"'], r'map = "sent": LEDs of scene .* send "code"'),
+    "bound in motion": (["bound=true", MOTION], r"bound = true: needs a camera at rest; remove \[motion\]"),
+    "bound with glare": (
+        ["bound=true", "camera.glare={share=0.1,radius_um=600.0}"],
+        r"bound = true: is not computed for a lens with glare where light is modulated",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_a_rolling_shutter_cannot_do_is_refused(tmp_path: Path, name: str) -> None:
+    assignments, message = REFUSED[name]
+    shutter = 'camera.shutter={kind="rolling",row_time_us=100.0}'
+    with pytest.raises(InputError, match=message):
+        plan_of(tmp_path, shutter, *assignments)
+
+
+def test_pixels_need_light_that_tells_its_led(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r'demodulation = "pixels": no LED of scene .* transmits what identifies it'):
+        plan_of(tmp_path, 'demodulation="pixels"', downlink='send = "pwm"')
+
+
+def test_a_scale_keeps_the_readout_and_is_refused_where_stripes_would_vanish(tmp_path: Path) -> None:
+    """Chips of 250 us: two binned lines of 100 us are shorter, four are longer."""
+    small = plan_of(tmp_path, *ROLLING, scale=2).recipe.camera
+    assert small.shutter.row_time_s == pytest.approx(200e-6)
+    assert small.line_starts_s().max() == pytest.approx(149 * 200e-6)
+    with pytest.raises(InputError, match=r"--scale 4: a binned line takes 400 us, and the shortest level .* 250 us"):
+        plan_of(tmp_path, *ROLLING, scale=4)
+    assert plan_of(tmp_path, *ROLLING, downlink='send = "steady"', scale=4).recipe.camera.height_px == 75
+
+
+def test_an_image_that_runs_along_with_the_readout_is_refused(sending: Scene, small_camera: Camera) -> None:
+    """600 deg/s moves images by 15 700 px/s, 1.6 px in a row time of 100 us; 120 deg/s by 0.3 px."""
+    camera = Camera(**{**small_camera.model_dump(), "shutter": rolling("down", 100.0)})
+    (mounted,) = mounted_cameras(camera, ())
+    with pytest.raises(
+        InputError, match=r"motion: moves the image by up to 1\.\d+ px from line to line; .* at most 0.5"
+    ):
+        poses_during(Motion(angular_velocity_deg_s=(600.0, 0.0, 0.0)), mounted, POSE, 1e-5, sending)
+    assert poses_during(Motion(angular_velocity_deg_s=(120.0, 0.0, 0.0)), mounted, POSE, 1e-5, sending)
+
+
+def warnings_of(plan: Plan) -> list[str]:
+    return list(light_warnings(plan.recipe, plan.scene))
+
+
+def test_lit_levels_that_saturate_and_bursts_in_step_are_warned_of(tmp_path: Path) -> None:
+    """The brightest LED gives 3 309 electrons in the small camera's frame: lit 6 618 of 4 095; 8 ms are a code."""
+    (warning,) = warnings_of(plan_of(tmp_path, *ROLLING))
+    assert "when lit, gives a pixel 66" in warning
+    assert "4095 saturate it" in warning
+    assert warnings_of(plan_of(tmp_path, *ROLLING, "exposure_s=0.9e-6")) == []
+    dark = ("exposure_s=0.9e-6", "burst={frames=2,frame_rate_hz=25.0}")
+    (warning,) = warnings_of(plan_of(tmp_path, *ROLLING, *dark))
+    assert "a frame takes 5.000 periods of 8 ms" in warning
+    assert warnings_of(plan_of(tmp_path, *ROLLING, "exposure_s=0.9e-6", "burst={frames=2,frame_rate_hz=27.0}")) == []
+
+
+def test_peak_metering_counts_the_mean(tmp_path: Path) -> None:
+    path = scene_file(tmp_path)
+    for share, count in ((0.6, 1), (0.45, 0)):
+        metering = f'exposure={{kind="peak",share_of_saturation={share},max_s=1e-3}}'
+        changes = [c for c in SMALL if "exposure" not in c] + [f"scene={path}", metering, "poses.min_leds=2"]
+        plan = vr.load_recipe(ROOT / "datasets/quickstart.toml", changes)
+        assert len(warnings_of(plan)) == count
+
+
+def test_a_sent_map_is_null_for_the_device_and_sealed_in_the_truth(tmp_path: Path) -> None:
+    packets = ('map="sent"', 'demodulation="pixels"', "poses.count=1")
+    plan = plan_of(tmp_path, *ROLLING, *packets, downlink='send = "packet"\nchip_us = 250.0')
+    vr.generate(plan, tmp_path / "set")
+    dataset = json.loads((tmp_path / "set/dataset.json").read_text(encoding="utf-8"))
+    assert dataset["led_map"] is None
+    assert dataset["luminaires"] == []
+    assert dataset["downlink"]["demodulation"] == "pixels"
+    assert dataset["cameras"]["main"]["shutter"] == rolling("down", 100.0)
+    rows = read_table(tmp_path / "set/truth_map.parquet", MapTruthRow)
+    assert {row.led: row.position_m for row in rows}[4] == (0.9, 1.1, 3.5)
+    assert frames_of(tmp_path / "set")[0][0].spots == ()
+    assert vr.verify(tmp_path / "set") == []
