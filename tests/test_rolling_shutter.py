@@ -677,3 +677,22 @@ def test_a_sent_map_is_null_for_the_device_and_sealed_in_the_truth(tmp_path: Pat
     assert {row.led: row.position_m for row in rows}[4] == (0.9, 1.1, 3.5)
     assert frames_of(tmp_path / "set")[0][0].spots == ()
     assert vr.verify(tmp_path / "set") == []
+
+
+def test_expose_gives_the_bits_of_a_frame_of_a_set(tmp_path: Path) -> None:
+    plan = plan_of(tmp_path, *ROLLING)
+    vr.generate(plan, tmp_path / "set")
+    frames, truth = frames_of(tmp_path / "set")
+    row = truth[1]
+    pose = Pose(row.position_m, row.tilt_x_deg, row.tilt_y_deg, row.yaw_deg)
+    mean = vr.render(plan.scene, plan.recipe.camera, pose, sensor=plan.recipe.sensor)
+    raw = vr.expose(mean, plan.recipe.sensor, frames[1].exposure_s, plan.recipe.seed, frame=1, demodulation="pixels")
+    assert raw.start_s == frames[1].start_s
+    assert np.array_equal(raw.image_dn, pixels(tmp_path / "set/frames/000001.exr"))
+    record = raw.record()
+    assert record["spots"] == []
+    assert record["downlink"]["demodulation"] == "pixels"
+    assert record["start_s"] == frames[1].start_s
+    later = vr.expose(mean, plan.recipe.sensor, frames[1].exposure_s, plan.recipe.seed, frame=1, start_s=0.0)
+    assert not np.array_equal(raw.image_dn, later.image_dn)
+    assert len(later.spots) > 0

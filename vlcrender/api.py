@@ -20,7 +20,7 @@ from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.roi import LedRegions, Roi
 from vlcrender.config.packaged import find_file
 from vlcrender.errors import InputError
-from vlcrender.rendering.expected_image import ExpectedImage, Image
+from vlcrender.rendering.expected_image import ExpectedImage, Gain, Gains, Image
 from vlcrender.scene.loader import Scene
 from vlcrender.sensor.sensor import Sensor
 
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from vlcrender.sensor.accelerometer import Imu, TiltError
 
 ScaleMode = Literal["binned", "same-photons"]
+Demodulation = Literal["given", "pixels"]
 Overrides = Mapping[str, object] | Iterable[str]
 MAX_RENDERERS = 4
 """Renderers that are kept, one for each scene and spectral response; the one used longest ago is dropped first."""
@@ -108,7 +109,11 @@ class RawFrame:
     accelerometer_m_s2: NDArray[np.float64]
     """Reading (3,) of the accelerometer at rest, in camera axes."""
     spots: "tuple[SpotRow, ...]"
-    """Decoded identities: `led`, and a rough pixel `u_px`, `v_px`."""
+    """Decoded identities: `led`, and a rough pixel `u_px`, `v_px`; none with `demodulation` "pixels"."""
+    start_s: float = 0.0
+    """Start of the exposure of the first line, on the rig's clock, s."""
+    demodulation: Demodulation = "given"
+    """Whether identities are given, or have to be decoded from the pixels."""
 
     @property
     def image_dn(self) -> NDArray[np.uint32]:
@@ -120,19 +125,24 @@ class RawFrame:
     def record(self) -> dict[str, Any]:
         """The frame in the words of datasets/FORMAT.md, for `estimator.frame`; nothing of the truth is in it.
 
-        Keys: `camera`, `sensor`, `accelerometer` and `led_map` as in dataset.json, `exposure_s`, `accelerometer_m_s2`
-        and `spots` as in frames.parquet, and `parts`: `row`, `column` and `image_dn` of each region.
+        Keys: `camera`, `sensor`, `accelerometer`, `led_map` and `downlink` as in dataset.json, `exposure_s`, `start_s`,
+        `accelerometer_m_s2` and `spots` as in frames.parquet, and `parts`: `row`, `column` and `image_dn` of each
+        region.
         """
         from vlcrender.camera.rig import mounted_cameras
+        from vlcrender.dataset.downlink_entry import downlink_entry
         from vlcrender.dataset.schema import SensorEntry, accelerometer_entry, camera_entry, led_map
 
         (mounted,) = mounted_cameras(self.camera, ())
+        downlink = downlink_entry(self.scene.leds, self.demodulation)
         return {
             "camera": camera_entry(mounted).model_dump(mode="json"),
             "sensor": SensorEntry(**self.sensor.acting()).model_dump(mode="json"),
             "accelerometer": accelerometer_entry(self.accelerometer).model_dump(mode="json"),
             "led_map": [entry.model_dump(mode="json") for entry in led_map(self.scene.leds)],
+            "downlink": None if downlink is None else downlink.model_dump(mode="json"),
             "exposure_s": self.exposure_s,
+            "start_s": self.start_s,
             "accelerometer_m_s2": self.accelerometer_m_s2.tolist(),
             "spots": [spot.model_dump() for spot in self.spots],
             "parts": [
@@ -180,6 +190,8 @@ def render(
 ) -> ExpectedFrame:
     """Render the expected image: mean photoelectrons a second of every pixel, without noise, and the truth.
 
+    Light is its mean in time, whatever the LEDs transmit: `expose` gives the lines of a frame their share.
+
     Of the `sensor`, by default `Sensor()`, quantum efficiency, mosaic and crosstalk count. With `regions` the regions
     around the LEDs are rendered alone. The scene's light is computed once and kept in the cache folder; renderers are
     kept for each scene object and spectral response. Raises InputError if the camera is not inside the room, or if
@@ -188,7 +200,8 @@ def render(
     sensor = sensor or Sensor()
     if regions is not None and regions.overscan and camera.distortion is not None:
         raise InputError("regions.overscan = true: a camera with distortion is not defined far beyond its sensor")
-    image = _renderer(scene, sensor).expected_image(PosedCamera(camera, pose), regions)
+    modulated = any(transmitter.modulated for transmitter in scene.leds.transmitters)
+    image = _renderer(scene, sensor).expected_image(PosedCamera(camera, pose), regions, room_apart=modulated)
     return ExpectedFrame(image.parts, scene, camera, pose, sensor, regions)
 
 
@@ -200,16 +213,24 @@ def expose(
     accelerometer: "TiltError | Imu | None" = None,
     *,
     frame: int = 0,
+    start_s: float | None = None,
+    demodulation: Demodulation = "given",
 ) -> RawFrame:
     """Expose an expected image: noise, saturation and quantization of a sensor, as digital numbers.
 
     Noise depends on `seed`, `frame` and the pixel: the result has the bits of frame number `frame` of a dataset with
-    this seed, one camera and no repeats. `accelerometer` is `TiltError()` by default, with 0.1 deg of error. If the
+    this seed, one camera, no repeats and no bursts. Where LEDs of the scene are modulated, clocks and phases of their
+    waves depend on `seed`, and each line of the shutter `mean.camera.shutter` has its part of the waves in an exposure
+    that starts at `start_s` on the rig's clock; where not given, at the start of that frame of the dataset.
+    `accelerometer` is `TiltError()` by default, with 0.1 deg of error. If the
     quantum efficiency, mosaic or crosstalk of `sensor` differs from those that `mean` was rendered with, the view is
-    rendered again with the sensor's. Raises InputError for an exposure time or a seed out of range.
+    rendered again with the sensor's. Raises InputError for an exposure time, a seed or a start out of range.
     """
     from vlcrender.core.random_keys import random_key, stream
     from vlcrender.dataset.downlink import decoded_spots
+    from vlcrender.dataset.timeline import start_of_burst_s
+    from vlcrender.modulation.exposure import LineGains, MeanWave
+    from vlcrender.modulation.transmission import led_waves
     from vlcrender.sensor.accelerometer import TiltError
     from vlcrender.sensor.signal_chain import expose as digital_numbers
 
@@ -222,13 +243,27 @@ def expose(
     if _spectral_response(sensor) != _spectral_response(mean.sensor):
         mean = render(mean.scene, mean.camera, mean.pose, sensor=sensor, regions=mean.regions)
     device = accelerometer or TiltError()
+    leds, camera = mean.scene.leds, mean.camera
+    waves = led_waves(leds.transmitters, int(seed))
+    gains: Gains | None = None
+    room_gain: Gain = 1.0
+    starts_s = camera.line_starts_s()
+    if start_s is None:
+        timed = waves or camera.shutter.kind == "rolling"
+        start_s = start_of_burst_s(int(seed), int(frame), float(starts_s.max())) if timed else 0.0
+    if not isfinite(start_s):
+        raise InputError(f"start_s = {start_s}: has to be a finite number of seconds")
+    if waves:
+        gains = LineGains(waves, start_s + starts_s, exposure_s)
+        room = MeanWave.of(waves, dict(zip(leds.ids.tolist(), leds.fluxes_lm.tolist(), strict=True)))
+        room_gain = room.mean(start_s + starts_s, exposure_s)
     noise = random_key(int(seed), int(frame), "shot-noise")
     parts = tuple(
         RawRegion(
             part.roi,
             digital_numbers(
                 sensor,
-                part.expected_electrons(exposure_s),
+                part.expected_electrons(exposure_s, gains, room_gain),
                 noise,
                 part.roi.row,
                 part.roi.column,
@@ -238,6 +273,8 @@ def expose(
         for part in mean.parts
     )
     spots = decoded_spots(mean.parts, mean.camera.width_px, stream(int(seed), int(frame), "demodulator"))
+    if demodulation == "pixels":
+        spots = ()
     return RawFrame(
         mean.scene,
         mean.camera,
@@ -247,6 +284,8 @@ def expose(
         parts,
         device.reading_m_s2(mean.pose, stream(int(seed), int(frame), "accelerometer")),
         tuple(spots),
+        start_s,
+        demodulation,
     )
 
 
