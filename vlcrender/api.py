@@ -25,6 +25,7 @@ from vlcrender.scene.loader import Scene
 from vlcrender.sensor.sensor import Sensor
 
 if TYPE_CHECKING:
+    from vlcrender.dataset.downlink_entry import Demodulation
     from vlcrender.dataset.error_budget import ErrorBudget
     from vlcrender.dataset.progress import ProgressCallback
     from vlcrender.dataset.recipe import Plan
@@ -34,11 +35,12 @@ if TYPE_CHECKING:
     from vlcrender.sensor.accelerometer import Imu, TiltError
 
 ScaleMode = Literal["binned", "same-photons"]
-Demodulation = Literal["given", "pixels"]
 Overrides = Mapping[str, object] | Iterable[str]
 MAX_RENDERERS = 4
 """Renderers that are kept, one for each scene and spectral response; the one used longest ago is dropped first."""
 MAX_EXPOSURE_S = 100.0
+MAX_START_S = 1e7
+"""Latest start of a frame: the phase of a wave of 1 ms is then known to 1e-6 periods."""
 MAX_SEED = 2**63
 
 
@@ -114,9 +116,9 @@ class RawFrame:
     spots: "tuple[SpotRow, ...]"
     """Decoded identities: `led`, and a rough pixel `u_px`, `v_px`; none with `demodulation` "pixels"."""
     start_s: float = 0.0
-    """Start of the exposure of the first line, on the rig's clock, s."""
-    demodulation: Demodulation = "given"
-    """Whether identities are given, or have to be decoded from the pixels."""
+    """Start of the exposure of the first line that is read, by the clock of the waves of the LEDs."""
+    demodulation: "Demodulation" = "given"
+    """Whether identities are given, or a receiver has to read them from the pixels."""
 
     @property
     def image_dn(self) -> NDArray[np.uint32]:
@@ -193,8 +195,7 @@ def render(
 ) -> ExpectedFrame:
     """Render the expected image: mean photoelectrons a second of every pixel, without noise, and the truth.
 
-    Light is its mean in time, whatever the LEDs transmit: `expose` gives the lines of a frame their share.
-
+    Where LEDs transmit, this is the mean over time: `expose` adds their waves.
     Of the `sensor`, by default `Sensor()`, quantum efficiency, mosaic and crosstalk count. With `regions` the regions
     around the LEDs are rendered alone. The scene's light is computed once and kept in the cache folder; renderers are
     kept for each scene object and spectral response. Raises InputError if the camera is not inside the room, or if
@@ -216,51 +217,40 @@ def expose(
     accelerometer: "TiltError | Imu | None" = None,
     *,
     frame: int = 0,
-    start_s: float | None = None,
-    demodulation: Demodulation = "given",
+    start_s: float = 0.0,
+    demodulation: "Demodulation" = "given",
 ) -> RawFrame:
     """Expose an expected image: noise, saturation and quantization of a sensor, as digital numbers.
 
     Noise depends on `seed`, `frame` and the pixel: the result has the bits of frame number `frame` of a dataset with
-    this seed, one camera, no repeats and no bursts. Where LEDs of the scene are modulated, clocks and phases of their
-    waves depend on `seed`, and each line of the shutter `mean.camera.shutter` has its part of the waves in an exposure
-    that starts at `start_s` on the rig's clock; where not given, at the start of that frame of the dataset.
-    `accelerometer` is `TiltError()` by default, with 0.1 deg of error. If the
-    quantum efficiency, mosaic or crosstalk of `sensor` differs from those that `mean` was rendered with, the view is
-    rendered again with the sensor's. Raises InputError for an exposure time, a seed or a start out of range.
+    this seed, one camera and no repeats. Where LEDs of the scene transmit, the exposure of the first line starts
+    `start_s` after the start of their waves (`start_s` of that frame in frames.parquet); clocks and phases follow from
+    `seed`. With `demodulation` "pixels" no identities are given. `accelerometer` is `TiltError()` by default, with
+    0.1 deg of error. If the quantum efficiency, mosaic or crosstalk of `sensor` differs from those that `mean` was
+    rendered with, the view is rendered again with the sensor's. Raises InputError for a time, a seed or a demodulation
+    that is not allowed.
     """
     from vlcrender.core.random_keys import random_key, stream
     from vlcrender.dataset.downlink import decoded_spots
-    from vlcrender.dataset.timeline import start_of_burst_s
-    from vlcrender.modulation.exposure import LineGains, MeanWave
-    from vlcrender.modulation.transmission import led_waves
     from vlcrender.sensor.accelerometer import TiltError
     from vlcrender.sensor.signal_chain import expose as digital_numbers
 
     exposure_s = float(exposure_s)
     if not (isfinite(exposure_s) and 0 < exposure_s <= MAX_EXPOSURE_S):
         raise InputError(f"exposure_s = {exposure_s:g}: has to be above 0 and at most {MAX_EXPOSURE_S:g}")
+    start_s = float(start_s)
+    if not (isfinite(start_s) and 0 <= start_s <= MAX_START_S):
+        raise InputError(f"start_s = {start_s:g}: has to be from 0 to {MAX_START_S:g}")
+    if demodulation not in ("given", "pixels"):
+        raise InputError(f'demodulation = "{demodulation}": has to be "given" or "pixels"')
     for name, number in (("seed", seed), ("frame", frame)):
         if not 0 <= int(number) < MAX_SEED:
             raise InputError(f"{name} = {number}: has to be an integer from 0 to 2**63 - 1")
     if _spectral_response(sensor) != _spectral_response(mean.sensor):
         mean = render(mean.scene, mean.camera, mean.pose, sensor=sensor, regions=mean.regions)
     device = accelerometer or TiltError()
-    leds, camera = mean.scene.leds, mean.camera
-    waves = led_waves(leds.transmitters, int(seed))
-    gains: Gains | None = None
-    room_gain: Gain = 1.0
-    starts_s = camera.line_starts_s()
-    if start_s is None:
-        timed = waves or camera.shutter.kind == "rolling"
-        start_s = start_of_burst_s(int(seed), int(frame), float(starts_s.max())) if timed else 0.0
-    if not isfinite(start_s):
-        raise InputError(f"start_s = {start_s}: has to be a finite number of seconds")
-    if waves:
-        gains = LineGains(waves, start_s + starts_s, exposure_s)
-        room = MeanWave.of(waves, dict(zip(leds.ids.tolist(), leds.fluxes_lm.tolist(), strict=True)))
-        room_gain = room.mean(start_s + starts_s, exposure_s)
     noise = random_key(int(seed), int(frame), "shot-noise")
+    gains, room_gain = _gains(mean, exposure_s, int(seed), start_s)
     parts = tuple(
         RawRegion(
             part.roi,
@@ -275,9 +265,9 @@ def expose(
         )
         for part in mean.parts
     )
-    spots = decoded_spots(mean.parts, mean.camera.width_px, stream(int(seed), int(frame), "demodulator"))
-    if demodulation == "pixels":
-        spots = ()
+    spots: tuple[SpotRow, ...] = ()
+    if demodulation == "given":
+        spots = decoded_spots(mean.parts, mean.camera.width_px, stream(int(seed), int(frame), "demodulator"))
     return RawFrame(
         mean.scene,
         mean.camera,
@@ -286,10 +276,24 @@ def expose(
         exposure_s,
         parts,
         device.reading_m_s2(mean.pose, stream(int(seed), int(frame), "accelerometer")),
-        tuple(spots),
+        spots,
         start_s,
         demodulation,
     )
+
+
+def _gains(mean: ExpectedFrame, exposure_s: float, seed: int, start_s: float) -> tuple[Gains | None, Gain]:
+    """Gains of the LEDs and of the room's light in an exposure, for each line; None and 1 where all light is steady."""
+    from vlcrender.modulation.exposure import LineGains, MeanWave
+    from vlcrender.modulation.transmission import led_waves
+
+    leds = mean.scene.leds
+    waves = led_waves(leds.transmitters, seed)
+    if not waves:
+        return None, 1.0
+    starts_s = start_s + mean.camera.line_starts_s()
+    room = MeanWave.of(waves, dict(zip(leds.ids.tolist(), leds.fluxes_lm.tolist(), strict=True)))
+    return LineGains(waves, starts_s, exposure_s), room.mean(starts_s, exposure_s)
 
 
 def generate(
