@@ -26,6 +26,7 @@ from vlcrender.scene.as_built import BuildingErrors, as_built, luminaires_of
 from vlcrender.scene.leds import Leds
 from vlcrender.scene.loader import Scene
 from vlcrender.sensor.accelerometer import Imu, TiltError
+from vlcrender.sensor.gyroscope import Gyroscope
 from vlcrender.sensor.sensor import Sensor
 
 Array = NDArray[np.float64]
@@ -162,6 +163,13 @@ def reading_m_s2(recipe: Recipe, device: int, shot: int, main: Pose) -> Array:
     return TiltError(error_deg=sigmas.accelerometer_shot_deg).reading_m_s2(read, generator)
 
 
+def gyro_rad_s(recipe: Recipe, gyroscope: Gyroscope, device: int, shot: int) -> Array:
+    """Reading of a device's gyroscope in a shot, (3,), rad/s, axes of the camera `main`."""
+    velocity = np.zeros(3) if recipe.motion is None else recipe.motion.angular_velocity_rad_s
+    bias = stream(recipe.seed, "device", device, "gyroscope bias")
+    return gyroscope.reading_rad_s(velocity, bias, stream(recipe.seed, shot, "gyroscope"))
+
+
 def tilt_sigmas_deg(recipe: Recipe, main: Pose) -> tuple[float, float]:
     """True standard deviations of a frame's accelerometer on tilt_x and tilt_y in a pose, degrees."""
     accelerometer, sigmas = recipe.accelerometer, _true_sigmas(recipe)
@@ -204,9 +212,8 @@ def device_rows(recipe: Recipe) -> list[DeviceTruthRow]:
 
 def map_rows(recipe: Recipe, scene: Scene) -> list[MapTruthRow]:
     """The rows of truth_map.parquet."""
-    assert recipe.belief is not None
     rows = []
-    for map_number in range(recipe.belief.maps):
+    for map_number in range(1 if recipe.belief is None else recipe.belief.maps):
         leds = built_leds(recipe, scene, map_number)
         sizes = leds.half_widths_m * np.where(leds.squares, 2.0, 1.0)
         for i, (x, y, z) in enumerate(leds.centers_m.tolist()):
