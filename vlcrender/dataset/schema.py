@@ -16,6 +16,7 @@ from vlcrender.camera.distortion import Distortion
 from vlcrender.camera.rig import Mounted
 from vlcrender.config.toml_model import Settings
 from vlcrender.dataset.belief import CAMERA_PARAMETERS, CameraSigmas, Sigmas
+from vlcrender.dataset.downlink_entry import DownlinkEntry
 from vlcrender.scene.as_built import Luminaires
 from vlcrender.scene.leds import Leds
 from vlcrender.sensor.accelerometer import Imu, TiltError
@@ -313,6 +314,7 @@ class DatasetFile(Settings):
     led_map: tuple[LedMapEntry, ...]
     luminaires: tuple[LuminaireEntry, ...]
     map_datum: MapDatumEntry | None
+    downlink: DownlinkEntry | None
     room_m: Triple
     provenance: dict[str, Any]
 
