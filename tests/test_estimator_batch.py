@@ -27,7 +27,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     table = pq.read_table(folder / "frames.parquet")
     rows = table.to_pylist()
     for row, shot in zip(rows, (0, 0, 1), strict=True):
-        row["shot"] = shot
+        row["shot"] = row["burst"] = shot
     pq.write_table(table.from_pylist(rows, table.schema), folder / "frames.parquet")
     return folder
 

@@ -31,9 +31,9 @@ from estimator.evaluate.statistics import (
 )
 from estimator.io.atomic import write_atomically
 from estimator.io.dataset import Dataset, read_dataset
-from estimator.io.device import AnyLed, Led, LedId
+from estimator.io.device import AnyLed, Led
 from estimator.io.estimates import EstimateRow, read_estimates
-from estimator.io.records import Number, Positive, Row, Size, Triple, first_problem
+from estimator.io.records import LedId, Number, Positive, Row, Size, Triple, first_problem
 from estimator.io.truth import TruthRow, read_truth
 
 if TYPE_CHECKING:

@@ -4,23 +4,33 @@ import json
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, Strict, ValidationError, field_validator, model_validator
 
 from estimator.errors import InputError
-from estimator.io.records import NotNegative, NotNegativeTriple, Number, Positive, Row, Triple, first_problem
+from estimator.io.downlink import Downlink, downlink_problem, spots_problem
+from estimator.io.records import (
+    INT64_MAX,
+    LedId,
+    NotNegative,
+    NotNegativeTriple,
+    Number,
+    Positive,
+    Row,
+    Triple,
+    first_problem,
+)
+from estimator.io.shutter import GLOBAL, Gyroscope, Shutter
 
 Floats = NDArray[np.float64]
 
-INT64_MAX = 2**63 - 1
 MAX_SENSOR_AREAS = 16
 """Upper limit of the pixels in all regions of a frame, in sensor areas; regions may extend beyond the sensor."""
 # Pixels within this many standard deviations of the full well count as possibly full.
 FULL_SIGMA = 4.0
-LedId = Annotated[int, Field(ge=0, le=INT64_MAX)]
 DeviceNumber = Annotated[int, Field(ge=0, le=INT64_MAX)]
 # Within 1000 km of the origin: any range to an LED, even a wrong one, can then be written.
 Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
@@ -123,6 +133,7 @@ class Camera(Row):
     R_cam_rig: tuple[Triple, Triple, Triple]
     offset_m: Triple
     uncertainty: CameraUncertainty | None = None
+    shutter: Shutter = GLOBAL
 
     @field_validator("K")
     @classmethod
@@ -157,6 +168,19 @@ class Camera(Row):
     def pixel_angle_rad(self) -> float:
         """Angle of one pixel on the optical axis, 1 / fx, radians."""
         return 1 / self.K[0][0]
+
+    @property
+    def line_count(self) -> int:
+        """Lines that the shutter reads: rows of the sensor, or columns."""
+        return self.shutter.line_count(self.width_px, self.height_px)
+
+    def line_of(self, u_px: Floats, v_px: Floats) -> Floats:
+        """Continuous line coordinates, in readout order, of pixels (u, v) of any shape: line i is from i to i + 1."""
+        return self.shutter.line_of(u_px, v_px, self.width_px, self.height_px)
+
+    def times_s(self, u_px: Floats, v_px: Floats) -> Floats:
+        """Middle of the exposure of pixels (u, v) of any shape, relative to the frame's middle line, seconds."""
+        return (self.line_of(u_px, v_px) - self.line_count / 2) * self.shutter.row_time_s
 
     def R_cam_rig_array(self) -> Floats:
         """`R_cam_rig` as a (3, 3) array."""
@@ -401,6 +425,11 @@ def decoding_problem(spots: Sequence[DecodedSpot], leds: Mapping[int, Led]) -> s
     return None
 
 
+def gyro_problem(reading_rad_s: Sequence[float] | None, gyroscope: Gyroscope | None) -> str | None:
+    """What is wrong with a frame's reading of the gyroscope, None if nothing: a reading without a gyroscope."""
+    return "gyro_rad_s is given, but gyroscope is null" if reading_rad_s is not None and gyroscope is None else None
+
+
 class Accelerometer(Row):
     """Error of the accelerometer as the device knows it, degrees, one standard deviation.
 
@@ -427,6 +456,14 @@ class Part:
     image_dn: NDArray[np.uint32]
 
 
+class LineGains(Protocol):
+    """Gain of an LED at each line of the sensor: the mean of its wave, of mean 1, over the line's exposure."""
+
+    def __call__(self, lines: NDArray[np.int64]) -> Floats:
+        """Gains (n,) at lines (n,), counted in readout order from 0 on."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class DeviceFrame:
     """A frame as the device has it: the regions read out (one for a full frame), and all that the device knows.
@@ -451,6 +488,18 @@ class DeviceFrame:
     """Accuracy of the map's origin and scale; None where the device does not state it."""
     device: int = 0
     """Number of the device in its dataset: frames of one device share the errors of its camera and accelerometer."""
+    burst: int = 0
+    """Number of the burst: frames of a burst are taken one after another by a device that hardly moves."""
+    start_s: float = 0.0
+    """Start of the exposure of the first line that is read, seconds on the rig's clock."""
+    gyro_rad_s: tuple[float, float, float] | None = None
+    """Angular velocity as the gyroscope reads it, camera axes, mean over the readout; None without a reading."""
+    gyroscope: Gyroscope | None = None
+    """Errors of the gyroscope; None without one."""
+    downlink: Downlink | None = None
+    """What the LEDs send; None where the device cannot receive."""
+    gains: Mapping[int, LineGains] = field(default_factory=dict)
+    """Gain of an LED, by id, at each line, as its signal was decoded; without an entry an LED counts as steady."""
 
     def electrons(self, part: Part) -> NDArray[np.float32]:
         """Electrons above the black level of a part, (rows, columns)."""
@@ -473,13 +522,18 @@ class _Record(Row):
     camera: Camera
     sensor: Sensor
     accelerometer: Accelerometer
-    led_map: tuple[AnyLed, ...]
+    led_map: tuple[AnyLed, ...] | None
     exposure_s: Positive
     accelerometer_m_s2: Triple
     spots: tuple[DecodedSpot, ...]
     luminaires: tuple[Luminaire, ...] = ()
     map_datum: MapDatum | None = None
     device: DeviceNumber = 0
+    burst: int = Field(default=0, ge=0, le=INT64_MAX)
+    start_s: Number = 0.0
+    gyro_rad_s: Triple | None = None
+    gyroscope: Gyroscope | None = None
+    downlink: Downlink | None = None
 
 
 class _Origin(Row):
@@ -499,9 +553,9 @@ def frame(record: Mapping[str, Any]) -> DeviceFrame:
         (x, y, z in camera axes, m/s^2) and `spots` (`{led, u_px, v_px}`) as in frames.parquet; and `parts`, a sequence
         of `{"row": int, "column": int, "image_dn": array}`, where `image_dn` (rows, columns) uint32 holds digital
         numbers and its first pixel is pixel (row, column) of the sensor. NumPy arrays and scalars may stand for lists
-        and numbers. What the device does not state may be missing: `luminaires`, `map_datum`, `device` (0), in
-        `camera`, `accelerometer` and `led_map` the keys of standard deviations, and in `sensor` `crosstalk` (0). Other
-        keys are ignored.
+        and numbers. What the device does not state may be missing: `luminaires`, `map_datum`, `device` (0), `burst`
+        (0), `start_s` (0), `gyro_rad_s`, `gyroscope`, `downlink`, in `camera`, `accelerometer` and `led_map` the keys
+        of standard deviations, in `camera` `shutter` (global), and in `sensor` `crosstalk` (0). Other keys are ignored.
 
     Returns
     -------
@@ -518,13 +572,15 @@ def frame(record: Mapping[str, Any]) -> DeviceFrame:
     try:
         text = json.dumps({key: record[key] for key in _Record.model_fields if key in record}, default=_plain)
         known = _Record.model_validate_json(text)
-        leds = leds_by_id(known.led_map)
-        luminaires = luminaires_by_id(known.luminaires, known.led_map)
+        leds = leds_by_id(known.led_map or ())
+        luminaires = luminaires_by_id(known.luminaires, leds.values())
     except ValidationError as error:
         raise InputError(f"record: {first_problem(error)}") from None
     except (TypeError, ValueError) as error:
         raise InputError(f"record: {error}") from None
-    if problem := decoding_problem(known.spots, leds):
+    problem = downlink_problem(known.downlink, None if known.led_map is None else leds.keys())
+    problem = problem or gyro_problem(known.gyro_rad_s, known.gyroscope)
+    if problem := problem or spots_problem(known.downlink, known.spots) or decoding_problem(known.spots, leds):
         raise InputError(f"record: {problem}")
     return DeviceFrame(
         parts=_parts(record, known.camera, known.sensor),
@@ -538,6 +594,11 @@ def frame(record: Mapping[str, Any]) -> DeviceFrame:
         luminaires=luminaires,
         map_datum=known.map_datum,
         device=known.device,
+        burst=known.burst,
+        start_s=known.start_s,
+        gyro_rad_s=known.gyro_rad_s,
+        gyroscope=known.gyroscope,
+        downlink=known.downlink,
     )
 
 

@@ -12,8 +12,7 @@ from pydantic import Field, Strict, model_validator
 
 from estimator.errors import InputError
 from estimator.io.atomic import write_atomically
-from estimator.io.device import LedId
-from estimator.io.records import Covariance, Number, Row, Triple, read_rows
+from estimator.io.records import Covariance, LedId, Number, Row, Triple, read_rows
 
 COLUMNS = {
     "frame": pa.int64(),

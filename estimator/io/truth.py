@@ -7,8 +7,7 @@ import pyarrow as pa
 from pydantic import Field, Strict
 
 from estimator.errors import InputError
-from estimator.io.device import LedId
-from estimator.io.records import Covariance, Row, Size, Triple, read_rows
+from estimator.io.records import Covariance, LedId, Row, Size, Triple, read_rows
 
 COLUMNS = {
     "frame": pa.int64(),

@@ -15,6 +15,7 @@ from pydantic import Field, ValidationError, ValidatorFunctionWrapHandler, WrapV
 from vlcrender.camera.distortion import Distortion
 from vlcrender.camera.glare import Glare
 from vlcrender.camera.projection import Equidistant, FieldOfView, Perspective, Projection
+from vlcrender.camera.shutter import GlobalShutter, Shutter
 from vlcrender.config.presets import with_presets
 from vlcrender.config.toml_model import Settings, check
 
@@ -86,6 +87,8 @@ class Camera(Settings):
     """Field angle at which a second stop hides the whole pupil, deg; no mechanical vignetting where not given."""
     glare: Glare | None = None
     """Veiling glare of the lens; none where not given."""
+    shutter: Shutter = GlobalShutter()
+    """When each line of the sensor is exposed; all lines at once where not given."""
 
     @classmethod
     def preset(cls, name: str) -> Self:
@@ -235,6 +238,19 @@ class Camera(Settings):
         """K^-1, rows of Python floats: a NumPy scalar times a Dr.Jit array would become a NumPy array."""
         inverse: list[list[Any]] = np.linalg.inv(self.matrix).tolist()
         return inverse
+
+    def line_starts_s(self) -> NDArray[np.float64]:
+        """Start of each line's exposure after the frame's, s: (height, 1), (1, width), or (1, 1) for a global shutter."""
+        return self.shutter.line_starts_s(self.width_px, self.height_px)
+
+    def middle_s(self, exposure_s: float) -> float:
+        """Time from the start of a frame to the middle of its middle line's exposure, s."""
+        lines = self.shutter.line_count(self.width_px, self.height_px)
+        return (lines - 1) / 2 * self.shutter.row_time_s + exposure_s / 2
+
+    def times_s(self, u_px: Any, v_px: Any) -> Any:
+        """Time of pixel positions after the middle of a frame, s, of any shape."""
+        return self.shutter.times_s(u_px, v_px, self.width_px, self.height_px)
 
     def view_angles_deg(self) -> tuple[float, float]:
         """Full angles of view across and down, for a sensor centred on the axis.

@@ -19,11 +19,12 @@ from vlcrender.dataset.motion import poses_during
 from vlcrender.dataset.pose_sampling import pose_of_frame
 from vlcrender.dataset.preview import write_preview
 from vlcrender.dataset.recipe import Recipe
-from vlcrender.dataset.schema import Flat9, FrameRecord, FrameRow, LedTruth, TruthRow, five, flat9
+from vlcrender.dataset.schema import Flat9, FrameRecord, FrameRow, LedTruth, TruthRow, five, flat9, triple
 from vlcrender.dataset.true_world import (
     built_leds,
     device_of_pose,
     device_sensor,
+    gyro_rad_s,
     map_of_device,
     reading_m_s2,
     shots_differ,
@@ -82,9 +83,14 @@ def make_frame(job: Job, frame: int) -> FrameRecord:
         recipe.processed.write(directory / PROCESSED / f"{frame:06d}{recipe.processed.suffix}", picture)
     # The rig has one accelerometer: its error belongs to the shot. The device turns its reading by the told mounting.
     reading = told.rotation @ reading_m_s2(recipe, device, shot, main)
+    gyro = None
+    if recipe.gyroscope is not None:
+        gyro = triple(told.rotation @ gyro_rad_s(recipe, recipe.gyroscope, device, shot))
     known = FrameRow(
         frame=frame,
         shot=shot,
+        burst=shot // recipe.burst_frames,
+        start_s=recipe.start_s(shot, modulated=False),
         pose=pose_number,
         device=device,
         file=file,
@@ -93,6 +99,7 @@ def make_frame(job: Job, frame: int) -> FrameRecord:
         exposure_s=exposure_s,
         capturable=all(sensor.contains(part.roi) for part in view.parts),
         accelerometer_m_s2=reading.tolist(),
+        gyro_rad_s=gyro,
         spots=decoded_spots(view.parts, camera.width_px, stream(recipe.seed, frame, "demodulator")),
     )
     truth = TruthRow(
@@ -106,8 +113,18 @@ def make_frame(job: Job, frame: int) -> FrameRecord:
         tilt_x_deg=pose.tilt_x_deg,
         tilt_y_deg=pose.tilt_y_deg,
         yaw_deg=pose.yaw_deg,
+        angular_velocity_rad_s=None,
+        linear_velocity_m_s=None,
         leds=tuple(
-            LedTruth(led=p.led_id, u_px=p.center_px[0], v_px=p.center_px[1], visible_fraction=p.visible_fraction)
+            LedTruth(
+                led=p.led_id,
+                u_px=p.center_px[0],
+                v_px=p.center_px[1],
+                visible_fraction=p.visible_fraction,
+                clock_error=None,
+                phase=None,
+                bits=None,
+            )
             for p in sorted(view.patches, key=lambda p: p.led_id)
         ),
         bound_m2=mean.bound_m2,

@@ -20,6 +20,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from vlcrender.core.warn_once import warn_once
+from vlcrender.dataset.downlink_entry import downlink_entry
 from vlcrender.dataset.files import FRAMES, sha256_of, whole_file, write_json
 from vlcrender.dataset.frame_job import Job, make_frame, poses_of
 from vlcrender.dataset.progress import FRAMES_STAGE, Progress, ProgressCallback
@@ -36,6 +37,7 @@ from vlcrender.dataset.schema import (
     TruthRow,
     accelerometer_entry,
     camera_entry,
+    gyroscope_entry,
     led_map,
     luminaire_entries,
     map_datum_entry,
@@ -306,9 +308,11 @@ def _finish(plan: Plan, directory: Path, provenance: dict[str, Any], records: li
         },
         sensor=SensorEntry(**recipe.sensor.acting()),
         accelerometer=accelerometer_entry(recipe.accelerometer, sigmas),
+        gyroscope=gyroscope_entry(recipe.gyroscope),
         led_map=led_map(scene.leds, luminaires, sigmas),
         luminaires=() if luminaires is None or sigmas is None else luminaire_entries(luminaires, sigmas),
         map_datum=None if sigmas is None else map_datum_entry(sigmas),
+        downlink=downlink_entry(scene.leds),
         room_m=scene.settings.room.size_m,
         provenance=provenance,
     )

@@ -32,6 +32,11 @@ class Motion(Settings):
     linear_velocity_m_s: tuple[LinearVelocity, LinearVelocity, LinearVelocity] = (0.0, 0.0, 0.0)
     """Velocity of the projection centre of `main`, world axes, metres a second."""
 
+    @property
+    def angular_velocity_rad_s(self) -> NDArray[np.float64]:
+        """Angular velocity about the axes of `main`, (3,), rad/s."""
+        return np.radians(np.array(self.angular_velocity_deg_s))
+
     def pose_at(self, middle: Pose, time_s: float) -> Pose:
         """The pose `time_s` after mid-exposure."""
         # The camera turns by this rotation in its own axes; directions in camera axes turn by the inverse.

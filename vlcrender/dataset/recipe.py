@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 from vlcrender.camera.intrinsics import Camera
 from vlcrender.camera.rig import MAIN, Mounted, RigCamera, mounted_cameras
 from vlcrender.camera.roi import LedRegions
+from vlcrender.camera.shutter import RollingShutter
 from vlcrender.config.packaged import find_file
 from vlcrender.config.presets import with_presets
 from vlcrender.config.toml_model import Settings, check, read_toml
@@ -18,10 +19,12 @@ from vlcrender.dataset.auto_exposure import Metering, NoiseLevelMetering
 from vlcrender.dataset.belief import Belief
 from vlcrender.dataset.motion import Motion
 from vlcrender.dataset.pose_sampling import AimedPoses, Poses
+from vlcrender.dataset.timeline import Burst, start_of_burst_s
 from vlcrender.errors import InputError
 from vlcrender.rendering.expected_image import ExpectedImage
 from vlcrender.scene.loader import Scene, load_scene
 from vlcrender.sensor.accelerometer import Accelerometer, TiltError
+from vlcrender.sensor.gyroscope import Gyroscope
 from vlcrender.sensor.isp import Processed
 from vlcrender.sensor.radiometry import WAVELENGTHS_NM, detectors
 from vlcrender.sensor.sensor import Sensor
@@ -52,7 +55,13 @@ class Recipe(Settings):
     exposure: Metering | None = None
     """Automatic exposure: how the exposure time of each frame is chosen."""
     repeats: Annotated[int, Field(ge=1, le=1_000_000)] = 1
-    """Shots of each pose, one after another; they differ in noise alone."""
+    """Shots, or bursts of shots, of each pose, one after another; they differ in noise, and in the phase of waves."""
+    burst: Burst | None = None
+    """Shots in quick succession in place of each single shot; single shots where not given."""
+    demodulation: Literal["given", "pixels"] = "given"
+    """Who tells which LED image is which: identities are given, or estimators have to decode them from the pixels."""
+    map: Literal["given", "sent"] = "given"
+    """Whether devices are given a map of the LEDs, or know of LEDs only what the LEDs send about themselves."""
     expected: bool = False
     """Whether the noise-free images are written too."""
     processed: Processed | None = None
@@ -65,12 +74,14 @@ class Recipe(Settings):
     """The sensor of every camera."""
     accelerometer: Accelerometer = TiltError()
     """The accelerometer of the rig."""
+    gyroscope: Gyroscope | None = None
+    """The gyroscope of the rig; none where not given."""
     poses: Poses
     """Poses of the camera `main`."""
     regions: LedRegions | None = None
     """Regions of interest that are read out; the whole sensor where not given."""
     motion: Motion | None = None
-    """Motion of the rig during each exposure; at rest where not given."""
+    """Motion of the rig during each frame, and from frame to frame of a burst; at rest where not given."""
     rig: tuple[RigCamera, ...] = ()
     """Further cameras, mounted beside `main` and exposed at the same time."""
     belief: Belief | None = None
@@ -155,6 +166,46 @@ class Recipe(Settings):
             )
         return self
 
+    @model_validator(mode="after")
+    def _overscan_needs_a_global_shutter(self) -> Self:
+        rolling = [c.name for c in self.cameras if c.camera.shutter.kind == "rolling"]
+        if self.regions is not None and self.regions.overscan and rolling:
+            raise ValueError(
+                f"regions.overscan = true: camera {rolling[0]!r} has a rolling shutter, which has no lines beyond the "
+                "sensor; remove overscan or [camera.shutter]"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _frames_of_a_burst_do_not_overlap(self) -> Self:
+        if self.burst is None:
+            return self
+        longest_s = max(self._readout_s(c.camera) for c in self.cameras) + self._max_exposure_s
+        if 1 / self.burst.frame_rate_hz < longest_s:
+            raise ValueError(
+                f"burst.frame_rate_hz = {self.burst.frame_rate_hz:g}: a frame takes {longest_s * 1000:.4g} ms from the "
+                f"first line to the last; at most {1 / longest_s:.4g} Hz are possible"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _a_sent_map_is_read_from_pixels(self) -> Self:
+        if self.map == "sent" and self.demodulation == "given":
+            raise ValueError('map = "sent": the map comes out of the light; set demodulation = "pixels"')
+        return self
+
+    @property
+    def _max_exposure_s(self) -> float:
+        if self.exposure is not None:
+            return self.exposure.max_s
+        assert self.exposure_s is not None  # _one_way_to_expose
+        return self.exposure_s
+
+    @staticmethod
+    def _readout_s(camera: Camera) -> float:
+        """Time from the start of the first line's exposure to that of the last, s."""
+        return float(camera.line_starts_s().max())
+
     @property
     def cameras(self) -> tuple[Mounted, ...]:
         """All cameras, `main` first."""
@@ -162,8 +213,13 @@ class Recipe(Settings):
 
     @property
     def frame_count(self) -> int:
-        """Number of frames: one for each pose, repeat and camera."""
-        return self.poses.count * self.repeats * len(self.cameras)
+        """Number of frames: one for each pose, repeat, shot of a burst and camera."""
+        return self.poses.count * self.repeats * self.burst_frames * len(self.cameras)
+
+    @property
+    def burst_frames(self) -> int:
+        """Shots in each burst; 1 without bursts."""
+        return 1 if self.burst is None else self.burst.frames
 
     def time_s(self, view: ExpectedImage) -> float:
         """Exposure time of an expected image, seconds."""
@@ -175,7 +231,23 @@ class Recipe(Settings):
     def place_of_frame(self, frame: int) -> tuple[int, int, int]:
         """Pose, shot and camera of a frame, each counted from 0. The camera varies fastest, the pose slowest."""
         shot, which = divmod(frame, len(self.cameras))
-        return shot // self.repeats, shot, which
+        return shot // (self.repeats * self.burst_frames), shot, which
+
+    def start_s(self, shot: int, modulated: bool) -> float:
+        """Start of a shot on the rig's clock, s.
+
+        modulated: whether LEDs of the scene are. 0 where no frame depends on time: nothing is modulated, shutters are
+        global, and there are no bursts.
+        """
+        rolling = any(c.camera.shutter.kind == "rolling" for c in self.cameras)
+        if not (modulated or rolling or self.burst):
+            return 0.0
+        burst, number = divmod(shot, self.burst_frames)
+        lasts_s = max(self._readout_s(c.camera) for c in self.cameras) + self._max_exposure_s
+        if self.burst is None:
+            return start_of_burst_s(self.seed, burst, lasts_s)
+        lasts_s += self.burst.offset_s(self.burst.frames - 1)
+        return start_of_burst_s(self.seed, burst, lasts_s) + self.burst.offset_s(number)
 
 
 @dataclass(frozen=True)
@@ -210,6 +282,8 @@ def load_plan(path: Path, assignments: Iterable[str] = (), scale: int = 1, scale
 
 def scaled(recipe: Recipe, by: int, mode: ScaleMode) -> Recipe:
     """The recipe with `by` x `by` pixels binned into one, and every length in pixels divided by `by`.
+
+    A binned line takes `by` times the row time of a rolling shutter: a readout takes as long as before.
 
     The margin of regions does not fall below MIN_SCALED_MARGIN_PX: an LED image of any size needs some pixels of
     background around it.
@@ -251,16 +325,22 @@ def scaled(recipe: Recipe, by: int, mode: ScaleMode) -> Recipe:
 
 
 def _scaled_camera(camera: Camera, by: int) -> Camera:
-    """The camera with u' = u / by, v' = v / by: its focal length, principal point and skew in pixels shrink alike."""
+    """The camera with u' = u / by, v' = v / by: its focal length, principal point and skew in pixels shrink alike.
+
+    `by` lines are read as one.
+    """
     if camera.width_px % by or camera.height_px % by:
         raise InputError(f"--scale {by}: does not divide the camera's {camera.width_px} x {camera.height_px} pixels")
     if camera.psf_kernel is not None:
         raise InputError(
             f"--scale {by}: camera.psf_kernel is given in pixels of the full camera; remove --scale or psf_kernel"
         )
-    point = camera.principal_point_px
+    point, shutter = camera.principal_point_px, camera.shutter
+    if isinstance(shutter, RollingShutter):
+        shutter = shutter.model_copy(update={"row_time_us": shutter.row_time_us * by})
     return camera.model_copy(
         update={
+            "shutter": shutter,
             "width_px": camera.width_px // by,
             "height_px": camera.height_px // by,
             "pixel_pitch_um": camera.pixel_pitch_um * by,

@@ -14,11 +14,14 @@ from pydantic import Field
 
 from vlcrender.camera.distortion import Distortion
 from vlcrender.camera.rig import Mounted
+from vlcrender.camera.shutter import Shutter
 from vlcrender.config.toml_model import Settings
 from vlcrender.dataset.belief import CAMERA_PARAMETERS, CameraSigmas, Sigmas
+from vlcrender.dataset.downlink_entry import DownlinkEntry
 from vlcrender.scene.as_built import Luminaires
 from vlcrender.scene.leds import Leds
 from vlcrender.sensor.accelerometer import Imu, TiltError
+from vlcrender.sensor.gyroscope import Gyroscope
 
 FORMAT_VERSION: Final = 4
 """`version` of dataset.json."""
@@ -48,7 +51,8 @@ def five(distortion: Distortion | None) -> Five | None:
     return distortion.k1, distortion.k2, distortion.k3, distortion.p1, distortion.p2
 
 
-def _triple(numbers: NDArray[np.float64]) -> Triple:
+def triple(numbers: NDArray[np.float64]) -> Triple:
+    """A vector (3,) as a tuple."""
     x, y, z = numbers.tolist()
     return x, y, z
 
@@ -72,6 +76,10 @@ class FrameRow(Settings):
 
     frame: int
     shot: int
+    burst: int
+    """Frames of one burst follow each other at the frame rate; equal to `shot` without bursts."""
+    start_s: float
+    """Start of the exposure of the first line, on the rig's clock."""
     pose: int
     device: int
     """Frames of one device share the errors of a device."""
@@ -85,6 +93,8 @@ class FrameRow(Settings):
     """Whether every region of the frame lies on the sensor."""
     accelerometer_m_s2: Triple
     """Reading at mid-exposure in the axes of this frame's camera."""
+    gyro_rad_s: Triple | None
+    """Reading of the gyroscope, mean over the readout, in the axes of this frame's camera; None without one."""
     spots: tuple[SpotRow, ...]
 
 
@@ -94,10 +104,16 @@ class LedTruth(Settings):
     led: int
     """LED id."""
     u_px: float
-    """Image of the LED's centre, exact."""
+    """Image of the LED's centre, exact, at the time of its own line."""
     v_px: float
     visible_fraction: float
     """Share of the LED's image that falls on the sensor."""
+    clock_error: float | None
+    """Relative error of the frequency of the LED's clock; None for a steady LED."""
+    phase: float | None
+    """Phase of the LED's wave at the frame's `start_s`, periods, in [0, 1); None for a steady LED."""
+    bits: str | None
+    """Chips of one period of the LED's wave, "1" lit; None for a steady LED and for waves that send nothing."""
 
 
 class TruthRow(Settings):
@@ -117,6 +133,10 @@ class TruthRow(Settings):
     tilt_x_deg: float
     tilt_y_deg: float
     yaw_deg: float
+    angular_velocity_rad_s: Triple | None
+    """About the axes of this frame's camera, right-handed; None at rest."""
+    linear_velocity_m_s: Triple | None
+    """Velocity of the projection centre, world axes; None at rest."""
     leds: tuple[LedTruth, ...]
     bound_m2: Flat9 | None
     """Cramér-Rao bound of the position; hybrid with a belief."""
@@ -220,6 +240,7 @@ class CameraEntry(Settings):
     psf: Literal["none", "diffraction", "measured"]
     psf_wavelength_nm: float
     psf_kernel: tuple[tuple[float, ...], ...] | None
+    shutter: Shutter
     R_cam_rig: Matrix
     offset_m: Triple
     uncertainty: CameraUncertainty | None
@@ -253,6 +274,13 @@ class AccelerometerEntry(Settings):
     error_deg: float
     device_error_deg: float | None
     shot_error_deg: float | None
+
+
+class GyroscopeEntry(Settings):
+    """The gyroscope in dataset.json: standard deviations about each axis."""
+
+    noise_rad_s: float
+    bias_rad_s: float
 
 
 class DiscEntry(Settings):
@@ -310,9 +338,12 @@ class DatasetFile(Settings):
     cameras: dict[str, CameraEntry]
     sensor: SensorEntry
     accelerometer: AccelerometerEntry
-    led_map: tuple[LedMapEntry, ...]
+    gyroscope: GyroscopeEntry | None
+    led_map: tuple[LedMapEntry, ...] | None
+    """None where devices know of LEDs only what the LEDs send."""
     luminaires: tuple[LuminaireEntry, ...]
     map_datum: MapDatumEntry | None
+    downlink: DownlinkEntry | None
     room_m: Triple
     provenance: dict[str, Any]
 
@@ -348,6 +379,13 @@ def accelerometer_entry(accelerometer: TiltError | Imu, sigmas: Sigmas | None = 
     )
 
 
+def gyroscope_entry(gyroscope: Gyroscope | None) -> GyroscopeEntry | None:
+    """The entry of a gyroscope."""
+    if gyroscope is None:
+        return None
+    return GyroscopeEntry(noise_rad_s=gyroscope.noise_rad_s, bias_rad_s=gyroscope.bias_rad_s)
+
+
 def led_map(
     leds: Leds, luminaires: Luminaires | None = None, sigmas: Sigmas | None = None
 ) -> tuple[DiscEntry | SquareEntry, ...]:
@@ -358,9 +396,9 @@ def led_map(
         size_sigma_m = None if sigmas is None else sigmas.led_size * size_m
         shared: dict[str, Any] = {
             "id": int(led),
-            "position_m": _triple(center),
+            "position_m": triple(center),
             "luminaire": None if luminaires is None else int(luminaires.of_led[i]),
-            "sigma_m": None if sigmas is None else _triple(sigmas.led_m),
+            "sigma_m": None if sigmas is None else triple(sigmas.led_m),
             "gradient_sigma": None if sigmas is None else sigmas.led_gradient,
         }
         if square:
@@ -375,9 +413,9 @@ def luminaire_entries(luminaires: Luminaires, sigmas: Sigmas) -> tuple[Luminaire
     return tuple(
         LuminaireEntry(
             id=number,
-            position_m=_triple(center),
-            sigma_m=_triple(sigmas.luminaire_m),
-            sigma_rotation_deg=_triple(sigmas.luminaire_rotation_deg),
+            position_m=triple(center),
+            sigma_m=triple(sigmas.luminaire_m),
+            sigma_rotation_deg=triple(sigmas.luminaire_rotation_deg),
         )
         for number, center in enumerate(luminaires.centers_m)
     )
@@ -385,4 +423,4 @@ def luminaire_entries(luminaires: Luminaires, sigmas: Sigmas) -> tuple[Luminaire
 
 def map_datum_entry(sigmas: Sigmas) -> MapDatumEntry:
     """The standard deviations of the map as a whole that devices are told."""
-    return MapDatumEntry(sigma_m=_triple(sigmas.datum_m), scale_sigma_ppm=sigmas.datum_scale_ppm)
+    return MapDatumEntry(sigma_m=triple(sigmas.datum_m), scale_sigma_ppm=sigmas.datum_scale_ppm)

@@ -26,6 +26,7 @@ from vlcrender.scene.as_built import BuildingErrors, as_built, luminaires_of
 from vlcrender.scene.leds import Leds
 from vlcrender.scene.loader import Scene
 from vlcrender.sensor.accelerometer import Imu, TiltError
+from vlcrender.sensor.gyroscope import Gyroscope
 from vlcrender.sensor.sensor import Sensor
 
 Array = NDArray[np.float64]
@@ -160,6 +161,13 @@ def reading_m_s2(recipe: Recipe, device: int, shot: int, main: Pose) -> Array:
     error_x, error_y = tilt_errors_deg(recipe, device)
     read = replace(main, tilt_x_deg=main.tilt_x_deg + error_x, tilt_y_deg=main.tilt_y_deg + error_y)
     return TiltError(error_deg=sigmas.accelerometer_shot_deg).reading_m_s2(read, generator)
+
+
+def gyro_rad_s(recipe: Recipe, gyroscope: Gyroscope, device: int, shot: int) -> Array:
+    """Reading of a device's gyroscope in a shot, (3,), rad/s, axes of the camera `main`."""
+    velocity = np.zeros(3) if recipe.motion is None else recipe.motion.angular_velocity_rad_s
+    bias = stream(recipe.seed, "device", device, "gyroscope bias")
+    return gyroscope.reading_rad_s(velocity, bias, stream(recipe.seed, shot, "gyroscope"))
 
 
 def tilt_sigmas_deg(recipe: Recipe, main: Pose) -> tuple[float, float]:

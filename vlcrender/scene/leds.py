@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from vlcrender.core.face_profile import FaceProfile
 from vlcrender.core.random_keys import stream
 from vlcrender.errors import InputError
+from vlcrender.modulation.transmission import Transmitter, transmission_of
 from vlcrender.scene.diffuser import MIN_DISTANCE_RADII, Diffuser
 from vlcrender.scene.schema import PanelDiffuser, PanelGrid, PanelLeds, SceneSettings
 from vlcrender.scene.surfaces import TOUCH_M, panel_centers_m, panel_opening_m
@@ -35,6 +36,8 @@ class Leds:
     """Relative rise of luminance from each face's centre to its border along x and y, (n, 2); (0, 0): even."""
     face_falloffs: NDArray[np.float64]
     """Luminance at each face's rim over that at its centre, without the gradient, (n,); 1: even."""
+    transmitters: tuple[Transmitter, ...] = ()
+    """Single LEDs and panels with what they transmit, in the order of their numbers."""
 
     def __len__(self) -> int:
         """Number of LEDs."""
@@ -70,8 +73,8 @@ class Leds:
 def leds_of(settings: SceneSettings, source: str) -> Leds:
     """All LEDs of a scene, single ones and those of panels.
 
-    Raises InputError that starts with `source` for a scene without LEDs, for an id used twice, and for LEDs that
-    overlap, do not fit onto their panel or are outside the room.
+    Raises InputError that starts with `source` for a scene without LEDs, for an id used twice, for LEDs that overlap,
+    do not fit onto their panel or are outside the room, and for what LEDs cannot transmit.
     """
     ids: list[int] = []
     centers: list[NDArray[np.float64]] = []
@@ -128,6 +131,7 @@ def leds_of(settings: SceneSettings, source: str) -> Leds:
         (None,) * len(ids),
         np.array(gradients)[order],
         np.array(falloffs)[order],
+        transmitters_of(settings),
     )
     diffusers = [
         None
@@ -144,7 +148,26 @@ def leds_of(settings: SceneSettings, source: str) -> Leds:
     ]
     leds = replace(leds, diffusers=tuple(diffusers))
     _check_leds(leds, [origins[i] for i in order], np.array(settings.room.size_m), source)
+    try:
+        transmission_of(leds.transmitters)
+    except ValueError as error:
+        raise InputError(f"{source}: {error}") from None
     return leds
+
+
+def transmitters_of(settings: SceneSettings) -> tuple[Transmitter, ...]:
+    """Single LEDs in the order of the scene file, then panels grid by grid, with what they transmit."""
+    found = [
+        Transmitter(number, f"led[{number}]", entry.downlink, (entry.id,), entry.position_m)
+        for number, entry in enumerate(settings.led)
+    ]
+    for index, grid in enumerate(settings.panels):
+        per_panel, first = grid.leds.columns * grid.leds.rows, grid.leds.first_id
+        for x, y, z in panel_centers_m(grid).tolist():
+            ids = tuple(range(first, first + per_panel))
+            found.append(Transmitter(len(found), f"panels[{index}]", grid.downlink, ids, (x, y, z)))
+            first += per_panel
+    return tuple(found)
 
 
 def _check_led_array(array: PanelLeds, grid: PanelGrid, where: str) -> None:

@@ -6,6 +6,7 @@ from pydantic import Field, model_validator
 
 from vlcrender.config.toml_model import Settings, key_error
 from vlcrender.core.face_profile import lowest_share
+from vlcrender.modulation.keys import Downlink
 
 Length = Annotated[float, Field(gt=0, le=1000)]
 Reflectance = Annotated[float, Field(ge=0, le=1)]
@@ -145,7 +146,10 @@ class LedEntry(LedFace):
     position_m: Point
     """Centre of the face, x, y, z in metres, in the room."""
     luminance_cd_m2: Luminance
-    """Luminance along the normal (straight down), cd/m2. The same from every direction for half_power_deg = 60."""
+    """Luminance along the normal (straight down), cd/m2; the mean over time. The same from every direction for
+    half_power_deg = 60."""
+    downlink: Downlink | None = None
+    """What the LED transmits; steady light without this table."""
 
 
 class PanelLeds(LedFace):
@@ -207,8 +211,18 @@ class PanelGrid(Settings):
     """The rim around each panel's underside; no rim without this table."""
     diffuser: PanelDiffuser | None = None
     """The diffuser before the LEDs of each panel; bare LEDs without this table."""
+    downlink: Downlink | None = None
+    """What the panel's LEDs transmit; steady light without this table."""
     leds: PanelLeds
     """The LEDs of each panel."""
+
+    @model_validator(mode="after")
+    def _leds_of_a_panel_have_tones_of_their_own(self) -> Self:
+        if self.downlink is not None and self.downlink.send == "tone" and self.downlink.frequency_hz is not None:
+            raise key_error(
+                "downlink.frequency_hz", "is the tone of a single LED; the tones of panels are first_hz, step_hz"
+            )
+        return self
 
     @model_validator(mode="after")
     def _faces_behind_a_diffuser_are_even(self) -> Self:
