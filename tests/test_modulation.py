@@ -282,6 +282,10 @@ def test_a_packet_with_wrong_chips_is_none() -> None:
         flipped = PACKET[:place] + PACKET[place : place + 2][::-1] + PACKET[place + 2 :]
         assert packet.decode_chips(flipped) is None
     assert packet.decode_chips(PACKET[1:] + PACKET[:1]) is None
+    data = np.zeros(packet.DATA_BITS, dtype=np.int64)
+    data[-1] = 1  # the spare bit, with a CRC that is right
+    bits = np.concatenate([data, packet.crc16(data)])
+    assert packet.decode_chips(packet.PREAMBLE + "".join("10" if bit else "01" for bit in bits)) is None
 
 
 def test_the_preamble_is_in_no_stretch_of_manchester_code() -> None:
@@ -393,8 +397,10 @@ def test_tones_count_up_over_the_scene_and_wrap_at_7_khz() -> None:
     assert [round(1 / waves[led].period_s) for led in (1, 2, 3, 4)] == [2000, 1234, 2500, 3000]
 
 
-def test_codes_of_all_panels_and_single_leds_are_of_one_book() -> None:
-    waves = nominal_waves(table1_of(*[{"send": "code"}] * 4).leds.transmitters)
+def test_codes_are_of_one_book_in_the_order_of_ids() -> None:
+    tree = read_toml(ROOT / "scenes/table1.toml")
+    leds = [{**tree["led"][i], "downlink": {"send": "code"}} for i in (2, 0, 3, 1)]
+    waves = nominal_waves(scene_of({**tree, "led": leds}).leds.transmitters)
     assert tuple(waves[led].bits for led in (1, 2, 3, 4)) == code_book(4, 32)
 
 
