@@ -6,18 +6,20 @@ hypothesis' misfit. Error of the transmitter's clock within one LED image is neg
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimator.io.downlink import Codes, Downlink
-from estimator.receiver.signal import ChipWave, Floats, Ints, Signal, folded, overlaps
+from estimator.receiver.signal import ChipWave, Ints, Signal, folded, overlaps
 
 MIN_CORRELATION = 0.9
 MIN_MISFIT_RATIO = 1.5
 """The misfit of the best code of another LED has to be this many times the best one's."""
+MIN_MISFIT = 1e-12
 MIN_LINES = 8
+CLOCK_SIGMAS = 3.0
 PHASES = 8
 """Phases within a chip that are tried for every code; those of the best codes are refined."""
 REFINED = 6
@@ -44,13 +46,16 @@ class CodeMatch:
 
 
 class CodeBook:
-    """Codes of one chip duration and length, of several transmitters, ready for comparison."""
+    """Codes of one chip duration and length, ready for comparison."""
 
     def __init__(self, chip_s: float, transmitters: Sequence[Codes]) -> None:
+        """Make the book of transmitters whose chips are `chip_s` long; their codes have one length."""
         self.chip_s = chip_s
         self.leds = np.array([led for one in transmitters for led in one.leds], dtype=np.int64)
         self.depths = np.array([one.depth for one in transmitters for _ in one.leds])
-        self.chips: Ints = np.array([list(map(int, code)) for one in transmitters for code in one.codes], dtype=np.int64)
+        self.chips: Ints = np.array(
+            [list(map(int, code)) for one in transmitters for code in one.codes], dtype=np.int64
+        )
         self.length = self.chips.shape[1]
         self._products: dict[int, Singles] = {}
 
@@ -87,11 +92,34 @@ class CodeBook:
         variance = -np.square(self._product(0) @ flat[1])
         for lag in range(reach + 1):
             variance += self._product(lag) @ flat[2 + lag]
-        return np.where(variance > CONSTANT, product / np.sqrt(np.maximum(variance, CONSTANT)), np.float32(-1))
+        found = product / np.sqrt(np.maximum(variance, CONSTANT))
+        return np.where(variance > CONSTANT, found, -1).astype(np.float32)
 
     def wave(self, row: int, phase: float, at_s: float) -> ChipWave:
         """Wave of a code of the book that is `phase` chips into its period at the time `at_s`."""
         return ChipWave(self.chips[row], self.chip_s, float(self.depths[row]), at_s, phase % self.length)
+
+    def at_first(self, misfit: Singles, later_s: float, clock_error: float) -> Singles:
+        """Misfits (codes, phases) by the phase that a signal `later_s` before had: the least that the clock allows."""
+        later, slack = self._later(later_s, clock_error)
+        reach = min(int(np.ceil(slack * PHASES)), misfit.shape[1] // 2)
+        start = round(later * PHASES)
+        tried = [np.roll(misfit, -(start + shift), axis=1) for shift in range(-reach, reach + 1)]
+        return np.asarray(np.min(tried, axis=0), dtype=np.float32)
+
+    def near(self, signal: Signal, row: int, phase: float, first: Signal, clock_error: float) -> CodeMatch:
+        """Match of one code with a signal, near the phase that it had at the first line of another one."""
+        later, slack = self._later(float(signal.start_s[0] - first.start_s[0]), clock_error)
+        steps = int(np.ceil(slack * PHASES))
+        tried = phase + later + np.arange(-steps, steps + 1) / PHASES
+        found = [self.refined(signal, row, one) for one in tried]
+        best, correlation = max(found, key=lambda one: one[1])
+        return CodeMatch(int(self.leds[row]), correlation, 1.0, self.wave(row, best, float(signal.start_s[0])))
+
+    def _later(self, later_s: float, clock_error: float) -> tuple[float, float]:
+        """Chips that pass in a time, modulo the length, and by how many more or less by the clock's error."""
+        chips = later_s / self.chip_s
+        return chips % self.length, CLOCK_SIGMAS * clock_error * abs(chips)
 
     def refined(self, signal: Signal, row: int, phase: float) -> tuple[float, float]:
         """Phase near `phase`, chips, at which a code fits best, and its correlation there."""
@@ -99,7 +127,9 @@ class CodeBook:
         correlation = -1.0
         while step > 0.5 / PHASES**3:
             tried = phase + step * np.linspace(-1, 1, REFINED_PHASES)
-            found = [signal.correlation(self.wave(row, one, at_s).gains(signal.start_s, signal.exposure_s)) for one in tried]
+            found = [
+                signal.correlation(self.wave(row, one, at_s).gains(signal.start_s, signal.exposure_s)) for one in tried
+            ]
             best = int(np.argmax(found))
             phase, correlation, step = float(tried[best]), found[best], step * 2 / (REFINED_PHASES - 1)
         return phase % self.length, correlation
@@ -112,6 +142,41 @@ def code_books(downlink: Downlink) -> tuple[CodeBook, ...]:
         if isinstance(one, Codes):
             kinds.setdefault((one.chip_us, len(one.codes[0])), []).append(one)
     return tuple(CodeBook(chip_us * 1e-6, some) for (chip_us, _), some in kinds.items())
+
+
+def match_code_of_frames(
+    signals: Sequence[Signal], books: Sequence[CodeBook], clock_error: float
+) -> list[CodeMatch | None]:
+    """The LED whose code fits the signals of one LED in the frames of a burst best, as a match for each signal.
+
+    The phase goes on from frame to frame by their times, within CLOCK_SIGMAS standard deviations of the clock's
+    relative error. Correlation and misfits are those of all lines; levels are free in each frame. None where nothing is
+    found.
+    """
+    used = [signal for signal in signals if len(signal) >= MIN_LINES and signal.centred.any()]
+    if not used:
+        return [None] * len(signals)
+    power = [float(signal.weight @ signal.centred**2) for signal in used]
+    found: list[tuple[float, int, list[CodeMatch]]] = []
+    for book in books:
+        misfit = np.zeros((len(book.leds), book.length * PHASES), dtype=np.float32)
+        for signal, of_signal in zip(used, power, strict=True):
+            explained = np.square(np.maximum(book.correlations(signal), 0))
+            unexplained = (of_signal * (1 - explained)).astype(np.float32)
+            misfit = misfit + book.at_first(unexplained, float(signal.start_s[0] - used[0].start_s[0]), clock_error)
+        phases = misfit.argmin(axis=1)
+        best = np.take_along_axis(misfit, phases[:, None], axis=1)[:, 0]
+        for row in np.argsort(best)[:REFINED].tolist():
+            matches = [book.near(signal, row, phases[row] / PHASES, used[0], clock_error) for signal in used]
+            left = sum(p * (1 - max(one.correlation, 0.0) ** 2) for p, one in zip(power, matches, strict=True))
+            found.append((left / sum(power), int(book.leds[row]), matches))
+    found.sort(key=lambda one: one[0])
+    misfit_of, led, matches = found[0]
+    second = min((one[0] for one in found if one[1] != led), default=1.0)
+    ratio = second / max(misfit_of, MIN_MISFIT)
+    joint = float(np.sqrt(max(1 - misfit_of, 0.0)))
+    of_signal_number = iter([replace(one, correlation=joint, misfit_ratio=ratio) for one in matches])
+    return [next(of_signal_number) if any(signal is one for one in used) else None for signal in signals]
 
 
 def match_code(signal: Signal, books: Sequence[CodeBook]) -> CodeMatch | None:
@@ -131,5 +196,5 @@ def match_code(signal: Signal, books: Sequence[CodeBook]) -> CodeMatch | None:
     found.sort(key=lambda one: -one[0])
     correlation, led, book, row, phase = found[0]
     second = max((one[0] for one in found if one[1] != led), default=0.0)
-    misfits = [max(1 - max(one, 0.0) ** 2, 1e-12) for one in (second, correlation)]
+    misfits = [max(1 - max(one, 0.0) ** 2, MIN_MISFIT) for one in (second, correlation)]
     return CodeMatch(led, correlation, misfits[0] / misfits[1], book.wave(row, phase, float(signal.start_s[0])))

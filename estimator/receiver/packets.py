@@ -1,13 +1,14 @@
 """Packets: the coordinates that the LEDs of a panel send, from all LEDs and all frames of a burst in one fit.
 
-An LED image shows a few bits of a packet; those of a panel, each delayed by its index, show all of it. The chips of one
-period are the unknowns of a linear least-squares fit to the lines of all LED images, by their times. Which LED of the
-panel each image is enters through the delays: each way to lay the images over the panel is a hypothesis. A packet starts
-where preamble and Manchester code fit best. At most MAX_CHECKED hypotheses are checked by CRC, as each has a chance of
-2^-17 to pass, and the lines that a packet predicts have to explain MIN_EXPLAINED of the measured ones. Bits that no line
-shows are erasures: up to MAX_ERASED of them follow from the CRC, which then checks the less, and MIN_EXPLAINED_ERASED is
-asked for. No bit that was read is corrected. What the CRC checks the less has to be checked by chips that several LED
-images show: a wrong hypothesis has them agree by chance, with a half of their number as bits in Manchester code.
+An LED image shows a few bits of a packet; those of a panel, each delayed by its index, show all of it. The chips of
+one period are the unknowns of a linear least-squares fit to the lines of all LED images, by their times. Which LED of
+the panel each image is enters through the delays: each way to lay the images over the panel is a hypothesis. A packet
+starts where preamble and Manchester code fit best. At most MAX_CHECKED hypotheses are checked by CRC, as each has a
+chance of 2^-17 to pass, and the packet has to explain MIN_EXPLAINED of the lines' light.
+
+Bits that no line shows are erasures. Up to MAX_ERASED of them follow from the CRC, which then checks the less: the
+packet has to explain MIN_EXPLAINED_ERASED, and chips that several LED images show have to check the rest. A wrong
+hypothesis has two such chips agree with a chance of a half or less. No bit that was read is corrected.
 """
 
 from collections.abc import Iterator, Sequence
@@ -31,7 +32,7 @@ CHIPS_PER_ERASED = 2
 SEEN_SHARE = 0.2
 """An LED image shows a chip if it weighs this share of the image's best one."""
 MIN_SHOWN = 0.3
-"""A bit of which the lines show less than this share of the prior's variance is an erasure; one half alone shows 0.5."""
+"""A bit of which the lines show less than this share of the prior's variance is an erasure; one half shows 0.5."""
 MIN_MISFIT_RATIO = 1.5
 """The misfit of the packet with the images laid over the panel otherwise has to be this many times the best one's."""
 BRIGHT_PERCENTILE = 96.0
@@ -81,7 +82,9 @@ class PacketFormat:
         """Parity checks (17, bits): those of the CRC, and the bit 0 after the coordinates."""
         count = self.packets.data_bits
         ones = np.eye(count, dtype=np.int64)
-        of_crc = np.column_stack([*(crc(one, self.packets.polynomial) for one in ones), np.eye(CRC_BITS, dtype=np.int64)])
+        of_crc = np.column_stack(
+            [*(crc(one, self.packets.polynomial) for one in ones), np.eye(CRC_BITS, dtype=np.int64)]
+        )
         return np.vstack([of_crc, np.concatenate([ones[-1], np.zeros(CRC_BITS, dtype=np.int64)])])
 
     def data(self, soft: Floats, erased: NDArray[np.bool_]) -> Bits | None:
@@ -100,10 +103,10 @@ class PacketFormat:
         bits[missing] = filled
         return bits[:-CRC_BITS]
 
-    def centre_m(self, data: Bits) -> Floats:
-        """Centre (3,) of the panel by a packet's data bits, metres."""
-        of_axis = data[:-1].reshape(3, -1) @ (1 << np.arange(self.packets.coordinate_bits)[::-1])
-        return np.asarray(of_axis * self.packets.coordinate_unit_m)
+    def coordinates(self, data: Bits) -> tuple[int, int, int]:
+        """Centre of the panel by a packet's data bits, x, y, z in units of `coordinate_unit_m`."""
+        x, y, z = (data[:-1].reshape(3, -1) @ (1 << np.arange(self.packets.coordinate_bits)[::-1])).tolist()
+        return x, y, z
 
     def likeness(self, soft: Floats) -> Floats:
         """How much chips (length,), -1 to 1, look like a packet that starts at each of them, (length,)."""
@@ -133,8 +136,8 @@ def solved_mod_2(matrix: Bits, right: Bits) -> Bits | None:
 class PacketMatch:
     """A packet that a panel's LED images agree with: its data bits, the share of the light that it explains, and waves.
 
-    `erased` counts the bits that no line shows. `indices` (images,) is the index in the panel of each LED image. `misfit_ratio` is the misfit of the best other way
-    to lay the images over the panel, over that of this one.
+    `erased` counts the bits that no line shows. `indices` (images,) is the index in the panel of each LED image.
+    `misfit_ratio` is the misfit of the best other way to lay the images over the panel, over that of this one.
     """
 
     data: Bits
@@ -176,7 +179,7 @@ class _Fit:
         return int(np.maximum(self.shown - 1, 0).sum())
 
     def soft(self) -> tuple[Floats, Floats]:
-        """Chips (n,), about -1 to 1, near 0 where no line shows them; and their covariance (n, n), 1 where none does."""
+        """Chips (n,), about -1 to 1, 0 where no line shows them; and their covariance (n, n), 1 where none does."""
         ridge = RIDGE * np.trace(self.normal) / len(self.right) + 1e-12
         covariance = np.linalg.inv(self.normal / ridge + np.eye(len(self.right)))
         return np.clip(2 * covariance @ self.right / ridge, -1.5, 1.5), covariance
@@ -212,10 +215,11 @@ def decode_packet(
     if not hypotheses or not any(len(signal) for signals in normal for signal in signals):
         return None
     clock = _best_clock(normal, packets)
-    sums = [_added([clock.sums(signal, form.length) for signal in signals]).of_one_image() for signals in normal]
+    period = form.length
+    sums = [_added([clock.sums(signal, period) for signal in signals], period).of_one_image() for signals in normal]
     delays = np.array(packets.delays_chips)
     fits = [
-        _added([fit.turned(int(delays[index])) for fit, index in zip(sums, indices, strict=True)])
+        _added([fit.turned(int(delays[index])) for fit, index in zip(sums, indices, strict=True)], period)
         for indices in hypotheses
     ]
     for number, start, data, erased in _checked(fits, form):
@@ -327,10 +331,10 @@ def _best_clock(images: Sequence[Sequence[Signal]], packets: Packets) -> _Clock:
     return min(fine, key=misfit)
 
 
-def _added(fits: Sequence[_Fit]) -> _Fit:
+def _added(fits: Sequence[_Fit], period: int) -> _Fit:
     return _Fit(
-        np.sum([one.normal for one in fits], axis=0),
-        np.sum([one.right for one in fits], axis=0),
+        np.sum([np.zeros((period, period)), *(one.normal for one in fits)], axis=0),
+        np.sum([np.zeros(period), *(one.right for one in fits)], axis=0),
         sum(one.square for one in fits),
-        np.sum([one.shown for one in fits], axis=0),
+        np.sum([np.zeros(period, dtype=np.int64), *(one.shown for one in fits)], axis=0),
     )

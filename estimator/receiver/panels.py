@@ -1,15 +1,14 @@
 """Panels: which LED images are of one panel, and the ways to lay them over it.
 
-Gravity levels the image: LEDs of a panel are then seen as they stand, but for a rotation, a shift and a scale. The known
-size of an LED gives the scale at each image. Images nearer to each other than LEDs of different panels are one group; the
-images of a burst's frames are matched by their places.
+Gravity levels the image: LEDs of a panel are then seen as they stand, but for a rotation, a shift and a scale. The
+known size of an LED gives the scale. Images that are neighbours in a panel are of one group; the images of a burst's
+frames are matched by their places.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimator.camera.leveling import MIN_ELEVATION_SINE, tilt_from_gravity
 from estimator.camera.pose import rotation
@@ -26,6 +25,8 @@ PLACE = 0.3
 """An image is at an LED's place in the panel within this share of the distance of neighbouring LEDs."""
 PAIR = 0.25
 """Two images may be two LEDs if their distances differ by at most this share of the larger one."""
+FOLLOWED = 4.0
+"""Diameters that an LED image moves at most from one frame of a burst to the next. Ours."""
 MAX_OUTSIDE = 0.2
 """Share of a group's images that may be at no LED's place, such as a lamp of another kind among them."""
 
@@ -47,13 +48,17 @@ class Group:
     members: tuple[Member, ...]
     hypotheses: tuple[Ints, ...]
 
+    def alike(self) -> list[list[Ints]]:
+        """Hypotheses in lists that lay the same members, more frequent ones first."""
+        found: dict[tuple[bool, ...], list[Ints]] = {}
+        for one in self.hypotheses:
+            found.setdefault(tuple((one >= 0).tolist()), []).append(one)
+        return sorted(found.values(), key=lambda some: -len(some))
+
 
 @dataclass(frozen=True, eq=False)
 class _Level:
-    """A frame's LED images in a level view: places (n, 2), metres but for a common shift, and `seen` (n,), their numbers.
-
-    One unit of the level image plane is `scale_m`.
-    """
+    """A frame's LED images in a level view: places (n, 2), metres, and `seen` (n,), the numbers of the images."""
 
     places_m: Floats
     seen: Ints
@@ -77,6 +82,35 @@ def find_groups(
     return tuple(groups)
 
 
+def same_images(images: Sequence[Sequence[LedImage]]) -> tuple[tuple[tuple[int, int], ...], ...]:
+    """LED images of a burst that are of one LED, as (frame, number of the image), in the order of time.
+
+    An image follows the one in the frame before that is nearest, where each is the other's nearest and the distance is
+    less than MATCH of that to the next LED image, and than FOLLOWED diameters.
+    """
+    tracks: list[list[tuple[int, int]]] = [[(0, number)] for number in range(len(images[0]))] if images else []
+    for which in range(1, len(images)):
+        now = _pixels(images[which])
+        latest = [track for track in tracks if track[-1][0] == which - 1]
+        before = _pixels([images[which - 1][track[-1][1]] for track in latest])
+        followed: set[int] = set()
+        if len(now) and len(before):
+            away = np.linalg.norm(before[:, None] - now, axis=2)
+            gap = np.linalg.norm(now[:, None] - now, axis=2) + np.diag(np.full(len(now), np.inf))
+            for old, number in enumerate(away.argmin(axis=1).tolist()):
+                size_px = 4 * np.linalg.det(images[which][number].moments_px2) ** 0.25
+                limit_px = min(MATCH * gap[number].min(), FOLLOWED * size_px)
+                if away[:, number].argmin() == old and away[old, number] < limit_px:
+                    latest[old].append((which, number))
+                    followed.add(number)
+        tracks += [[(which, number)] for number in range(len(now)) if number not in followed]
+    return tuple(map(tuple, tracks))
+
+
+def _pixels(images: Sequence[LedImage]) -> Floats:
+    return np.array([(one.u_px, one.v_px) for one in images], dtype=np.float64).reshape(-1, 2)
+
+
 def _pitch_m(offsets: Floats) -> float:
     """Largest distance of an LED of a panel from the nearest other, metres; 0 for a single LED."""
     if len(offsets) < 2:
@@ -88,7 +122,7 @@ def _pitch_m(offsets: Floats) -> float:
 
 def _level(frame: DeviceFrame, images: Sequence[LedImage], packets: Packets, R_cam_world: Floats) -> _Level:
     """Level places of a frame's LED images, those at or below the horizon left out."""
-    pixels = np.array([(one.u_px, one.v_px) for one in images]).reshape(-1, 2)
+    pixels = _pixels(images)
     # Each image and a pixel beside it along u and along v.
     around = (pixels[:, None] + [(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)]).reshape(-1, 2)
     seen = np.flatnonzero(has_pinhole_image(around, frame.camera).reshape(-1, 3).all(axis=1))
@@ -109,7 +143,7 @@ def _level(frame: DeviceFrame, images: Sequence[LedImage], packets: Packets, R_c
 
 
 def _matched(levels: Sequence[_Level], pitch_m: float) -> tuple[Floats, Ints]:
-    """Places (n, 2) of the LEDs that any frame shows, and their numbers in each frame, (n, frames), -1 where not seen."""
+    """Places (n, 2) of the LEDs that any frame shows, and the number of each in each frame, (n, frames), or -1."""
     places = np.zeros((0, 2))
     numbers = np.zeros((0, len(levels)), dtype=np.int64)
     for which, level in enumerate(levels):
@@ -175,9 +209,7 @@ def _hypotheses(places: Floats, offsets: Floats, pitch_m: float) -> tuple[Ints, 
     return tuple(one for one in found.values() if (one >= 0).sum() == most)
 
 
-def _laid(
-    places: Floats, offsets: Floats, pair: tuple[int, int], onto: tuple[int, int], limit_m: float
-) -> Ints | None:
+def _laid(places: Floats, offsets: Floats, pair: tuple[int, int], onto: tuple[int, int], limit_m: float) -> Ints | None:
     """Index of each place where two of them are known; -1 beyond `limit_m` from any. None if two have the same.
 
     The nearest places are laid first, each over the LED nearest to where those before it put it.

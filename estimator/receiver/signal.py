@@ -31,6 +31,7 @@ class Signal:
     weight: Floats
 
     def __len__(self) -> int:
+        """Number of lines."""
         return len(self.start_s)
 
     @cached_property
@@ -78,7 +79,7 @@ def signal_of(lamp: Lamp, frame: DeviceFrame) -> Signal:
     level = profile.level_e[order]
     variance = 1 / profile.weight[order] + (ENVELOPE_SHARE * level) ** 2
     start_s = frame.start_s + lines[order] * frame.camera.shutter.row_time_s
-    return Signal(start_s, frame.exposure_s, level, 1 / variance)
+    return Signal(np.asarray(start_s, dtype=np.float64), frame.exposure_s, level, 1 / variance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +126,8 @@ class WaveGains:
 
     def __call__(self, lines: Ints) -> Floats:
         """Gains (n,) at lines (n,), counted in readout order from 0 on."""
-        return self.wave.gains(self.frame_start_s + np.asarray(lines) * self.row_time_s, self.exposure_s)
+        start_s = self.frame_start_s + np.asarray(lines, dtype=np.float64) * self.row_time_s
+        return self.wave.gains(np.asarray(start_s), self.exposure_s)
 
     def later(self, chips: float) -> "WaveGains":
         """The gains if the wave were `chips` chips further in its period."""
@@ -138,10 +140,11 @@ def overlaps(signal: Signal, chip_s: float, phase: float) -> Floats:
     during = signal.exposure_s / chip_s
     chips = np.arange(int(np.floor(at[-1] + during)) + 1)
     covered = np.minimum(at[:, None] + during, chips + 1) - np.maximum(at[:, None], chips)
-    return np.clip(covered, 0, None) / during
+    return np.asarray(np.clip(covered, 0, None) / during)
 
 
 def folded(shares: Floats, period: int) -> Floats:
     """Overlaps (n, chips) with chips of equal place in the period added, (n, period)."""
     missing = -shares.shape[1] % period
-    return np.asarray(np.pad(shares, ((0, 0), (0, missing))).reshape(len(shares), -1, period).sum(axis=1))
+    whole = np.pad(shares, ((0, 0), (0, missing))).reshape(len(shares), -1, period)
+    return np.asarray(whole.sum(axis=1), dtype=np.float64)
