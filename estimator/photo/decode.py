@@ -55,13 +55,14 @@ class FoundLamp:
         if self.tone.at_border:
             return f"{self.tone.frequency_hz:.0f} Hz is at the border of the band"
         if not self.tone.clear:
-            return f"{self.tone.frequency_hz:.0f} Hz explains {100 * self.tone.share:.0f} % of the stripes' energy"
+            share = max(100 * self.tone.share, 0.0)
+            return f"{self.tone.frequency_hz:.0f} Hz explains {share:.0f} % of the stripes' energy"
         return f"{self.tone.frequency_hz:.0f} Hz is no LED's tone"
 
 
 def readout_ratio(picture: Picture) -> tuple[Along, float]:
     """What lines are, by the gradients of the bright parts, and by how many times they exceed the other axis'."""
-    coded = picture.coded()
+    coded = picture.coded
     bright = (coded > LAMP_SHARE * coded.max()).view(np.uint8)
     near = cv2.dilate(bright, np.ones((2 * LAMP_RADIUS_PX + 1, 2 * LAMP_RADIUS_PX + 1), np.uint8)).view(np.bool_)
     down, right = np.diff(coded, axis=0) ** 2, np.diff(coded, axis=1) ** 2
@@ -81,10 +82,10 @@ def find(
 ) -> list[FoundLamp]:
     """Lamps of a picture with the tones of the map's LEDs; larger ones first.
 
-    `along` says what lines are, `line_time_s` is the time between two of them. `frequencies_hz` are those of the LEDs, by
-    id. Stripes are looked at in the coded picture, where dim and bright parts of a lamp weigh alike.
+    `along` says what lines are, `line_time_s` is the time between two of them. `frequencies_hz` are those of the LEDs,
+    by id. Stripes are looked at in the coded picture, where dim and bright parts of a lamp weigh alike.
     """
-    coded = picture.coded()
+    coded = picture.coded
     readout = Readout(0, 0, coded, coded, picture.clipped, FLOOR)
     longest_s = 0.5 / min(frequencies_hz.values()) + exposure_s
     lamps = find_lamps([readout], along, longest_s / line_time_s, coded.size, any_square)
@@ -106,7 +107,7 @@ def _tone(lamp: Lamp, line_time_s: float, exposure_s: float, band: tuple[float, 
     envelope = envelope_of(whole, int(np.ceil(1 / band[0] / line_time_s)))
     highest = float(envelope.max())
     used = envelope >= MIN_ENVELOPE * highest
-    variance = (LEVEL_SHARE * envelope) ** 2 + (FLOOR_SHARE * highest) ** 2 + 1 / profile.weight
+    variance: Floats = (LEVEL_SHARE * envelope) ** 2 + (FLOOR_SHARE * highest) ** 2 + 1 / profile.weight
     signal = Signal(whole.start_s[used], exposure_s, whole.level[used], 1 / variance[used])
     low, high = band_hz(line_time_s, exposure_s, int(used.sum()))
     return fit_tone(signal, (max(low, band[0]), min(high, band[1])), envelope=envelope[used])
