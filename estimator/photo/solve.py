@@ -35,7 +35,7 @@ MIN_LEDS = 3
 PRIOR_SIGMA_PX = 1.5
 PRIOR_RESIDUALS = 4.0
 SIGMA_ROUNDS = 3
-# Centroids of hypotheses have this standard deviation, as a share of the picture's width: the map may be off by as much.
+# Standard deviation of the centroids of hypotheses, as a share of the picture's width: the map may be off by as much.
 ROUGH_SHARE = 5e-4
 # A hypothesis is taken if it is this many times as likely as every other one: chi-square by 13.8.
 MIN_CLEAR_CHI2 = 2 * float(np.log(1000))
@@ -110,9 +110,9 @@ def solve(
 ) -> Solved:
     """Positions of a picture's camera; of the frame, camera and accelerometer are used.
 
-    `mirrors` are the ways to reverse an axis of the map that are tried. `sigma_px` is the further standard deviation of
-    each coordinate of a centroid; None for one by the residuals. Raises EstimationFailure if too few LEDs are identified,
-    no assignment is clearly the likeliest, or the map does not fit the spots.
+    `mirrors` are the ways to reverse an axis of the map that are tried. `sigma_px` is the further standard deviation
+    of each coordinate of a centroid; None for one by the residuals. Raises EstimationFailure if too few LEDs are
+    identified, no assignment is clearly the likeliest, or the map does not fit the spots.
     """
     identified = sum(bool(centre.candidates) for centre in centres)
     if identified < MIN_LEDS:
@@ -282,8 +282,8 @@ def _check_fit(frame: DeviceFrame, answers: Sequence[Answer]) -> None:
     if fitting.mean() < MIN_INLIER_SHARE or np.sqrt((off[fitting] ** 2).mean()) > limit_px:
         raise EstimationFailure(
             "position",
-            f"the map does not fit the spots: residuals of {np.sqrt((off**2).mean()):.0f} px, at most {limit_px:.0f} px are "
-            "allowed; check the map, its frequencies, --mirror, and the focal length",
+            f"the map does not fit the spots: residuals of {np.sqrt((off**2).mean()):.0f} px, at most {limit_px:.0f} "
+            "px are allowed; check the map, its frequencies, --mirror, and the focal length",
         )
 
 
