@@ -111,7 +111,8 @@ def _tone(lamp: Lamp, line_time_s: float, exposure_s: float, lowest_hz: float, h
     used = envelope >= MIN_ENVELOPE * highest
     variance = (LEVEL_SHARE * envelope) ** 2 + (FLOOR_SHARE * highest) ** 2 + 1 / profile.weight
     weight = np.asarray(1 / variance[used], dtype=np.float64)
-    signal = Signal(whole.start_s[used], exposure_s, whole.level[used], weight)
+    starts_s, levels = np.asarray(whole.start_s[used]), np.asarray(whole.level[used], dtype=np.float64)
+    signal = Signal(starts_s, exposure_s, levels, weight)
     low, high = band_hz(line_time_s, exposure_s, int(used.sum()))
     band = max(low, lowest_hz / BAND_BEYOND), min(high, highest_hz * BAND_BEYOND)
     fits = [fit for duty in DUTIES if (fit := fit_tone(signal, band, duty, envelope[used])) is not None]
