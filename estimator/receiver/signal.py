@@ -13,8 +13,10 @@ from estimator.spots.striped import Lamp
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-# Error of a line's level that its noise does not include, as a share of the level: chord, vignetting, face. Ours.
+# Error of a line's level that its noise does not include, as a share of the bright lines' level: chord, background,
+# vignetting, face. It is the same for all lines: dark ones, of little noise, would else decide alone. Ours.
 ENVELOPE_SHARE = 0.02
+BRIGHT_PERCENTILE = 90.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +79,8 @@ def signal_of(lamp: Lamp, frame: DeviceFrame) -> Signal:
     lines = lines_of(frame.camera.shutter, profile.lines, frame.camera.line_count)
     order = np.argsort(lines)
     level = profile.level_e[order]
-    variance = 1 / profile.weight[order] + (ENVELOPE_SHARE * level) ** 2
+    bright = float(np.percentile(level, BRIGHT_PERCENTILE)) if len(level) else 0.0
+    variance = 1 / profile.weight[order] + (ENVELOPE_SHARE * bright) ** 2
     start_s = frame.start_s + lines[order] * frame.camera.shutter.row_time_s
     return Signal(np.asarray(start_s, dtype=np.float64), frame.exposure_s, level, 1 / variance)
 
