@@ -170,8 +170,10 @@ def ml(frame: DeviceFrame) -> Estimate:
     """The most likely position and its covariance; raises EstimationFailure.
 
     The initial pose is that of `gravity_fit`, which also decides whether the estimate is ambiguous and whether gravity
-    is used. With two spots the initial pose is the fit to them and gravity.
+    is used. With two spots the initial pose is the fit to them and gravity. LEDs without a size have no model.
     """
+    if not all(led.has_size for led in frame.leds.values()):
+        raise EstimationFailure("fit", "the map does not say how large its LEDs are")
     correspondences = find_correspondences(frame)
     observations = observe(frame, correspondences)
     inliers, use_gravity, is_ambiguous = np.ones(len(observations.leds_m), dtype=bool), True, False
@@ -251,7 +253,9 @@ def _maximize_honestly(
 
 
 def gravity_of(frame: DeviceFrame) -> Gravity:
-    """Prior of the rig's tilts by a frame's accelerometer."""
+    """Prior of the rig's tilts by a frame's accelerometer; NO_GRAVITY without one."""
+    if frame.accelerometer is None or frame.accelerometer_m_s2 is None:
+        return NO_GRAVITY
     x, y, z = (frame.camera.R_cam_rig_array().T @ frame.accelerometer_m_s2).tolist()
     tilts = tilt_from_gravity((x, y, z))
     return Gravity(np.array(tilts), tilt_sigmas(frame.accelerometer, tilts[1]))

@@ -211,18 +211,20 @@ class ToneMatch:
     fit: ToneFit
 
 
-def match_tone(fit: ToneFit, frequencies_hz: Mapping[int, float], clock_error: float = 0.0) -> ToneMatch | None:
+def match_tone(
+    fit: ToneFit, frequencies_hz: Mapping[int, float], clock_error: float = 0.0, added_sigma_hz: float = 0.0
+) -> ToneMatch | None:
     """The LEDs, by id, whose frequency a fitted one is; None where it is none of them, or not clearly one.
 
-    It lies within GATE_SIGMA standard deviations of the fit and of the clocks, relative, and every other frequency is
-    CLEARANCE times further away.
+    It lies within GATE_SIGMA standard deviations of the fit and of the clocks, relative, and of `added_sigma_hz`, and
+    every other frequency is CLEARANCE times further away.
     """
     if not fit.clear or not frequencies_hz:
         return None
     nominal = np.unique(np.array(list(frequencies_hz.values())))
     off = np.abs(nominal - fit.frequency_hz)
     best = int(off.argmin())
-    gate = GATE_SIGMA * float(np.hypot(fit.sigma_hz, clock_error * nominal[best]))
+    gate = GATE_SIGMA * float(np.sqrt(fit.sigma_hz**2 + (clock_error * nominal[best]) ** 2 + added_sigma_hz**2))
     if off[best] > gate or (np.delete(off, best) < CLEARANCE * off[best]).any():
         return None
     leds = tuple(led for led, frequency in frequencies_hz.items() if frequency == nominal[best])
