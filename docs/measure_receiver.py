@@ -18,11 +18,11 @@ from estimator.io.downlink import Packets
 from estimator.io.estimates import EstimateRow
 from estimator.io.truth import WHOLE, read_true_map, read_truth
 from estimator.receiver.bits import bit_error_rates, chip_levels
-from estimator.receiver.lamps import lamps_of
 from estimator.receiver.packets import PacketFormat, decode_packet
 from estimator.receiver.panels import find_groups
 from estimator.receiver.receive import receive_frames
 from estimator.receiver.signal import ChipWave, Signal, led_image, overlaps
+from estimator.spots.lamps import lamps_of
 
 Floats = NDArray[np.float64]
 ROW_TIME_S = 10e-6

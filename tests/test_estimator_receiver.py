@@ -23,7 +23,7 @@ from estimator.receiver.bits import NOT_SEEN, bit_error_rates, bits_seen, chip_l
 from estimator.receiver.codes import PHASES, code_books, match_code, match_code_of_frames
 from estimator.receiver.packets import MAX_ERASED, PacketFormat, crc, decode_packet, solved_mod_2
 from estimator.receiver.panels import find_groups, same_images
-from estimator.receiver.signal import ChipWave, LedImage, Signal, WaveGains, folded, overlaps
+from estimator.receiver.signal import ChipWave, LedImage, PulseWave, Signal, WaveGains, folded, overlaps
 
 CHIP_S = 25e-6
 CODES = balanced_codes(200, 32, np.random.default_rng(5))
@@ -54,8 +54,18 @@ def test_gains_at_the_lines_of_a_frame() -> None:
     gains = WaveGains(wave, 2.5, ROW_TIME_S, EXPOSURE_S)
     lines = np.array([0, 7, 2999])
     assert gains(lines) == pytest.approx(wave.gains(2.5 + lines * ROW_TIME_S, EXPOSURE_S))
-    assert gains.later(2.5)(lines) == pytest.approx(gains(lines + round(2.5 * CHIP_S / ROW_TIME_S * 4) / 4), abs=0.2)
-    assert WaveGains(wave, 2.5 + 2.5 * CHIP_S, ROW_TIME_S, EXPOSURE_S)(lines) == pytest.approx(gains.later(2.5)(lines))
+    later = WaveGains(wave, 2.5 + 60e-6, ROW_TIME_S, EXPOSURE_S)
+    assert later(lines) == pytest.approx(gains.advanced(60e-6)(lines))
+    assert np.abs(later(lines) - gains(lines)).max() > 0.5
+
+
+@pytest.mark.parametrize(("duty", "depth"), [(0.5, 1.0), (0.2, 0.6)])
+def test_a_square_wave_by_the_midpoint_rule(duty: float, depth: float) -> None:
+    starts_s = 0.3 + np.random.default_rng(1).uniform(0, 1e-2, 50)
+    told = PulseWave(2100.0, duty, depth, 0.3, 0.4).gains(starts_s, EXPOSURE_S)
+    chips = "1" * round(10 * duty) + "0" * round(10 - 10 * duty)
+    true = Sent(chips, 1 / 21000, 4 - 0.3 * 21000, depth).gains(starts_s)
+    assert np.abs(told - true).max() < 2 * 5 / 800
 
 
 def test_overlaps_of_lines_with_chips_by_hand() -> None:

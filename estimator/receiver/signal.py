@@ -119,10 +119,35 @@ class ChipWave:
 
 
 @dataclass(frozen=True, eq=False)
+class PulseWave:
+    """Square wave of mean 1: bright for the share `duty` of each period; at `at_s` it has made `phase` periods.
+
+    Dark it has the share 1 - `depth` of the bright level.
+    """
+
+    frequency_hz: float
+    duty: float
+    depth: float
+    at_s: float
+    phase: float
+
+    def gains(self, start_s: Floats, exposure_s: float) -> Floats:
+        """Mean of the wave over exposures that start at (n,), exact."""
+        at = (start_s - self.at_s) * self.frequency_hz + self.phase
+        during = exposure_s * self.frequency_hz
+        return np.asarray((self._integral(at + during) - self._integral(at)) / during)
+
+    def _integral(self, at: Floats) -> Floats:
+        bright = 1 / (self.duty + (1 - self.duty) * (1 - self.depth))
+        whole = np.floor(at)
+        return np.asarray(whole + np.interp(at - whole, [0.0, self.duty, 1.0], [0.0, self.duty * bright, 1.0]))
+
+
+@dataclass(frozen=True, eq=False)
 class WaveGains:
     """Gains of an LED at the lines of one frame, by the wave that was decoded (`estimator.io.device.LineGains`)."""
 
-    wave: ChipWave
+    wave: ChipWave | PulseWave
     frame_start_s: float
     row_time_s: float
     exposure_s: float
@@ -132,9 +157,9 @@ class WaveGains:
         start_s = self.frame_start_s + np.asarray(lines, dtype=np.float64) * self.row_time_s
         return self.wave.gains(np.asarray(start_s), self.exposure_s)
 
-    def later(self, chips: float) -> "WaveGains":
-        """The gains if the wave were `chips` chips further in its period."""
-        return replace(self, wave=replace(self.wave, start_chips=self.wave.start_chips + chips))
+    def advanced(self, seconds: float) -> "WaveGains":
+        """The gains if the wave were `seconds` further in its period."""
+        return replace(self, wave=replace(self.wave, at_s=self.wave.at_s - seconds))
 
 
 def overlaps(signal: Signal, chip_s: float, phase: float) -> Floats:
