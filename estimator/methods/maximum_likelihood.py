@@ -62,7 +62,8 @@ from estimator.pixels.nuisances import (
     solve,
     square_root,
 )
-from estimator.solvers.reprojection import Observations, fit, observe
+from estimator.solvers.observations import Observations, observe
+from estimator.solvers.reprojection import fit
 from estimator.solvers.uncertainty import assumed_uncertainty
 from estimator.spots.correspondences import find_correspondences
 from estimator.spots.identify import Correspondence
@@ -281,7 +282,7 @@ def start_at_spots(
         camera = with_errors(frame.camera, nuisances.camera)
         points_m = of_spots.positions_m + nuisances.shifts_m(of_spots)
         offset_m = points_m - pose.position_m
-        # See `estimator.solvers.reprojection` on the eccentricity of a centroid.
+        # See `estimator.solvers.observations` on the eccentricity of a centroid.
         points_m[:, 2] += lift_m2 * offset_m[:, 2] / (offset_m**2).sum(axis=1)
         points_m[:, :2] += by_gradient_m[:, None] * nuisances.profile()[:, :2]
         images = project(points_m, pose, camera)
