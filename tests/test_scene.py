@@ -95,7 +95,7 @@ BAD_TABLE1 = [
     (
         "radius_m = 0.01",
         "radius_m = 0.01\ncolour = 3",
-        r"unknown key led\[0\]\.colour; allowed: face_falloff, face_gradient,",
+        r"unknown key led\[0\]\.colour; allowed: downlink, face_falloff, face_gradient,",
     ),
     ("radius_m = 0.01", 'shape = "square"\nradius_m = 0.01', r"led\[0\]\.radius_m: .*a square has side_m"),
     ("radius_m = 0.01", "side_m = 0.02", r"led\[0\]\.side_m: .*a disc has radius_m"),

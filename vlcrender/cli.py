@@ -5,6 +5,7 @@ so that `--help` loads neither Mitsuba nor SciPy.
 """
 
 import logging
+import math
 import os
 import sys
 from collections.abc import Iterator, Sequence
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
     from vlcrender.dataset.error_budget import ErrorBudget
     from vlcrender.dataset.progress import Progress
     from vlcrender.emva1288.datasheet import Datasheet
+    from vlcrender.scene.loader import Scene
+
+log = logging.getLogger(__name__)
 
 
 def _version() -> str:
@@ -147,7 +151,7 @@ def verify(directory: Path, /) -> None:
 
 @app.command
 def show(scene: str, /, *, out: Path | None = None, reference: Annotated[bool, Parameter(negative=())] = False) -> None:
-    """Draw a room's floor plan and a camera's view of it; print the share of poses that see four LEDs or more.
+    """Draw a room's floor plan and a camera's view of it; print how many poses see four LEDs or more, and the flicker.
 
     Parameters
     ----------
@@ -193,7 +197,35 @@ def show(scene: str, /, *, out: Path | None = None, reference: Annotated[bool, P
 
     draw(loaded, camera, path, reference)
     Console(width=max(Console().width, 100)).print(table)
+    _print_flicker(loaded)
     print(f"{path}: written")
+
+
+def _print_flicker(scene: "Scene") -> None:
+    """Print how much the LEDs of a scene flicker, and warn where that exceeds low risk; nothing for steady light."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from vlcrender.modulation.flicker import flicker_of, flicker_warning
+
+    found = flicker_of(scene.leds.transmitters)
+    if not found:
+        return
+    table = Table(title=f"{scene.name}: flicker against IEEE 1789, worst line of the spectra of all LEDs")
+    for heading in ("sends", "LEDs", "limit", "modulation", "at", "allowed", "of limit", "LEDs beyond"):
+        table.add_column(heading, justify="left" if heading in ("sends", "limit") else "right")
+    for one in found:
+        for name, line, beyond in (
+            ("low risk", one.worst.low_risk, one.low_risk_exceeded),
+            ("no effect", one.worst.no_effect, one.no_effect_exceeded),
+        ):
+            allowed = "any" if math.isinf(line.limit_percent) else f"{line.limit_percent:.3g} %"
+            own = [f"{line.percent:.3g} %", f"{line.frequency_hz:.5g} Hz", allowed, f"{line.share:.2f}", str(beyond)]
+            table.add_row(one.send, str(one.leds), name, *own)
+    Console(width=max(Console().width, 100)).print(table)
+    warning = flicker_warning(found)
+    if warning is not None:
+        log.warning("%s", warning)
 
 
 @app.command

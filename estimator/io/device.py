@@ -425,6 +425,21 @@ def decoding_problem(spots: Sequence[DecodedSpot], leds: Mapping[int, Led]) -> s
     return None
 
 
+class Identity(Row):
+    """What a receiver decoded of an LED image: the LED, None if none was accepted, and the image's centre.
+
+    `correlation` is that of the image's lines with the decoded wave, `bits` the chips of one period as the lines show
+    them ("-" where not seen), and `position_m` the LED's, where a packet told it and the map is null.
+    """
+
+    led: LedId | None
+    u_px: Number
+    v_px: Number
+    correlation: float = Field(ge=-1.001, le=1.001)
+    bits: str | None = None
+    position_m: Triple | None = None
+
+
 def gyro_problem(reading_rad_s: Sequence[float] | None, gyroscope: Gyroscope | None) -> str | None:
     """What is wrong with a frame's reading of the gyroscope, None if nothing: a reading without a gyroscope."""
     return "gyro_rad_s is given, but gyroscope is null" if reading_rad_s is not None and gyroscope is None else None
@@ -498,6 +513,8 @@ class DeviceFrame:
     """Errors of the gyroscope; None without one."""
     downlink: Downlink | None = None
     """What the LEDs send; None where the device cannot receive."""
+    identities: tuple[Identity, ...] | None = None
+    """What a receiver decoded; None where it has not been asked."""
     gains: Mapping[int, LineGains] = field(default_factory=dict)
     """Gain of an LED, by id, at each line, as its signal was decoded; without an entry an LED counts as steady."""
 

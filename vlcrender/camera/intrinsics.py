@@ -240,7 +240,7 @@ class Camera(Settings):
         return inverse
 
     def line_starts_s(self) -> NDArray[np.float64]:
-        """Start of each line's exposure after the frame's, s: (height, 1), (1, width), or (1, 1) for a global shutter."""
+        """Start of each line's exposure after the frame's, s: (height, 1) or (1, width); (1, 1) of a global shutter."""
         return self.shutter.line_starts_s(self.width_px, self.height_px)
 
     def middle_s(self, exposure_s: float) -> float:

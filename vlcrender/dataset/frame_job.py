@@ -1,13 +1,14 @@
 """One frame of a dataset: render, expose, write its files, and return its rows."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cache, lru_cache
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
 
 from vlcrender.camera.intrinsics import Camera, Pose
+from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.rig import Mounted
 from vlcrender.camera.roi import RegionImage, Roi
 from vlcrender.core.random_keys import random_key, stream
@@ -19,7 +20,7 @@ from vlcrender.dataset.motion import poses_during
 from vlcrender.dataset.pose_sampling import pose_of_frame
 from vlcrender.dataset.preview import write_preview
 from vlcrender.dataset.recipe import Recipe
-from vlcrender.dataset.schema import Flat9, FrameRecord, FrameRow, LedTruth, TruthRow, five, flat9, triple
+from vlcrender.dataset.schema import Flat9, FrameRecord, FrameRow, LedTruth, SpotRow, TruthRow, five, flat9, triple
 from vlcrender.dataset.true_world import (
     built_leds,
     device_of_pose,
@@ -32,9 +33,13 @@ from vlcrender.dataset.true_world import (
     true_camera,
 )
 from vlcrender.light.lightmap import bake
+from vlcrender.modulation.exposure import LineGains, MeanWave
+from vlcrender.modulation.transmission import led_waves
+from vlcrender.modulation.wave import Wave
 from vlcrender.rendering.bayer import MosaicRenderer
 from vlcrender.rendering.crlb import FrameSlopes
-from vlcrender.rendering.expected_image import ExpectedImage
+from vlcrender.rendering.expected_image import ExpectedImage, Gain, Gains, LedPatch, gain_in
+from vlcrender.rendering.readout import RollingPoses
 from vlcrender.rendering.renderer import Renderer
 from vlcrender.scene.loader import Scene, build_scene
 from vlcrender.scene.schema import SceneSettings
@@ -53,27 +58,43 @@ class Job:
     directory: str
 
 
+def make_frames(job: Job, frames: Sequence[int]) -> list[FrameRecord]:
+    """`make_frame` of several frames."""
+    return [make_frame(job, frame) for frame in frames]
+
+
 def make_frame(job: Job, frame: int) -> FrameRecord:
-    """Render, expose and write one frame, and return its rows; depends on nothing but its arguments."""
+    """Render, expose and write one frame, and return its rows; depends on nothing but its arguments.
+
+    A view that the frame before had too, such as that of a burst, is not rendered again.
+    """
     recipe, renderer = _renderer(job.recipe_json, job.scene_json, job.scene_folder)
     directory = Path(job.directory)
     pose_number, shot, which = recipe.place_of_frame(frame)
     device = device_of_pose(recipe, pose_number)
+    map_number = map_of_device(recipe, device)
     told = recipe.cameras[which]
     camera, sensor = told.camera, Roi.of_sensor(told.camera)
-    mean = _noise_free_frame(job, pose_number, which, frame if shots_differ(recipe) else None)
-    main, pose, view, exposure_s, expected = mean.main, mean.pose, mean.view, mean.exposure_s, mean.expected
+    number = 0 if recipe.motion is None else shot % recipe.burst_frames
+    views = _views_at(job, pose_number, number, frame if shots_differ(recipe) else None)
+    if which not in views:
+        views[which] = _rendered(job, pose_number, number, which, frame if shots_differ(recipe) else None)
+    view = views[which]
+    image, pose, exposure_s = view.image, view.posed.pose, view.exposure_s
+    waves = _waves(job, map_number)
+    start_s = recipe.start_s(shot, bool(waves))
+    exposed = view.exposed(waves, start_s)
     noise = random_key(recipe.seed, frame, "shot-noise")
     of_device = device_sensor(recipe, device)
     dn = [
-        RegionImage(roi, expose(of_device, image, noise, roi.row, roi.column, exposure_s=exposure_s, camera=told.name))
-        for roi, image in expected
+        RegionImage(roi, expose(of_device, mean, noise, roi.row, roi.column, exposure_s=exposure_s, camera=told.name))
+        for roi, mean in exposed.expected
     ]
     attributes = exr_attributes(camera, told.name, exposure_s, frame)  # of the told camera: a reader sees them
     file = f"{FRAMES}/{frame:06d}.exr"
     digest = write_exr(directory / file, dn, sensor, attributes)
     if recipe.expected:
-        write_exr(directory / EXPECTED / f"{frame:06d}.exr", expected, sensor, attributes)
+        write_exr(directory / EXPECTED / f"{frame:06d}.exr", exposed.expected, sensor, attributes)
     preview = directory / PREVIEWS / f"{frame:06d}.png"
     write_preview(preview, dn, sensor, recipe.sensor.largest_dn, recipe.sensor.black_level_dn)
     if recipe.processed is not None:
@@ -82,89 +103,151 @@ def make_frame(job: Job, frame: int) -> FrameRecord:
         )
         recipe.processed.write(directory / PROCESSED / f"{frame:06d}{recipe.processed.suffix}", picture)
     # The rig has one accelerometer: its error belongs to the shot. The device turns its reading by the told mounting.
-    reading = told.rotation @ reading_m_s2(recipe, device, shot, main)
+    reading = told.rotation @ reading_m_s2(recipe, device, shot, view.main)
     gyro = None
     if recipe.gyroscope is not None:
         gyro = triple(told.rotation @ gyro_rad_s(recipe, recipe.gyroscope, device, shot))
+    spots: tuple[SpotRow, ...] = ()
+    if recipe.demodulation == "given":
+        spots = decoded_spots(image.parts, camera.width_px, stream(recipe.seed, frame, "demodulator"))
     known = FrameRow(
         frame=frame,
         shot=shot,
         burst=shot // recipe.burst_frames,
-        start_s=recipe.start_s(shot, modulated=False),
+        start_s=start_s,
         pose=pose_number,
         device=device,
         file=file,
         sha256=digest,
         camera=told.name,
         exposure_s=exposure_s,
-        capturable=all(sensor.contains(part.roi) for part in view.parts),
+        capturable=all(sensor.contains(part.roi) for part in image.parts),
         accelerometer_m_s2=reading.tolist(),
         gyro_rad_s=gyro,
-        spots=decoded_spots(view.parts, camera.width_px, stream(recipe.seed, frame, "demodulator")),
+        spots=spots,
     )
+    angular = linear = None
+    if recipe.motion is not None:
+        angular, linear = map(triple, recipe.motion.velocities_of(view.mounted, view.middle))
     truth = TruthRow(
         frame=frame,
         shot=shot,
-        map=map_of_device(recipe, device),
-        K=flat9(mean.camera.matrix),
-        distortion=five(mean.camera.distortion),
+        map=map_number,
+        K=flat9(view.mounted.camera.matrix),
+        distortion=five(view.mounted.camera.distortion),
         position_m=pose.position_m,
         R_cam_world=flat9(pose.rotation),
         tilt_x_deg=pose.tilt_x_deg,
         tilt_y_deg=pose.tilt_y_deg,
         yaw_deg=pose.yaw_deg,
-        angular_velocity_rad_s=None,
-        linear_velocity_m_s=None,
+        angular_velocity_rad_s=angular,
+        linear_velocity_m_s=linear,
         leds=tuple(
-            LedTruth(
-                led=p.led_id,
-                u_px=p.center_px[0],
-                v_px=p.center_px[1],
-                visible_fraction=p.visible_fraction,
-                clock_error=None,
-                phase=None,
-                bits=None,
-            )
-            for p in sorted(view.patches, key=lambda p: p.led_id)
+            _led_truth(patch, waves.get(patch.led_id), start_s)
+            for patch in sorted(image.patches, key=lambda patch: patch.led_id)
         ),
-        bound_m2=mean.bound_m2,
-        bound_exact_m2=mean.bound_exact_m2,
+        bound_m2=exposed.bound_m2,
+        bound_exact_m2=exposed.bound_exact_m2,
     )
     return FrameRecord(device=known, truth=truth)
 
 
-@dataclass(frozen=True)
-class _NoiseFreeFrame:
-    """A camera's frame at a pose without its noise: shared by all repeats of the pose with the same true camera."""
+def _led_truth(patch: LedPatch, wave: Wave | None, start_s: float) -> LedTruth:
+    return LedTruth(
+        led=patch.led_id,
+        u_px=patch.center_px[0],
+        v_px=patch.center_px[1],
+        visible_fraction=patch.visible_fraction,
+        clock_error=None if wave is None else wave.clock_error,
+        phase=None if wave is None else float(wave.phase(start_s)),
+        bits=None if wave is None else wave.bits,
+    )
 
-    main: Pose
-    pose: Pose
-    camera: Camera
-    """The true camera."""
-    view: ExpectedImage
-    exposure_s: float
+
+@dataclass(frozen=True)
+class _Exposed:
+    """A frame without its noise."""
+
     expected: list[RegionImage]
     bound_m2: Flat9 | None
     bound_exact_m2: Flat9 | None
 
 
+@dataclass(frozen=True, eq=False)
+class _View:
+    """What a true camera sees from a pose: shared by all frames there of a camera with the same errors."""
+
+    recipe: Recipe
+    renderer: Renderer | MosaicRenderer
+    mounted: Mounted
+    """The true camera."""
+    main: Pose
+    """Pose of the camera `main` in the middle of its frame."""
+    middle: Pose
+    """Pose of the camera `main` in the middle of this camera's frame."""
+    image: ExpectedImage
+    exposure_s: float
+    room: MeanWave
+    """Light of all LEDs of the room."""
+
+    @property
+    def posed(self) -> PosedCamera:
+        """The camera in the middle of its frame."""
+        return self.mounted.posed(self.middle)
+
+    def exposed(self, waves: Mapping[int, Wave], start_s: float) -> _Exposed:
+        """The exposure of a frame that starts at `start_s`; computed once where all light is steady."""
+        return self._with_gains(waves, start_s) if waves else self._steady
+
+    @cached_property
+    def _steady(self) -> _Exposed:
+        return self._with_gains({}, 0.0)
+
+    def _with_gains(self, waves: Mapping[int, Wave], start_s: float) -> _Exposed:
+        gains: Gains | None = None
+        room_gain: Gain = 1.0
+        if waves:
+            starts_s = start_s + self.mounted.camera.line_starts_s()
+            gains = LineGains(waves, starts_s, self.exposure_s)
+            room_gain = self.room.mean(starts_s, self.exposure_s)
+        expected = [
+            RegionImage(part.roi, part.expected_electrons(self.exposure_s, gains, room_gain))
+            for part in self.image.parts
+        ]
+        hybrid, exact = _bounds_m2(
+            self.recipe, self.renderer, self.mounted, self.main, self.exposure_s, expected, gains
+        )
+        return _Exposed(expected, hybrid, exact)
+
+
 @lru_cache(maxsize=1)
-def _noise_free_frame(job: Job, pose_number: int, which: int, frame: int | None) -> _NoiseFreeFrame:
-    """Render camera number `which` of the rig at a pose; kept for the next repeat.
+def _views_at(job: Job, pose_number: int, number: int, frame: int | None) -> dict[int, _View]:
+    """Views of the cameras of a rig at a place, by the camera's number; kept until frames at another place are made."""
+    return {}
+
+
+def _rendered(job: Job, pose_number: int, number: int, which: int, frame: int | None) -> _View:
+    """Render camera number `which` of the rig at a pose, in shot `number` of a burst.
 
     frame: whose errors of a shot the camera has; None where no shot has errors of its own.
     """
     recipe, of_scene = _renderer(job.recipe_json, job.scene_json, job.scene_folder)
     device = device_of_pose(recipe, pose_number)
-    renderer = _renderer_of_map(job.recipe_json, job.scene_json, job.scene_folder, map_of_device(recipe, device))
+    map_number = map_of_device(recipe, device)
+    renderer = _renderer_of_map(job.recipe_json, job.scene_json, job.scene_folder, map_number)
     mounted = true_camera(recipe, which, device, frame)
-    main, during = poses_of(recipe, of_scene.scene, pose_number, mounted)
-    posed = mounted.posed(main)
-    view = renderer.expected_image(posed, recipe.regions, during)
-    exposure_s = recipe.time_s(view)
-    expected = [RegionImage(part.roi, part.expected_electrons(exposure_s)) for part in view.parts]
-    hybrid, exact = _bounds_m2(recipe, renderer, mounted, main, exposure_s, expected)
-    return _NoiseFreeFrame(main, posed.pose, mounted.camera, view, exposure_s, expected, hybrid, exact)
+    main, middle, during = poses_of(recipe, of_scene.scene, pose_number, mounted, number)
+    waves, leds = _waves(job, map_number), of_scene.scene.leds
+    image = renderer.expected_image(mounted.posed(middle), recipe.regions, during, room_apart=bool(waves))
+    room = MeanWave.of(waves, dict(zip(leds.ids.tolist(), leds.fluxes_lm.tolist(), strict=True)))
+    return _View(recipe, renderer, mounted, main, middle, image, recipe.time_s(image), room)
+
+
+@cache
+def _waves(job: Job, map_number: int) -> dict[int, Wave]:
+    """The wave of each LED of a map that is not steady, by its id."""
+    recipe, renderer = _renderer(job.recipe_json, job.scene_json, job.scene_folder)
+    return led_waves(renderer.scene.leds.transmitters, recipe.seed, map_number)
 
 
 def _bounds_m2(
@@ -174,10 +257,12 @@ def _bounds_m2(
     main: Pose,
     exposure_s: float,
     expected: Sequence[RegionImage],
+    gains: Gains | None,
 ) -> tuple[Flat9 | None, Flat9 | None]:
     """Cramér-Rao bounds of the frame's position, row by row: hybrid, and exact; the same without [belief].
 
-    None where the recipe does not ask for them, or where the frame does not determine a position.
+    gains: of the LEDs by id, which the bound takes as known; 1 where not given. None where the recipe does not ask for
+    them, or where the frame does not determine a position.
     """
     if not recipe.bound:
         return None, None
@@ -185,7 +270,7 @@ def _bounds_m2(
     slopes = FrameSlopes.rendered(
         mounted,
         main,
-        lambda posed: renderer.led_patches(posed, recipe.regions, at.pose),
+        lambda posed: [_with_gain(p, gains) for p in renderer.led_patches(posed, recipe.regions, at.pose)],
         exposure_s,
         [RegionImage(roi, variance_e2(recipe.sensor, image, exposure_s)) for roi, image in expected],
         float(np.median(np.linalg.norm(renderer.scene.leds.centers_m - at.position_m, axis=1))),
@@ -203,14 +288,30 @@ def _bounds_m2(
     return None if hybrid is None else flat9(hybrid), None if exact is None else flat9(exact)
 
 
-def poses_of(recipe: Recipe, scene: Scene, pose_number: int, mounted: Mounted) -> tuple[Pose, tuple[Pose, ...]]:
-    """Pose of the camera `main` at mid-exposure, and the poses of a camera during the exposure.
+def _with_gain(patch: LedPatch, gains: Gains | None) -> LedPatch:
+    if gains is None or patch.led_id not in gains:
+        return patch
+    return replace(patch, electrons_per_s=patch.electrons_per_s * gain_in(gains[patch.led_id], patch.roi))
 
-    scene: the recipe's scene. Poses are chosen for the told camera and LEDs, so that they are the same with [belief].
+
+def poses_of(
+    recipe: Recipe, scene: Scene, pose_number: int, mounted: Mounted, number: int = 0
+) -> tuple[Pose, Pose, tuple[Pose, ...] | RollingPoses]:
+    """Poses of a frame of a camera, in shot `number` of a burst: the rig moves on from shot to shot.
+
+    Poses of the camera `main` in the middle of its own frame and in the middle of the camera's, and the poses of the
+    camera during its frame. scene: the recipe's scene. Poses are chosen for the told camera and LEDs, so that they are
+    the same with [belief].
     """
     main = pose_of_frame(recipe.poses, pose_number, recipe.seed, recipe.camera, scene)
-    # A recipe with motion has an exposure time: Recipe checks it.
-    return main, poses_during(recipe.motion, mounted, main, recipe.exposure_s or 0.0, scene)
+    middle, exposure_s = main, recipe.exposure_s or 0.0  # a recipe with motion has an exposure time: Recipe checks it
+    if recipe.motion is not None:
+        if recipe.burst is not None and number:
+            middle = main = recipe.motion.pose_at(main, recipe.burst.offset_s(number))
+        later_s = mounted.camera.middle_s(exposure_s) - recipe.camera.middle_s(exposure_s)
+        if later_s:
+            middle = recipe.motion.pose_at(main, later_s)
+    return main, middle, poses_during(recipe.motion, mounted, middle, exposure_s, scene)
 
 
 def _white_balance(camera: Camera, sensor: Sensor, scene: Scene) -> tuple[float, float, float]:

@@ -13,6 +13,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from functools import cache, partial
 from importlib.metadata import version
+from itertools import groupby, product
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,8 @@ from pydantic import ValidationError
 from vlcrender.core.warn_once import warn_once
 from vlcrender.dataset.downlink_entry import downlink_entry
 from vlcrender.dataset.files import FRAMES, sha256_of, whole_file, write_json
-from vlcrender.dataset.frame_job import Job, make_frame, poses_of
+from vlcrender.dataset.frame_job import Job, make_frame, make_frames, poses_of
+from vlcrender.dataset.light_checks import light_warnings
 from vlcrender.dataset.progress import FRAMES_STAGE, Progress, ProgressCallback
 from vlcrender.dataset.recipe import Plan, Recipe
 from vlcrender.dataset.schema import (
@@ -47,7 +49,9 @@ from vlcrender.dataset.true_world import built_leds, device_of_pose, device_rows
 from vlcrender.dataset.verify import extra_folders, missing_files, verify
 from vlcrender.errors import InputError
 from vlcrender.light.lightmap import Lightmap, bake, room_mesh
+from vlcrender.modulation.flicker import flicker_of, flicker_warning
 from vlcrender.rendering.electron_rates import ElectronRates
+from vlcrender.rendering.readout import RollingPoses
 from vlcrender.rendering.renderer import check_inside, share_cores
 from vlcrender.scene.as_built import luminaires_of
 from vlcrender.sensor.quantisation import MIN_NOISE_STEPS, noise_steps
@@ -83,12 +87,14 @@ def generate(
         log.info("%s: complete and intact already", directory)
         return False
     mounted_of = cache(partial(true_camera, plan.recipe))
+    numbers = {0} if plan.recipe.motion is None else {0, plan.recipe.burst_frames - 1}
     for pose_number in range(plan.recipe.poses.count):  # an impossible pose ends the run before the first frame
-        for which in range(len(plan.recipe.cameras)):
+        for which, number in product(range(len(plan.recipe.cameras)), numbers):
             mounted = mounted_of(which, device_of_pose(plan.recipe, pose_number))
-            _, during = poses_of(plan.recipe, plan.scene, pose_number, mounted)
-            check_inside(plan.scene, during[0])
-            check_inside(plan.scene, during[-1])
+            *_, during = poses_of(plan.recipe, plan.scene, pose_number, mounted, number)
+            first, last = during.ends if isinstance(during, RollingPoses) else (during[0], during[-1])
+            check_inside(plan.scene, first)
+            check_inside(plan.scene, last)
     if plan.recipe.belief is not None:
         for map_number in range(plan.recipe.belief.maps):  # an impossible LED, too
             built_leds(plan.recipe, plan.scene, map_number)
@@ -106,8 +112,11 @@ def generate(
     # Into the cache, from which every worker reads it.
     light = bake(plan.scene, progress=lambda step, share: report(Progress(step, share, 1.0)))
     _warn_of_coarse_steps(plan, light)
+    _warn_of_flicker(plan)
+    for warning in light_warnings(plan.recipe, plan.scene):
+        warn_once(log, warning)
     with (directory / "journal.jsonl").open("a", encoding="utf-8") as journal:
-        for record in _records(job, missing, workers, scheduler):
+        for record in _records(job, _bursts(missing, plan.recipe), workers, scheduler):
             done[record.frame] = record
             journal.write(record.model_dump_json() + "\n")
             journal.flush()
@@ -139,32 +148,48 @@ def _warn_of_coarse_steps(plan: Plan, light: Lightmap) -> None:
         )
 
 
-def _records(job: Job, frames: list[int], workers: int, scheduler: str | None) -> Iterator[FrameRecord]:
+def _warn_of_flicker(plan: Plan) -> None:
+    """Warn where LEDs of the scene flicker beyond the low risk of IEEE 1789."""
+    warning = flicker_warning(flicker_of(plan.scene.leds.transmitters))
+    if warning is not None:
+        warn_once(log, f"{plan.recipe.scene}: {warning}")
+
+
+def _bursts(frames: list[int], recipe: Recipe) -> list[list[int]]:
+    """Frames that one worker makes, one after another, since they share a view: those of a burst."""
+    per_burst = len(recipe.cameras) * recipe.burst_frames
+    if recipe.burst_frames == 1:
+        return [[frame] for frame in frames]
+    return [list(group) for _, group in groupby(frames, key=lambda frame: frame // per_burst)]
+
+
+def _records(job: Job, bursts: list[list[int]], workers: int, scheduler: str | None) -> Iterator[FrameRecord]:
     if scheduler is not None:
-        yield from _on_cluster(job, frames, scheduler)
-    elif workers == 1 or len(frames) <= 1:
-        for frame in frames:
-            yield make_frame(job, frame)
+        yield from _on_cluster(job, bursts, scheduler)
+    elif workers == 1 or len(bursts) <= 1:
+        for burst in bursts:
+            for frame in burst:
+                yield make_frame(job, frame)
     else:
-        yield from _in_processes(job, frames, workers)
+        yield from _in_processes(job, bursts, workers)
 
 
-def _in_processes(job: Job, frames: list[int], workers: int) -> Iterator[FrameRecord]:
+def _in_processes(job: Job, bursts: list[list[int]], workers: int) -> Iterator[FrameRecord]:
     # spawn: a forked child of a process that ran kernels is left with one thread
     context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(min(workers, len(frames)), context, _start_worker, (workers,))
-    pending: set[Future[FrameRecord]] = set()
-    queue = iter(frames)
+    pool = ProcessPoolExecutor(min(workers, len(bursts)), context, _start_worker, (workers,))
+    pending: set[Future[list[FrameRecord]]] = set()
+    queue = iter(bursts)
     try:
         while True:
             with _interrupts_deferred():  # submit() starts children
-                while len(pending) < 2 * workers and (frame := next(queue, None)) is not None:
-                    pending.add(pool.submit(make_frame, job, frame))
+                while len(pending) < 2 * workers and (burst := next(queue, None)) is not None:
+                    pending.add(pool.submit(make_frames, job, burst))
             if not pending:
                 return
             finished, pending = wait(pending, return_when=FIRST_COMPLETED)
             for future in finished:
-                yield future.result()
+                yield from future.result()
     except BrokenProcessPool:
         raise InputError(
             f"{job.directory}: a worker process died (out of memory?); run the same command again, "
@@ -209,7 +234,7 @@ def _exit_with_parent() -> None:
         os._exit(1)
 
 
-def _on_cluster(job: Job, frames: Iterable[int], address: str) -> Iterator[FrameRecord]:
+def _on_cluster(job: Job, bursts: Iterable[list[int]], address: str) -> Iterator[FrameRecord]:
     try:
         from dask.distributed import Client, as_completed
     except ImportError:
@@ -219,9 +244,9 @@ def _on_cluster(job: Job, frames: Iterable[int], address: str) -> Iterator[Frame
     except (OSError, ValueError) as error:
         raise InputError(f"--scheduler {address}: no answer from a scheduler: {error}") from None
     with client:
-        futures = client.map(lambda frame: make_frame(job, frame), list(frames), pure=False)
+        futures = client.map(lambda burst: make_frames(job, burst), list(bursts), pure=False)
         for future in as_completed(futures):
-            yield future.result()
+            yield from future.result()
             future.release()
 
 
@@ -292,10 +317,12 @@ def _finish(plan: Plan, directory: Path, provenance: dict[str, Any], records: li
     write_table(directory / "frames.parquet", [record.device for record in records], FrameRow)
     write_table(directory / "truth.parquet", [record.truth for record in records], TruthRow)
     sigmas = luminaires = None
+    told_map = recipe.map == "given"
     if recipe.belief is not None:
         sigmas = recipe.belief.stated_sigmas(recipe.cameras, recipe.accelerometer)
-        luminaires = luminaires_of(scene.settings, scene.leds)
+        luminaires = luminaires_of(scene.settings, scene.leds) if told_map else None
         write_table(directory / "truth_devices.parquet", device_rows(recipe), DeviceTruthRow)
+    if recipe.belief is not None or not told_map:
         write_table(directory / "truth_map.parquet", map_rows(recipe, scene), MapTruthRow)
     dataset = DatasetFile(
         format="vlcrender-dataset",
@@ -309,10 +336,10 @@ def _finish(plan: Plan, directory: Path, provenance: dict[str, Any], records: li
         sensor=SensorEntry(**recipe.sensor.acting()),
         accelerometer=accelerometer_entry(recipe.accelerometer, sigmas),
         gyroscope=gyroscope_entry(recipe.gyroscope),
-        led_map=led_map(scene.leds, luminaires, sigmas),
+        led_map=led_map(scene.leds, luminaires, sigmas) if told_map else None,
         luminaires=() if luminaires is None or sigmas is None else luminaire_entries(luminaires, sigmas),
         map_datum=None if sigmas is None else map_datum_entry(sigmas),
-        downlink=downlink_entry(scene.leds),
+        downlink=downlink_entry(scene.leds, recipe.demodulation),
         room_m=scene.settings.room.size_m,
         provenance=provenance,
     )

@@ -17,6 +17,7 @@ from vlcrender.config.presets import with_presets
 from vlcrender.config.toml_model import Settings, check, read_toml
 from vlcrender.dataset.auto_exposure import Metering, NoiseLevelMetering
 from vlcrender.dataset.belief import Belief
+from vlcrender.dataset.light_checks import check_light
 from vlcrender.dataset.motion import Motion
 from vlcrender.dataset.pose_sampling import AimedPoses, Poses
 from vlcrender.dataset.timeline import Burst, start_of_burst_s
@@ -277,7 +278,9 @@ def load_plan(path: Path, assignments: Iterable[str] = (), scale: int = 1, scale
         raise InputError(f"{source}: scene = {error}") from None
     if not scene_path.is_file():
         raise InputError(f"{source}: scene = {recipe.scene!r}: no such file, relative to the recipe's folder")
-    return Plan(scaled(recipe, scale, scale_mode), load_scene(scene_path))
+    plan = Plan(scaled(recipe, scale, scale_mode), load_scene(scene_path))
+    check_light(plan.recipe, plan.scene, source, scale)
+    return plan
 
 
 def scaled(recipe: Recipe, by: int, mode: ScaleMode) -> Recipe:

@@ -212,9 +212,8 @@ def device_rows(recipe: Recipe) -> list[DeviceTruthRow]:
 
 def map_rows(recipe: Recipe, scene: Scene) -> list[MapTruthRow]:
     """The rows of truth_map.parquet."""
-    assert recipe.belief is not None
     rows = []
-    for map_number in range(recipe.belief.maps):
+    for map_number in range(1 if recipe.belief is None else recipe.belief.maps):
         leds = built_leds(recipe, scene, map_number)
         sizes = leds.half_widths_m * np.where(leds.squares, 2.0, 1.0)
         for i, (x, y, z) in enumerate(leds.centers_m.tolist()):

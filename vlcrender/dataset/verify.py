@@ -48,7 +48,7 @@ def verify(directory: Path) -> list[str]:
     for row in frames:
         problems += _frame_problems(directory, row, dataset)
     recipe = dataset.provenance.get("recipe", {})
-    maps: dict[int, Positions] = {0: {led.id: np.array(led.position_m) for led in dataset.led_map}}
+    maps: dict[int, Positions] = {0: {led.id: np.array(led.position_m) for led in dataset.led_map or ()}}
     devices: list[DeviceTruthRow] | None = None
     if recipe.get("belief") is not None:
         devices = _read_sealed(directory / "truth_devices.parquet", DeviceTruthRow, problems)
@@ -183,7 +183,7 @@ def _sealed_problems(
     expected = [(device, camera) for device in range(belief["devices"]) for camera in dataset.cameras]
     if devices and [(row.device, row.camera) for row in devices] != expected:
         problems.append("truth_devices.parquet: has not one row for each device and camera, in order")
-    leds = [(number, led.id) for number in range(belief["maps"]) for led in dataset.led_map]
+    leds = [(number, led.id) for number in range(belief["maps"]) for led in dataset.led_map or ()]
     if built and [(row.map, row.led) for row in built] != leds:
         problems.append("truth_map.parquet: has not one row for each map and LED, in order")
     return problems

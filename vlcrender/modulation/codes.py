@@ -6,7 +6,9 @@ out.
 
 A short LED image shows a part of a code only. No part of `window_chips` chips, at any shift, occurs twice in a book: 20
 chips where 1225 LEDs have codes of 32. A receiver that sees fewer clear chips may find several LEDs that fit, and has
-to reject such an image.
+to reject such an image: of those 1225 codes, 70 % of the parts of 16 chips and 19 % of those of 18 occur elsewhere too.
+But for one chip, 77 % of the parts of 20 do, 8 % of those of 24 and 0.5 % of those of 28
+(`python docs/measure_downlink.py codes`).
 """
 
 from functools import cache

@@ -20,6 +20,7 @@ from vlcrender.light.raycast import Hit, Room
 from vlcrender.rendering.camera_data import CameraData
 from vlcrender.rendering.electron_rates import DARK, ElectronRates
 from vlcrender.rendering.expected_image import Image
+from vlcrender.rendering.readout import LinePoses
 from vlcrender.scene.loader import Scene
 
 EDGE_GRID = 8
@@ -58,17 +59,36 @@ class Background:
         background.cameras_vary = True
         return background
 
-    def trace(self, posed: PosedCamera, u: Any, v: Any, rates: ElectronRates = DARK, size_px: float = 1.0) -> Hit:
+    def trace(
+        self,
+        posed: PosedCamera,
+        u: Any,
+        v: Any,
+        rates: ElectronRates = DARK,
+        size_px: float = 1.0,
+        lines: LinePoses | None = None,
+    ) -> Hit:
         """Surfaces and light seen by squares of `size_px` around the pixel positions (u, v), Dr.Jit arrays.
 
-        The value is in electrons a second and includes the lens's relative illumination.
+        lines: poses of the sensor's lines, in place of the pose of `posed`; positions are then on the sensor. The value
+        is in electrons a second and includes the lens's relative illumination.
         """
         camera = CameraData.of(posed.camera, mi.Float) if self.cameras_vary else posed.camera
         if rates not in self._values:
             self._values[rates] = self.room.values(self._light, rates.led, rates.ambient)
             while len(self._values) > MAX_RATES:
                 del self._values[next(iter(self._values))]
-        to_world = _opaque(posed.rotation.T)
+        if lines is None:
+            to_world: list[list[Any]] = list(_opaque(posed.rotation.T))
+            origin = mi.Point3f(*_opaque(np.array([posed.pose.position_m]))[0])
+        else:
+            line = mi.UInt32(dr.floor(v if lines.along_rows else u))
+
+            def of_line(numbers: NDArray[np.float64]) -> Any:
+                return dr.gather(mi.Float, mi.Float(np.ascontiguousarray(numbers, dtype=np.float32)), line)
+
+            to_world = [[of_line(lines.rotations[:, j, i]) for j in range(3)] for i in range(3)]
+            origin = mi.Point3f(*(of_line(lines.positions_m[:, i]) for i in range(3)))
 
         def ray(u: Any, v: Any) -> Any:
             x, y, z = camera.unproject(u, v, dr)
@@ -78,18 +98,19 @@ class Background:
         if self.room.textures is not None:
             half = size_px / 2
             spread = ray(u + half, v) - ray(u - half, v), ray(u, v + half) - ray(u, v - half)
-        origin = mi.Point3f(*_opaque(np.array([posed.pose.position_m]))[0])
         hit = self.room.trace(origin, ray(u, v), self._values[rates], spread=spread)
         value = relative_illumination(camera, u, v, dr, hit.value)
         return replace(hit, value=value)
 
-    def regions(self, posed: PosedCamera, rois: Sequence[Roi], rates: ElectronRates) -> list[BackgroundRegion]:
-        """The room in each region."""
+    def regions(
+        self, posed: PosedCamera, rois: Sequence[Roi], rates: ElectronRates, lines: LinePoses | None = None
+    ) -> list[BackgroundRegion]:
+        """The room in each region. `lines`: as in `trace`; the regions are then on the sensor."""
         sensor = Roi.of_sensor(posed.camera)
         # The neighbours of a region's border pixels tell whether surfaces meet there; pixels beyond the sensor do not.
         padded = [roi.padded(1).intersection(sensor) if sensor.contains(roi) else roi.padded(1) for roi in rois]
         with exact_math():
-            hit = self.trace(posed, *_pixel_centers(padded, sensor), rates)
+            hit = self.trace(posed, *_pixel_centers(padded, sensor), rates, lines=lines)
             dr.eval(hit.value, hit.surface)
             values, surfaces = hit.value.numpy(), hit.surface.numpy()
             starts = np.cumsum([0, *(roi.pixels for roi in padded)])
@@ -104,7 +125,7 @@ class Background:
             columns = np.concatenate([c + roi.column for (_, c), roi in zip(edges, rois, strict=True)])
             if len(rows):
                 u, v = sub_pixels(rows, columns)
-                rays = self.trace(posed, u, v, rates, 1 / EDGE_GRID).value.numpy()
+                rays = self.trace(posed, u, v, rates, 1 / EDGE_GRID, lines).value.numpy()
                 means = rays.reshape(len(rows), -1).mean(axis=1)
                 parts = np.split(means, np.cumsum([len(r) for r, _ in edges])[:-1])
                 for region, edge, mean in zip(regions, edges, parts, strict=True):

@@ -1,6 +1,6 @@
 """Mosaics of colour filters: each pixel sees the scene through its own filter."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial, reduce
 from typing import Any
@@ -12,8 +12,8 @@ from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.roi import LedRegions, Roi
 from vlcrender.rendering.crosstalk import REACH_PX, shared_patch, with_crosstalk
-from vlcrender.rendering.expected_image import ExpectedImage, ExpectedRegion, Halo, Image, LedPatch
-from vlcrender.rendering.renderer import Renderer, read_out
+from vlcrender.rendering.expected_image import ExpectedImage, ExpectedRegion, Gain, Gains, Halo, Image, LedPatch
+from vlcrender.rendering.renderer import During, Renderer, read_out
 from vlcrender.scene.leds import Leds
 from vlcrender.scene.loader import Scene
 from vlcrender.sensor.quantum_efficiency import COLOURS
@@ -52,9 +52,10 @@ class MosaicHalo:
     of_colours: tuple[Halo, ...]
     mosaic: str
 
-    def electrons_per_s(self, roi: Roi, gains: Mapping[int, float] | None = None) -> Image:
+    def electrons_per_s(self, roi: Roi, gains: Gains | None = None, room_gain: Gain = 1.0) -> Image:
         """As `expected_image.Halo`."""
-        return select_colours([halo.electrons_per_s(roi, gains) for halo in self.of_colours], self.mosaic, roi)
+        halos = [halo.electrons_per_s(roi, gains, room_gain) for halo in self.of_colours]
+        return select_colours(halos, self.mosaic, roi)
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,11 @@ class MosaicRenderer:
         return replace(self, of_colours=tuple(renderer.with_leds(leds) for renderer in self.of_colours))
 
     def expected_image(
-        self, posed: PosedCamera, regions: LedRegions | None = None, during: Sequence[Pose] | None = None
+        self,
+        posed: PosedCamera,
+        regions: LedRegions | None = None,
+        during: During | None = None,
+        room_apart: bool = False,
     ) -> ExpectedImage:
         """As `Renderer.expected_image`."""
         views = [
@@ -88,7 +93,9 @@ class MosaicRenderer:
             for renderer, of_colour in zip(self.of_colours, self._of_colours(posed), strict=True)
         ]
         rois = read_out(views, regions, REACH_PX if self.crosstalk else 0)
-        images = [renderer.image_of(view, rois) for renderer, view in zip(self.of_colours, views, strict=True)]
+        images = [
+            renderer.image_of(view, rois, room_apart) for renderer, view in zip(self.of_colours, views, strict=True)
+        ]
         image = ExpectedImage(tuple(map(self._region, zip(*(image.parts for image in images), strict=True))))
         return with_crosstalk(image, self.crosstalk, Roi.of_sensor(posed.camera)) if self.crosstalk else image
 
@@ -136,6 +143,8 @@ class MosaicRenderer:
 
     def _region(self, of_colours: Sequence[ExpectedRegion]) -> ExpectedRegion:
         roi = of_colours[0].roi
+        parts = [region.led_background_e_per_s for region in of_colours]
+        of_leds = [part for part in parts if part is not None]
         return ExpectedRegion(
             roi,
             self._select([region.background_e_per_s for region in of_colours], roi),
@@ -146,6 +155,7 @@ class MosaicRenderer:
                 for r in region.reflections
             ),
             self._halo([region.halo for region in of_colours]),
+            self._select(of_leds, roi) if of_leds else None,
         )
 
     def _halo(self, of_colours: Sequence[Halo | None]) -> MosaicHalo | None:

@@ -2,10 +2,10 @@
 
 Electrons that a pixel's light sets free diffuse, each by itself. A Poisson number of electrons that are shared out at
 random is a Poisson number in each pixel, independent of the others: crosstalk changes means alone and leaves no
-correlation between pixels. It comes after the colour filters, so that it mixes the colours of a mosaic.
+correlation between pixels. It comes after the colour filters, so that it mixes the colours of a mosaic. Lines of a
+rolling shutter are crossed with their own gain: a pixel's neighbours in other lines count as exposed with it.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
@@ -16,6 +16,8 @@ from vlcrender.camera.roi import Roi
 from vlcrender.rendering.expected_image import (
     ExpectedImage,
     ExpectedRegion,
+    Gain,
+    Gains,
     Halo,
     Image,
     LedPatch,
@@ -35,9 +37,9 @@ class CrosstalkHalo:
     halo: Halo
     share: float
 
-    def electrons_per_s(self, roi: Roi, gains: Mapping[int, float] | None = None) -> Image:
+    def electrons_per_s(self, roi: Roi, gains: Gains | None = None, room_gain: Gain = 1.0) -> Image:
         """As `expected_image.Halo`."""
-        return shared(self.halo.electrons_per_s(roi, gains), self.share)
+        return shared(self.halo.electrons_per_s(roi, gains, room_gain), self.share)
 
 
 def shared(image: NDArray[Any], share: float) -> NDArray[Any]:
@@ -87,6 +89,7 @@ def _region(part: ExpectedRegion, share: float, sensor: Roi) -> ExpectedRegion:
         tuple(shared_patch(patch, share, sensor) for patch in part.patches),
         tuple(_cut(shared_patch(reflection, share, sensor), part.roi) for reflection in part.reflections),
         None if part.halo is None else CrosstalkHalo(part.halo, share),
+        None if part.led_background_e_per_s is None else shared(part.led_background_e_per_s, share),
     )
 
 

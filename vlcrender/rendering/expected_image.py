@@ -1,4 +1,8 @@
-"""Expected images as parts, a background, a patch of light for each LED and a halo: any exposure is their sum."""
+"""Expected images as parts, a background, a patch of light for each LED and a halo: any exposure is their sum.
+
+The light of LEDs may change with time: a gain is light over its mean. It is a number, or one for each line of a sensor
+with a rolling shutter.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,6 +14,19 @@ from numpy.typing import NDArray
 from vlcrender.camera.roi import Roi
 
 Image = NDArray[np.float32]
+Gain = float | NDArray[np.float64]
+"""Light over its mean in time: a number, or an array that broadcasts over all pixels of the sensor, (height, 1) for a
+gain of each row, (1, width) for one of each column, or (1, 1)."""
+Gains = Mapping[int, Gain]
+"""Gains of LEDs by id."""
+
+
+def gain_in(gain: Gain, roi: Roi) -> Gain:
+    """A gain in a region of the sensor, in an array that broadcasts over the region's pixels."""
+    if not isinstance(gain, np.ndarray):
+        return gain
+    rows = slice(roi.row, roi.end_row) if gain.shape[0] > 1 else slice(None)
+    return gain[rows, roi.column : roi.end_column] if gain.shape[1] > 1 else gain[rows]
 
 
 @dataclass(frozen=True)
@@ -51,8 +68,10 @@ class SpecularReflection:
 class Halo(Protocol):
     """Light that the lens scatters all over the sensor (veiling glare)."""
 
-    def electrons_per_s(self, roi: Roi, gains: Mapping[int, float] | None = None) -> Image:
-        """The scattered light in a region, (rows, columns). `gains`: of LEDs by id; 1 where not given."""
+    def electrons_per_s(self, roi: Roi, gains: Gains | None = None, room_gain: Gain = 1.0) -> Image:
+        """The scattered light in a region, (rows, columns). `gains`: of LEDs by id; 1 where not given. `room_gain`: of
+        the light of LEDs that the room reflects.
+        """
 
 
 @dataclass(frozen=True)
@@ -67,16 +86,32 @@ class ExpectedRegion:
     reflections: tuple[SpecularReflection, ...] = ()
     halo: Halo | None = None
 
-    def expected_electrons(self, exposure_s: float, gains: Mapping[int, float] | None = None) -> Image:
-        """Mean electrons of an exposure, (rows, columns). `gains`: of LEDs by id; 1 where not given."""
+    led_background_e_per_s: Image | None = None
+    """Part of `background_e_per_s` that left an LED; None where it was not asked for."""
+
+    def expected_electrons(self, exposure_s: float, gains: Gains | None = None, room_gain: Gain = 1.0) -> Image:
+        """Mean electrons of an exposure, (rows, columns). `gains`: of LEDs by id; 1 where not given.
+
+        room_gain: of the light of LEDs that the room reflects. Raises ValueError for one other than 1 where that part
+        of the background is not known.
+        """
         image = self.background_e_per_s * np.float32(exposure_s)
         lights: list[LedPatch | SpecularReflection] = [*self.patches, *self.reflections]
         for light in lights:
-            gain = 1.0 if gains is None else gains.get(light.led_id, 1.0)
-            image[self.roi.slices(light.roi)] += light.electrons_per_s * np.float32(gain * exposure_s)
+            gain = 1.0 if gains is None else gain_in(gains.get(light.led_id, 1.0), light.roi)
+            image[self.roi.slices(light.roi)] += light.electrons_per_s * _float32(gain * exposure_s)
+        if isinstance(room_gain, np.ndarray) or room_gain != 1:
+            if self.led_background_e_per_s is None:
+                raise ValueError("room_gain: the part of the background that left an LED is not known")
+            image += self.led_background_e_per_s * _float32((gain_in(room_gain, self.roi) - 1.0) * exposure_s)
+            np.maximum(image, 0, out=image)  # rounding, where LEDs are dark and nothing else gives light
         if self.halo is not None:
-            image += self.halo.electrons_per_s(self.roi, gains) * np.float32(exposure_s)
+            image += self.halo.electrons_per_s(self.roi, gains, room_gain) * np.float32(exposure_s)
         return image
+
+
+def _float32(number: Gain) -> NDArray[np.float32] | np.float32:
+    return number.astype(np.float32) if isinstance(number, np.ndarray) else np.float32(number)
 
 
 @dataclass(frozen=True)
@@ -90,7 +125,7 @@ class ExpectedImage:
         """The patches of all regions."""
         return tuple(patch for part in self.parts for patch in part.patches)
 
-    def expected_electrons(self, exposure_s: float, gains: Mapping[int, float] | None = None) -> Image:
+    def expected_electrons(self, exposure_s: float, gains: Gains | None = None, room_gain: Gain = 1.0) -> Image:
         """Mean electrons of an exposure of a full frame, (height, width); of several regions see each of `parts`."""
         (whole,) = self.parts
-        return whole.expected_electrons(exposure_s, gains)
+        return whole.expected_electrons(exposure_s, gains, room_gain)

@@ -7,8 +7,8 @@ point's halo is below 0.5 % of its largest value (tested). The light of each LED
 change; the light of the room behind is sampled by one ray for 4 x 4 parts of the area of a node.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
 
@@ -23,7 +23,7 @@ from vlcrender.camera.roi import Roi
 from vlcrender.core.backend import dr, exact_math, mi
 from vlcrender.rendering.background import Background
 from vlcrender.rendering.electron_rates import ElectronRates
-from vlcrender.rendering.expected_image import Image
+from vlcrender.rendering.expected_image import Gain, Gains, Image, gain_in
 
 NODES_PER_RADIUS = 6
 """Nodes along the halo's radius."""
@@ -104,6 +104,19 @@ class HaloGrid:
         kernel = glare.share * glare.spread_per_px2(np.hypot(down[:, None], across), pixel_pitch_um)
         return np.maximum(signal.fftconvolve(kernel, light, mode="valid"), 0.0)
 
+    def values_by_line(self, sources: "Sequence[tuple[Array, Array]]", roi: Roi) -> Array:
+        """Sum of values times a gain for each row or column of the sensor, (rows, columns). All gains are of one shape.
+
+        Each of `sources` is a gain, of the shape of `expected_image.Gain`, and values at the nodes.
+        """
+        u, v = roi.centers_px()
+        down, across = self.weights(v[:, 0], 0), self.weights(u[0], 1)
+        if sources[0][0].shape[1] == 1:
+            by_row = sum((gain_in(gain, roi) * (down @ at_nodes) for gain, at_nodes in sources), np.zeros(()))
+            return np.ascontiguousarray((across @ by_row.T).T)
+        by_column = sum((gain_in(gain, roi) * (across @ at_nodes.T).T for gain, at_nodes in sources), np.zeros(()))
+        return np.ascontiguousarray(down @ by_column)
+
     def values(self, at_nodes: Array, roi: Roi) -> Array:
         """Values at the centres of the pixels of a region of the sensor, (rows, columns)."""
         u, v = roi.centers_px()
@@ -120,20 +133,45 @@ class GlareHalo:
     pixel_pitch_um: float
     room: Array
     leds: tuple[tuple[int, Array], ...]
+    room_by_leds: Array | None = None
+    """Part of `room` that left an LED; None where it was not asked for."""
 
-    def electrons_per_s(self, roi: Roi, gains: Mapping[int, float] | None = None) -> Image:
-        """The halo in a region of the sensor, (rows, columns). `gains`: of LEDs by id; 1 where not given."""
-        at_nodes = self._unmodulated if gains is None else self._at_nodes(gains)
-        return self.grid.values(at_nodes, roi).astype(np.float32)
+    def electrons_per_s(self, roi: Roi, gains: Gains | None = None, room_gain: Gain = 1.0) -> Image:
+        """As `expected_image.Halo`. A line of pixels has the gains of its own exposure, whichever lines the light that
+        is scattered onto it would have reached.
+        """
+        if gains is None and not isinstance(room_gain, np.ndarray) and room_gain == 1:
+            return self.grid.values(self._unmodulated, roi).astype(np.float32)
+        steady = self.room.copy()
+        by_line: list[tuple[Array, Array]] = []
+        for light, gain in self._modulated(gains or {}, room_gain):
+            if isinstance(gain, np.ndarray):
+                by_line.append((gain, light))
+            else:
+                steady += gain * light
+        image = self.grid.values(self._spread(steady), roi)
+        if by_line:
+            image += self.grid.values_by_line([(gain, self._spread(light)) for gain, light in by_line], roi)
+            np.maximum(image, 0, out=image)
+        return image.astype(np.float32)
+
+    def _modulated(self, gains: Gains, room_gain: Gain) -> "Iterator[tuple[Array, Gain]]":
+        """Light on the nodes and its gain: of each LED, and of the room the part by LEDs, beyond its mean."""
+        for led_id, of_led in self.leds:
+            yield of_led, gains.get(led_id, 1.0)
+        if isinstance(room_gain, np.ndarray) or room_gain != 1:
+            if self.room_by_leds is None:
+                raise ValueError("room_gain: the part of the halo that left an LED is not known")
+            yield self.room_by_leds, room_gain - 1.0
 
     @cached_property
     def _unmodulated(self) -> Array:
-        return self._at_nodes({})
-
-    def _at_nodes(self, gains: Mapping[int, float]) -> Array:
         light = self.room.copy()
-        for led_id, of_led in self.leds:
-            light += gains.get(led_id, 1.0) * of_led
+        for _, of_led in self.leds:
+            light += 1.0 * of_led
+        return self._spread(light)
+
+    def _spread(self, light: Array) -> Array:
         return self.grid.spread(light, self.glare, self.pixel_pitch_um)
 
 
@@ -148,13 +186,17 @@ def halo_of_sources(camera: Camera, glare: Glare, sources: Sequence[SourceOfLigh
 
 
 def glare_halo(
-    posed: PosedCamera, background: Background, rates: ElectronRates, sources: Sequence[SourceOfLight]
+    posed: PosedCamera,
+    background: Background,
+    rates: ElectronRates,
+    sources: Sequence[SourceOfLight],
+    room_apart: bool = False,
 ) -> GlareHalo | None:
     """The halo of a view; None for a lens without glare.
 
     background: the room, seen from this pose; rates: of light that is not scattered; sources: the light of the LEDs
-    that it images on the sensor, less the share that is scattered. LEDs' faces, which hide a little of the room, are
-    left out of its light.
+    that it images on the sensor, less the share that is scattered; room_apart: whether the room's light that left an
+    LED is wanted apart. LEDs' faces, which hide a little of the room, are left out of its light.
     """
     camera, glare = posed.camera, posed.camera.glare
     if glare is None:
@@ -168,11 +210,16 @@ def glare_halo(
         for starts, size in ((rows, camera.height_px), (columns, camera.width_px))
     )
     v, u = rows + heights / 2, columns + widths / 2
-    with exact_math():
-        across, down = np.meshgrid(u.astype(np.float32), v.astype(np.float32))
-        hit = background.trace(posed, mi.Float(across.ravel()), mi.Float(down.ravel()), rates, float(cell))
-        dr.eval(hit.value)
-        room = hit.value.numpy().reshape(len(v), len(u)).astype(np.float64)
+    areas = np.outer(heights, widths)
+
+    def room(rates: ElectronRates) -> Array:
+        with exact_math():
+            across, down = np.meshgrid(u.astype(np.float32), v.astype(np.float32))
+            hit = background.trace(posed, mi.Float(across.ravel()), mi.Float(down.ravel()), rates, float(cell))
+            dr.eval(hit.value)
+            light = hit.value.numpy().reshape(len(v), len(u)).astype(np.float64)
+        return sharp * grid.gathered(light * areas, v, u)
+
     leds: dict[int, Array] = {}
     for source in sources:
         roi = source.roi
@@ -183,6 +230,7 @@ def glare_halo(
         grid,
         glare,
         camera.pixel_pitch_um,
-        sharp * grid.gathered(room * np.outer(heights, widths), v, u),
+        room(rates),
         tuple(leds.items()),
+        room(replace(rates, ambient=0.0)) if room_apart else None,
     )

@@ -81,6 +81,18 @@ def coverage_of_led(posed: PosedCamera, face: LedFace, margin_px: int = 0) -> Le
     return LedCoverage(Roi(row, column, *coverage.shape), coverage, fraction, profile)
 
 
+def outline_roi(posed: PosedCamera, face: LedFace) -> Roi | None:
+    """The smallest region that contains the image of a face, on the sensor or not; None as in `coverage_of_led`."""
+    if posed.pose.position_m[2] >= face.center_m[2]:
+        return None
+    outline = _outline_px(posed, face)
+    if outline is None:
+        return None
+    column, row = np.floor(outline.min(axis=0)).astype(int).tolist()
+    end_column, end_row = np.ceil(outline.max(axis=0)).astype(int).tolist()
+    return Roi(row, column, end_row - row, end_column - column)
+
+
 def candidate_leds(
     posed: PosedCamera, centers_m: Array, circumradii_m: Array, margin_px: float = 0.0
 ) -> NDArray[np.int64]:

@@ -19,7 +19,13 @@ from vlcrender.camera.roi import LedRegions, Roi
 from vlcrender.camera.vignetting import relative_illumination
 from vlcrender.core.planar_shapes import Disc, Rectangle
 from vlcrender.rendering.led_blur import LedBlur
-from vlcrender.rendering.led_coverage import LedFace, candidate_leds, coverage_of_led, intersections_with_plane
+from vlcrender.rendering.led_coverage import (
+    LedFace,
+    candidate_leds,
+    coverage_of_led,
+    intersections_with_plane,
+    outline_roi,
+)
 from vlcrender.rendering.led_edges import LedEdges, edges_of_led
 from vlcrender.rendering.occlusion import LitRegion, Occlusion
 from vlcrender.scene.leds import Leds
@@ -56,14 +62,26 @@ class LedImage:
 
 
 def led_images(
-    leds: Leds, occlusion: Occlusion, posed: PosedCamera, regions: LedRegions | None, blurs: LedBlur
+    leds: Leds,
+    occlusion: Occlusion,
+    posed: PosedCamera,
+    regions: LedRegions | None,
+    blurs: LedBlur,
+    within: Roi | None = None,
 ) -> dict[int, LedImage]:
-    """By index, the image of each LED that lights a pixel of the regions or, by its blur, may light one."""
+    """By index, the image of each LED that lights a pixel of the regions or, by its blur, may light one.
+
+    within: LEDs whose image is outside this region are left out.
+    """
     camera = posed.camera
     overscan = regions is not None and regions.overscan
     margin_px = _overscan_px(camera) if overscan else blurs.radius_px
     imaged = []
     for i in candidate_leds(posed, leds.centers_m, leds.circumradii_m, margin_px).tolist():
+        if within is not None:
+            outline = outline_roi(posed, face_of_led(leds, i))
+            if outline is None or not outline.overlaps(within):
+                continue
         image = coverage_of_led(posed, face_of_led(leds, i), margin_px)
         if image is None:
             continue

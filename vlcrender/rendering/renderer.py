@@ -10,9 +10,9 @@ by the kernel of its depth (`led_blur`), and scatters a share of all light into 
 
 import copy
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import partial, reduce
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,7 @@ from vlcrender.rendering.halo import GlareHalo, glare_halo, halo_of_sources
 from vlcrender.rendering.led_blur import LedBlur, led_blur
 from vlcrender.rendering.led_radiance import LedImage, led_images
 from vlcrender.rendering.occlusion import Occlusion
+from vlcrender.rendering.readout import Knot, RollingPoses, image_at_own_line
 from vlcrender.rendering.specular_reflection import blurred, specular_reflections
 from vlcrender.scene.leds import Leds
 from vlcrender.scene.loader import Scene
@@ -47,15 +48,39 @@ LedImages = Mapping[int, LedImage]
 """Images of the LEDs at one pose, by the LED's index."""
 
 
+During = Sequence[Pose] | RollingPoses
+"""Poses of a moving camera: spread evenly over the exposure of all lines, or of each line."""
+
+
+@dataclass(frozen=True)
+class LedBand:
+    """The LEDs as a camera sees them at one or more poses, in lines of the sensor."""
+
+    poses: tuple[PosedCamera, ...]
+    images: tuple[LedImages, ...]
+    knot: Knot | None = None
+    """The lines, and the share of these poses in each; None for all lines."""
+
+    def share(self, roi: Roi) -> tuple[Roi, Array | float] | None:
+        """The lines in a region, and the share of these poses in them; None where there are none."""
+        if self.knot is None:
+            return roi, 1.0
+        if not self.knot.lines.overlaps(roi):
+            return None
+        inside = self.knot.lines.intersection(roi)
+        return inside, self.knot.weights_in(inside)
+
+
 @dataclass(frozen=True)
 class LedView:
     """The LEDs as a camera sees them at one or more poses, and the pixels that each lights, by its index."""
 
     posed: PosedCamera
-    poses: tuple[PosedCamera, ...]
+    bands: tuple[LedBand, ...]
     blurs: LedBlur
-    images: tuple[LedImages, ...]
     patch_rois: Mapping[int, Roi]
+    rolling: RollingPoses | None = None
+    """Poses of the lines of a moving camera with a rolling shutter."""
 
 
 def read_out(views: Sequence[LedView], regions: LedRegions | None, reach_px: int = 0) -> tuple[Roi, ...]:
@@ -112,22 +137,25 @@ class Renderer:
         return renderer
 
     def expected_image(
-        self, posed: PosedCamera, regions: LedRegions | None = None, during: Sequence[Pose] | None = None
+        self,
+        posed: PosedCamera,
+        regions: LedRegions | None = None,
+        during: During | None = None,
+        room_apart: bool = False,
     ) -> ExpectedImage:
         """Render the whole sensor, or regions of it only, at a cost in proportion to their pixels.
 
-        during: for a moving camera, poses spread evenly over the exposure. The image is the mean over them, and the
-        centres of the LEDs are given for `posed`. Raises InputError where the camera is not inside the room, or where
-        the regions hold more than MAX_SENSORS times the sensor's pixels, and for a lens with glare with overscan.
+        during: for a moving camera, poses spread evenly over the exposure, over which the image is the mean. The
+        centres of the LEDs are given for `posed`, or with RollingPoses for each LED's own line. room_apart: whether the
+        background's part that left an LED is wanted too. Raises InputError where the camera is not inside the room, or
+        where the regions hold more than MAX_SENSORS times the sensor's pixels, and for a lens with glare with overscan.
         """
         view = self.view(posed, regions, during)
         rois = read_out((view,), regions, REACH_PX if self._crosstalk else 0)
-        image = self.image_of(view, rois)
+        image = self.image_of(view, rois, room_apart)
         return with_crosstalk(image, self._crosstalk, Roi.of_sensor(posed.camera)) if self._crosstalk else image
 
-    def view(
-        self, posed: PosedCamera, regions: LedRegions | None = None, during: Sequence[Pose] | None = None
-    ) -> "LedView":
+    def view(self, posed: PosedCamera, regions: LedRegions | None = None, during: During | None = None) -> "LedView":
         """The LEDs of a view before their light is computed, and the pixels that they light.
 
         Arguments and exceptions of `expected_image`.
@@ -136,20 +164,42 @@ class Renderer:
             raise InputError(OVERSCAN_WITH_GLARE)
         if posed.camera.lateral_colour_um is not None:
             raise InputError("camera.lateral_colour_um: needs a sensor with a mosaic; remove it, or choose a mosaic")
-        poses = [posed] if during is None else [posed.at(pose) for pose in during]
-        for each in poses:
-            check_inside(self.scene, each.pose)
         blurs = led_blur(self.scene.leds, posed)
-        images = [led_images(self.scene.leds, self._occlusion, each, regions, blurs) for each in poses]
-        return LedView(posed, tuple(poses), blurs, tuple(images), _patch_rois(posed.camera, images, blurs, regions))
+        rolling = during if isinstance(during, RollingPoses) else None
+        if isinstance(during, RollingPoses):
+            bands = tuple(self._band(posed, knot.poses, regions, blurs, knot) for knot in during.knots)
+        else:
+            bands = (self._band(posed, [posed.pose] if during is None else during, regions, blurs),)
+        return LedView(posed, bands, blurs, _patch_rois(posed.camera, bands, blurs, regions), rolling)
 
-    def image_of(self, view: "LedView", rois: Sequence[Roi]) -> ExpectedImage:
-        """The expected image of a view before crosstalk, in the regions of `read_out`."""
-        posed = view.posed
-        _check_size(rois, posed.camera)
-        backgrounds, reflections = self._rooms(view.poses, rois, view.images, view.blurs)
-        patches = self._patches(posed, view.images, view.patch_rois, view.blurs)
-        halo = self._halo(posed, patches)
+    def _band(
+        self,
+        posed: PosedCamera,
+        poses: Sequence[Pose],
+        regions: LedRegions | None,
+        blurs: LedBlur,
+        knot: Knot | None = None,
+    ) -> LedBand:
+        cameras = tuple(posed if pose is posed.pose else posed.at(pose) for pose in poses)
+        for each in cameras:
+            check_inside(self.scene, each.pose)
+        within = None if knot is None else knot.lines.padded(blurs.radius_px)
+        images = [led_images(self.scene.leds, self._occlusion, each, regions, blurs, within) for each in cameras]
+        return LedBand(cameras, tuple(images), knot)
+
+    def image_of(self, view: "LedView", rois: Sequence[Roi], room_apart: bool = False) -> ExpectedImage:
+        """The expected image of a view before crosstalk, in the regions of `read_out`.
+
+        room_apart: as in `expected_image`.
+        """
+        _check_size(rois, view.posed.camera)
+        rates = self._rates(view.posed.camera)
+        backgrounds, reflections = self._rooms(view, rois, rates)
+        of_leds: Sequence[Image | None] = [None] * len(rois)
+        if room_apart:
+            of_leds, _ = self._rooms(view, rois, replace(rates, ambient=0.0), with_reflections=False)
+        patches = self._patches(view)
+        halo = self._halo(view.posed, patches, room_apart)
         return ExpectedImage(
             tuple(
                 ExpectedRegion(
@@ -158,8 +208,9 @@ class Renderer:
                     tuple(p for p in patches if roi.contains(p.roi)),
                     tuple(r for r in reflections if roi.contains(r.roi)),
                     halo,
+                    by_leds,
                 )
-                for roi, background in zip(rois, backgrounds, strict=True)
+                for roi, background, by_leds in zip(rois, backgrounds, of_leds, strict=True)
             )
         )
 
@@ -173,9 +224,9 @@ class Renderer:
         """
         leds = self.scene.leds
         blurs = led_blur(leds, posed if blurred_at is None else posed.at(blurred_at))
-        images = [led_images(leds, self._occlusion, posed, regions, blurs)]
-        patch_rois = _patch_rois(posed.camera, images, blurs, regions)
-        patches = self._patches(posed, images, patch_rois, blurs, np.float64)
+        bands = (LedBand((posed,), (led_images(leds, self._occlusion, posed, regions, blurs),)),)
+        view = LedView(posed, bands, blurs, _patch_rois(posed.camera, bands, blurs, regions))
+        patches = self._patches(view, np.float64)
         if not self._crosstalk:
             return patches
         return tuple(shared_patch(patch, self._crosstalk, Roi.of_sensor(posed.camera)) for patch in patches)
@@ -195,7 +246,7 @@ class Renderer:
     def _rates(self, camera: Camera) -> ElectronRates:
         return ElectronRates.of(self.scene, camera, self.detector)
 
-    def _halo(self, posed: PosedCamera, patches: Sequence[LedPatch]) -> GlareHalo | None:
+    def _halo(self, posed: PosedCamera, patches: Sequence[LedPatch], room_apart: bool) -> GlareHalo | None:
         """The halo of all that the sensor sees, regions or not; of room and reflections as at mid-exposure."""
         if posed.camera.glare is None:
             return None
@@ -205,111 +256,174 @@ class Renderer:
             for number in range(len(self.scene.glazings))
             for reflection in specular_reflections(self.scene, self._occlusion, posed, number, [sensor], rates.led)
         ]
-        return glare_halo(posed, self._background, rates, [*patches, *reflections])
+        return glare_halo(posed, self._background, rates, [*patches, *reflections], room_apart)
 
     def _rooms(
-        self, poses: Sequence[PosedCamera], rois: Sequence[Roi], images: Sequence[LedImages], blurs: LedBlur
+        self, view: LedView, rois: Sequence[Roi], rates: ElectronRates, with_reflections: bool = True
     ) -> tuple[list[Image], list[SpecularReflection]]:
         """The background of each region, and all specular reflections: means over the poses, blurred."""
-        camera = poses[0].camera
+        blurs, camera = view.blurs, view.posed.camera
         sensor = Roi.of_sensor(camera)
         padded = [roi.padded(blurs.radius_px) for roi in rois]
         wide = [p.intersection(sensor) if sensor.contains(roi) else p for roi, p in zip(rois, padded, strict=True)]
-        rates = self._rates(camera)
+        steps = len(view.bands[0].poses)
         totals: list[Image] | None = None
         reflections: list[SpecularReflection] = []
-        for posed, of_pose in zip(poses, images, strict=True):
-            rooms = self._background.regions(posed, wide, rates)
-            self._cover_with_faces(rooms, of_pose, rates)
+        for step in range(steps):
+            lines = None if view.rolling is None else view.rolling.steps[step]
+            rooms = self._background.regions(view.bands[0].poses[step], wide, rates, lines)
+            self._cover_with_faces(rooms, view.bands, step, rates)
             if totals is None:
                 totals = [room.image for room in rooms]
             else:
                 totals = [total + room.image for total, room in zip(totals, rooms, strict=True)]
-            for number in range(len(self.scene.glazings)):
+            for number in range(len(self.scene.glazings) if with_reflections else 0):
                 label = self._background.room.first_glazing + number
                 if any((room.surfaces == label).any() for room in rooms):
-                    led_rate = rates.led / len(poses)
-                    reflections += specular_reflections(self.scene, self._occlusion, posed, number, wide, led_rate)
+                    reflections += self._reflections(view, step, number, wide, rois, rates.led / steps)
         assert totals is not None  # there is at least one pose
         means = []
         for total, outer, roi in zip(totals, wide, rois, strict=True):
-            mean = total if len(poses) == 1 else total / np.float32(len(poses))
+            mean = total if steps == 1 else total / np.float32(steps)
             means.append(np.ascontiguousarray(blur(mean, blurs.typical, "edge")[outer.slices(roi)]))
-        return means, blurred(reflections, blurs.typical, rois, sensor)
+        return means, reflections
 
-    def _cover_with_faces(self, rooms: Sequence[BackgroundRegion], images: LedImages, rates: ElectronRates) -> None:
-        """Put the LEDs' faces, which reflect the room's light, before the room; changes its images."""
+    def _reflections(
+        self, view: LedView, step: int, number: int, wide: Sequence[Roi], rois: Sequence[Roi], led_rate: float
+    ) -> list[SpecularReflection]:
+        """Reflections in a glazing at one pose of each band, blurred, in the regions `rois`; `wide`: before blur."""
+        sensor, found = Roi.of_sensor(view.posed.camera), []
+        for band in view.bands:
+            within = wide
+            if band.knot is not None:
+                lines = band.knot.lines.padded(view.blurs.radius_px)
+                within = [roi.intersection(lines) for roi in wide if roi.overlaps(lines)]
+            sharp = specular_reflections(self.scene, self._occlusion, band.poses[step], number, within, led_rate)
+            for part in blurred(sharp, view.blurs.typical, rois, sensor):
+                shared = band.share(part.roi)
+                if band.knot is None:
+                    found.append(part)
+                elif shared is not None:
+                    inside, share = shared
+                    light = part.electrons_per_s[part.roi.slices(inside)] * share
+                    found.append(SpecularReflection(part.led_id, inside.row, inside.column, light.astype(np.float32)))
+        return found
+
+    def _cover_with_faces(
+        self, rooms: Sequence[BackgroundRegion], bands: Sequence[LedBand], step: int, rates: ElectronRates
+    ) -> None:
+        """Put the LEDs' faces, which reflect the room's light, before the room; changes its images.
+
+        step: the number of the pose of each band.
+        """
         vertices = len(self._light.mesh.vertices_m)  # the lightmap has the faces after the mesh
         faces = rates.led * self._light.led_cd_m2()[vertices:] + rates.ambient * self._light.ambient_cd_m2()[vertices:]
-        for i, led in images.items():
-            if self.scene.leds.diffusers[i] is not None:
-                continue  # a diffuser is one of the room's surfaces
-            for room in rooms:
-                if room.roi.overlaps(led.roi):
-                    both = room.roi.intersection(led.roi)
-                    here, there = room.roi.slices(both), led.roi.slices(both)
-                    coverage = led.coverage[there]
-                    uncovered = room.image[here] * (1 - coverage)
-                    room.image[here] = uncovered + faces[i] * coverage * led.weight[there]
+        sharp = [room.image.copy() for room in rooms] if len(bands) > 1 else [room.image for room in rooms]
+        for band in bands:
+            for i, led in band.images[step].items():
+                if self.scene.leds.diffusers[i] is not None:
+                    continue  # a diffuser is one of the room's surfaces
+                for room, before in zip(rooms, sharp, strict=True):
+                    shared = band.share(led.roi)
+                    if shared is not None and room.roi.overlaps(shared[0]):
+                        both = room.roi.intersection(shared[0])
+                        here, there = room.roi.slices(both), led.roi.slices(both)
+                        coverage = led.coverage[there]
+                        if band.knot is None:
+                            uncovered = room.image[here] * (1 - coverage)
+                            room.image[here] = uncovered + faces[i] * coverage * led.weight[there]
+                        else:
+                            share = coverage * band.knot.weights_in(both)
+                            room.image[here] += share * (faces[i] * led.weight[there] - before[here])
 
-    def _patches(
-        self,
-        posed: PosedCamera,
-        images: Sequence[LedImages],
-        patch_rois: Mapping[int, Roi],
-        blurs: LedBlur,
-        precision: type[np.floating] = np.float32,
-    ) -> tuple[LedPatch, ...]:
+    def _patches(self, view: LedView, precision: type[np.floating] = np.float32) -> tuple[LedPatch, ...]:
         """Patches of the LEDs: means over the images at several poses, blurred."""
-        leds = self.scene.leds
-        led_rate = self._rates(posed.camera).led
+        leds, posed = self.scene.leds, view.posed
         center_px = posed.project(leds.centers_m)
-        unions = _unions(images)
         patches = []
-        for i, roi in patch_rois.items():
-            union, kernel = unions[i], blurs.kernels[i]
-            light = np.zeros((union.rows, union.columns))
-            of_led = [of_pose[i] for of_pose in images if i in of_pose]
-            for image in of_led:
-                light[union.slices(image.roi)] += (
-                    led_rate * leds.luminances_cd_m2[i] * image.coverage * image.weight * image.pattern
+        for i, roi in view.patch_rois.items():
+            light = np.zeros((roi.rows, roi.columns)) if view.rolling else None
+            shares: list[tuple[float, float, float]] = []
+            for band in view.bands:
+                of_led = [of_pose[i] for of_pose in band.images if i in of_pose]
+                shared = band.share(roi)
+                if not of_led or shared is None:
+                    continue
+                of_band = self._light_of(view, i, of_led, len(band.poses), roi if light is None else shared[0])
+                visible, imaged = (
+                    sum(getattr(image, name) for image in of_led) / len(band.poses)
+                    for name in ("visible_fraction", "imaged_fraction")
                 )
-            edges = [image.edges for image in of_led if image.edges is not None]
-            light_per_excess = led_rate * float(leds.luminances_cd_m2[i]) / len(images)
-            patch = kernel.blurred(light / len(images), union, edges, light_per_excess)
-            patch = patch[union.padded(kernel.radius_px).slices(roi)]
+                if light is None:
+                    light = of_band
+                    shares.append((1.0, visible, imaged))
+                else:
+                    of_band *= shared[1]
+                    light[roi.slices(shared[0])] += of_band
+                    shares.append((float(of_band.sum()), visible, imaged))
+            assert light is not None  # an LED without an image has no patch
+            total = sum(share for share, _, _ in shares) or 1.0
+            u, v = center_px[i].tolist()
+            if view.rolling is not None:
+                u, v = image_at_own_line(posed, view.rolling.pose_at, leds.centers_m[i])
             patches.append(
                 LedPatch(
                     led_id=int(leds.ids[i]),
-                    center_px=(float(center_px[i, 0]), float(center_px[i, 1])),
+                    center_px=(u, v),
                     row=roi.row,
                     column=roi.column,
-                    electrons_per_s=np.ascontiguousarray(patch, dtype=precision),
-                    visible_fraction=sum(image.visible_fraction for image in of_led) / len(images),
-                    imaged_fraction=sum(image.imaged_fraction for image in of_led) / len(images),
+                    electrons_per_s=np.ascontiguousarray(light, dtype=precision),
+                    visible_fraction=sum(share * visible for share, visible, _ in shares) / total,
+                    imaged_fraction=sum(share * imaged for share, _, imaged in shares) / total,
                 )
             )
         return tuple(patches)
 
+    def _light_of(self, view: LedView, i: int, of_led: Sequence[LedImage], poses: int, roi: Roi) -> Array:
+        """Light of LED number i in a region: the mean over its images at this number of poses, blurred."""
+        luminance, kernel = self.scene.leds.luminances_cd_m2[i], view.blurs.kernels[i]
+        led_rate = self._rates(view.posed.camera).led
+        union = _union(of_led)
+        light = np.zeros((union.rows, union.columns))
+        for image in of_led:
+            light[union.slices(image.roi)] += led_rate * luminance * image.coverage * image.weight * image.pattern
+        edges = [image.edges for image in of_led if image.edges is not None]
+        light_per_excess = led_rate * float(luminance) / poses
+        result = kernel.blurred(light / poses, union, edges, light_per_excess)
+        return _cut(result, union.padded(kernel.radius_px), roi)
 
-def _unions(images: Sequence[LedImages]) -> dict[int, Roi]:
-    """By the LED's index, the region that contains its images at all poses, before blur."""
-    unions: dict[int, Roi] = {}
-    for of_pose in images:
-        for i, image in of_pose.items():
-            unions[i] = unions[i].union(image.roi) if i in unions else image.roi
-    return dict(sorted(unions.items()))
+
+def _union(images: Iterable[LedImage]) -> Roi:
+    """The region that contains several images of an LED."""
+    return reduce(Roi.union, (image.roi for image in images))
 
 
-def _patch_rois(
-    camera: Camera, images: Sequence[LedImages], blurs: LedBlur, regions: LedRegions | None
-) -> dict[int, Roi]:
+def _cut(light: Array, of: Roi, roi: Roi) -> Array:
+    """Light in the region `of`, in another region that it may not fill."""
+    if of.contains(roi):
+        return light[of.slices(roi)]
+    filled = np.zeros((roi.rows, roi.columns))
+    if of.overlaps(roi):
+        both = of.intersection(roi)
+        filled[roi.slices(both)] = light[of.slices(both)]
+    return filled
+
+
+def _patch_rois(camera: Camera, bands: Sequence[LedBand], blurs: LedBlur, regions: LedRegions | None) -> dict[int, Roi]:
     """By the LED's index, the pixels that it lights, blur included; on the sensor only, unless with overscan."""
-    rois = {i: roi.padded(blurs.kernels[i].radius_px) for i, roi in _unions(images).items()}
-    if regions is not None and regions.overscan:
-        return rois
     sensor = Roi.of_sensor(camera)
-    return {i: roi.intersection(sensor) for i, roi in rois.items() if sensor.overlaps(roi)}
+    rois: dict[int, Roi] = {}
+    for band in bands:
+        for i in sorted({i for of_pose in band.images for i in of_pose}):
+            roi = _union(of_pose[i] for of_pose in band.images if i in of_pose).padded(blurs.kernels[i].radius_px)
+            if regions is None or not regions.overscan:
+                if not sensor.overlaps(roi):
+                    continue
+                roi = roi.intersection(sensor)
+            shared = band.share(roi)
+            if shared is not None:
+                rois[i] = rois[i].union(shared[0]) if i in rois else shared[0]
+    return dict(sorted(rois.items()))
 
 
 def _check_size(rois: Sequence[Roi], camera: Camera) -> None:

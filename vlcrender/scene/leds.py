@@ -48,6 +48,13 @@ class Leds:
         """Area of each face, (n,)."""
         return np.where(self.squares, 4.0, np.pi) * self.half_widths_m**2
 
+    @property
+    def fluxes_lm(self) -> NDArray[np.float64]:
+        """Luminous flux that each LED sends into the room, (n,): 2 pi L A / (m + 1), less what a diffuser absorbs."""
+        through = np.array([1.0 if diffuser is None else diffuser.transmittance for diffuser in self.diffusers])
+        fluxes: NDArray[np.float64] = 2 * np.pi * self.luminances_cd_m2 * self.areas_m2 / (self.orders + 1) * through
+        return fluxes
+
     def profile(self, i: int) -> FaceProfile | None:
         """Luminance over the face of LED number i, relative to the mean; None for an even face."""
         gradient, falloff = self.face_gradients[i].tolist(), float(self.face_falloffs[i])
