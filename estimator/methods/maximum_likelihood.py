@@ -14,8 +14,11 @@ The standard deviation of such a nuisance is that of all LEDs of the frame: a va
 camera that states nothing is then assumed to be one as sold. A displacement common to all images is not revealed. Nor
 is a focal length where the view does not check it: `estimator.solvers.robust_fit` says what it adds to the covariance.
 
+With a rolling shutter the velocity of the camera while the frame is read out is estimated with the pose, with the
+gyroscope's reading or a hand's motion as a prior (`estimator.solvers.shutter_motion`); the pose is that at mid-readout.
+
 Not modelled: light of other sources beside a smooth background, mechanical vignetting (natural vignetting is), and
-motion. LEDs that the model does not explain are excluded by their goodness of fit.
+motion during the exposure of a line. LEDs that the model does not explain are excluded by their goodness of fit.
 """
 
 from collections.abc import Sequence
@@ -26,7 +29,6 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from estimator.camera.pose import POSE_PARAMETERS, Pose
-from estimator.camera.projection import project
 from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame
 from estimator.methods.gravity_fit import agreement, ambiguous
@@ -84,10 +86,11 @@ MAX_SIGMA_M = 1.0
 
 @dataclass(frozen=True, eq=False)
 class Maximum:
-    """The most likely pose and nuisances, the covariance (6, 6) of the pose, and the ids of the LEDs used.
+    """The most likely pose and nuisances, and the ids of the LEDs used.
 
-    `components` are those of the priors. `model_is_wrong` says whether many LEDs are not explained. `last` is the
-    result of the last search, with `pixels`.
+    `covariance` (6, 6) is that of the pose, or (12, 12) with the velocity's for a rolling shutter. `components` are
+    those of the priors. `model_is_wrong` says whether many LEDs are not explained. `last` is the result of the last
+    search, with `pixels`.
     """
 
     pose: Pose
@@ -214,7 +217,11 @@ def _revealed(frame: DeviceFrame, gravity: Gravity, priors: Priors, found: Maxim
     size, of_profile = [SIZE_PARAMETER], [IMAGE_PARAMETERS + k for k in range(PROFILE_PARAMETERS)]
     z = result.nuisances.standardized(had.added(priors).only(pixels.index))
     of_priors = gravity.deviance(result.pose.rig_angles(frame.camera)) + float(
-        (z.camera**2).sum() + (z.datum**2).sum() + (z.luminaires**2).sum() + (z.leds[result.used, :3] ** 2).sum()
+        (z.camera**2).sum()
+        + (z.datum**2).sum()
+        + (z.luminaires**2).sum()
+        + (z.leds[result.used, :3] ** 2).sum()
+        + (z.motion**2).sum()
     )
     ones = np.ones(len(radius_px))
     new = {}
@@ -282,11 +289,10 @@ def _shape_sigma_px(frame: DeviceFrame, priors: Priors, start: Start) -> float:
     state = start.nuisances.state(start.pose, frame.camera, priors).of(located)
     centres_m = np.array([led.position_m for led in leds]) + state.shifts_m
     points_m = np.concatenate([centres_m[:, None], centres_m[:, None] + rims_m], axis=1)
-    slopes = project(points_m.reshape(-1, 3), state.pose, state.camera).slopes.reshape(
-        len(leds), -1, 2, POSE_PARAMETERS
-    )
+    slopes = state.project(points_m.reshape(-1, 3)).slopes.reshape(len(leds), -1, 2, POSE_PARAMETERS)
     slopes = slopes[:, 1:] - slopes[:, :1]
-    return float(np.sqrt(np.nanmax(((slopes @ start.covariance) * slopes).sum(axis=(2, 3)))))
+    covariance = start.covariance[:POSE_PARAMETERS, :POSE_PARAMETERS]
+    return float(np.sqrt(np.nanmax(((slopes @ covariance) * slopes).sum(axis=(2, 3)))))
 
 
 def _model_is_wrong(wrong: int, used: int) -> bool:

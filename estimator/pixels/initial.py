@@ -9,11 +9,16 @@ from numpy.typing import NDArray
 from estimator.camera.intrinsics import intrinsic_slopes_px, with_errors
 from estimator.camera.leveling import tilt_from_gravity, tilt_sigmas
 from estimator.camera.pose import POSE_PARAMETERS, Pose
-from estimator.camera.projection import project
 from estimator.io.device import DeviceFrame
-from estimator.pixels.led_model import COARSE_POINTS, IMAGE_PARAMETERS, SIZE_PARAMETER, ImageState, rim
-from estimator.pixels.nuisances import (
+from estimator.pixels.led_model import (
+    COARSE_POINTS,
+    IMAGE_PARAMETERS,
     LOCAL_PARAMETERS,
+    SIZE_PARAMETER,
+    ImageState,
+    rim,
+)
+from estimator.pixels.nuisances import (
     NO_COMPONENTS,
     SIZE,
     Components,
@@ -44,8 +49,10 @@ MAX_TUNING = 10
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """Initial values: pose, nuisances of all LEDs of the map, the pose's covariance (6, 6), and which LEDs of the map
-    have an image that the initial values predict, whatever the covariance, (n,). `components` are added to the priors.
+    """Initial values: pose, nuisances of all LEDs of the map, and which of these have an image that the values predict.
+
+    `covariance` (6, 6) is that of the pose, or (12, 12) with the velocity's for a rolling shutter. The images of the
+    LEDs `located` (n,) are predicted whatever the covariance. `components` are added to the priors.
     """
 
     pose: Pose
@@ -89,10 +96,12 @@ def start_at_spots(
         # See `estimator.solvers.observations` on the eccentricity of a centroid.
         points_m[:, 2] += lift_m2 * offset_m[:, 2] / (offset_m**2).sum(axis=1)
         points_m[:, :2] += by_gradient_m[:, None] * nuisances.profile()[:, :2]
-        images = project(points_m, pose, camera)
+        images = nuisances.state(pose, frame.camera, of_spots).project(points_m)
         radius_px = np.sqrt(lift_m2) / np.linalg.norm(offset_m, axis=1) / camera.pixel_angle_rad
         sigma_px = np.hypot(START_SIGMA_PX, START_SIGMA_SHARE * radius_px)
-        rows = np.zeros((len(spots), 2, LOCAL_PARAMETERS))
+        rows = np.zeros((len(spots), 2, LOCAL_PARAMETERS + len(priors.motion)))
+        if images.motion_slopes is not None:
+            rows[:, :, LOCAL_PARAMETERS:] = images.motion_slopes
         rows[:, :, :POSE_PARAMETERS] = images.slopes
         rows[:, :, POSE_PARAMETERS:SIZE_PARAMETER] = intrinsic_slopes_px(
             images.p_cam, camera.normalized(images.pixels), camera
@@ -122,7 +131,7 @@ def _sizes_of_spots(spots: Sequence[Correspondence], state: ImageState, priors: 
     rims_m = state.rims_m(np.stack([rim(one.led, COARSE_POINTS) for one in spots])) + (
         priors.positions_m[:, None] + state.shifts_m[:, None]
     )
-    u, v = project(rims_m.reshape(-1, 3), state.pose, state.camera).pixels.reshape(len(spots), COARSE_POINTS, 2).T
+    u, v = state.project(rims_m.reshape(-1, 3)).pixels.reshape(len(spots), COARSE_POINTS, 2).T
     area_px = np.abs((u * np.roll(v, -1, axis=0) - v * np.roll(u, -1, axis=0)).sum(axis=0)) / 2
     whole = np.array([not (one.spot.touches_border or one.spot.saturated) for one in spots]) & (
         area_px >= np.pi * MIN_SIZED_PX**2

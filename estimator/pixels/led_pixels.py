@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.camera.projection import project
 from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame, Led, Part
 from estimator.pixels.led_model import (
@@ -244,14 +243,14 @@ def leds_in_view(
 ) -> LedsInView:
     """LEDs of the map, n in all, that are in view under a state of them.
 
-    Left out are LEDs whose image is not determined to MAX_IMAGE_SIGMA_PX by the pose, of covariance (6, 6), and by
-    their own position, of standard deviation `sigma_m` (n,), but for those whose image is `located` (n,). Raises
-    EstimationFailure if none is left.
+    Left out are LEDs whose image is not determined to MAX_IMAGE_SIGMA_PX by the pose, of covariance (6, 6), or (12, 12)
+    with that of the velocity for a rolling shutter, and by their own position, of standard deviation `sigma_m` (n,),
+    but for those whose image is `located` (n,). Raises EstimationFailure if none is left.
     """
     low, high = _read_out(frame)
     leds = tuple(frame.leds.values())
     centres_m = np.array([led.position_m for led in leds]) + state.shifts_m
-    centres = project(centres_m, state.pose, state.camera)
+    centres = state.project(centres_m)
     half_widths_m = np.array([led.half_width_m for led in leds])
     with np.errstate(invalid="ignore"):
         # The image moves with the camera as much as a point of the face moves it from its centre.
@@ -263,6 +262,8 @@ def leds_in_view(
         raise EstimationFailure("fit", NONE_IN_VIEW)
     footprints = led_footprints([leds[k] for k in candidates], state.of(candidates))
     slopes = centres.slopes[candidates]
+    if centres.motion_slopes is not None:
+        slopes = np.concatenate([slopes, centres.motion_slopes[candidates]], axis=2)
     with np.errstate(invalid="ignore"):
         in_view = footprints.whole & (footprints.high > low).all(axis=1) & (footprints.low < high).all(axis=1)
         variance_px2 = ((slopes @ covariance) * slopes).sum(axis=(1, 2)) + (sigma_m * scale)[candidates] ** 2

@@ -18,8 +18,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.camera.motion import MOTION_PARAMETERS
 from estimator.io.device import DeviceFrame
-from estimator.pixels.led_model import IMAGE_PARAMETERS, PROFILE_PARAMETERS, RenderedLeds
+from estimator.pixels.led_model import IMAGE_PARAMETERS, LOCAL_PARAMETERS, PROFILE_PARAMETERS, RenderedLeds
 from estimator.pixels.led_pixels import LedPixels
 
 Floats = NDArray[np.float64]
@@ -155,6 +156,8 @@ def score(
 ) -> tuple[Floats, Floats]:
     """Information (n, p, p) and gradient (n, p) of the log likelihood by the LOCAL_PARAMETERS of each of n LEDs.
 
+    Those of the motion follow where `rendered` has derivatives by them.
+
     Amplitudes and backgrounds are eliminated. Parameters that `rendered` has no derivatives by have no information; so
     has the profile if `profile` (n, 3) is None.
     """
@@ -165,9 +168,11 @@ def score(
         of_profile = pixels.face * (pixels.light(rendered) * photometry.amplitude[pixels.group])[:, None]
     residual = photometry.weight * (pixels.electrons - photometry.expected)
     columns = rendered.parameters
+    in_motion = bool((columns >= LOCAL_PARAMETERS).any())
     if profile is not None:
         columns = np.concatenate([columns, IMAGE_PARAMETERS + np.arange(PROFILE_PARAMETERS)])
-    count, all_of_them = len(columns), IMAGE_PARAMETERS + PROFILE_PARAMETERS
+    count = len(columns)
+    all_of_them = LOCAL_PARAMETERS + (MOTION_PARAMETERS if in_motion else 0)
     information = np.zeros((len(pixels.leds), all_of_them, all_of_them))
     gradient = np.zeros((len(pixels.leds), all_of_them))
     first_edge = np.searchsorted(pixels.edges, pixels.starts)

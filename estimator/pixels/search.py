@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.camera.pose import POSE_PARAMETERS, Pose
-from estimator.camera.projection import project
 from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame
 from estimator.pixels.initial import CONVERGED_STEP2, tuned
 from estimator.pixels.led_model import (
+    MOTION_COLUMNS,
     POSE_ALONE,
     SIZE_PARAMETER,
     TILT_PARAMETERS,
@@ -66,10 +66,10 @@ BACKGROUND_EDGE_PX = 0.02
 
 
 def image_parameters(priors: Priors) -> Ints:
-    """The IMAGE_PARAMETERS to estimate: pose, intrinsics and tilts with a prior, sizes because of the background."""
+    """The parameters to estimate: pose, intrinsics, tilts and motion with a prior, sizes because of the background."""
     of_camera = POSE_PARAMETERS + np.flatnonzero(priors.camera)
     of_face = [SIZE_PARAMETER, *(TILT_PARAMETERS if priors.leds[:, TILTS].any() else ())]
-    return np.concatenate([POSE_ALONE, of_camera, of_face])
+    return np.concatenate([POSE_ALONE, of_camera, of_face, MOTION_COLUMNS[: len(priors.motion)]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,8 +188,8 @@ class Search:
 
     def _damping(self, step: Solution, before: Solution, factor: float) -> float:
         """Factor of a step: a half where it takes back much of the one before."""
-        inner = step.pose_step @ step.information @ before.pose_step * factor
-        length2 = before.pose_step @ step.information @ before.pose_step * factor**2
+        inner = step.view_step @ step.information @ before.view_step * factor
+        length2 = before.view_step @ step.information @ before.view_step * factor**2
         return 0.5 if inner < -MAX_RETURN * length2 else 1.0
 
     def _with_edge_errors(self, used: Mask) -> Priors:
@@ -224,7 +224,7 @@ class Search:
         """Points of the rims, (n, RIM_POINTS, 2)."""
         centres_m = self._centres_m + state.shifts_m
         points_m = centres_m[:, None] + state.rims_m(self._rims_m)
-        return project(points_m.reshape(-1, 3), state.pose, state.camera).pixels.reshape(-1, RIM_POINTS, 2)
+        return state.project(points_m.reshape(-1, 3)).pixels.reshape(-1, RIM_POINTS, 2)
 
 
 def unexplained(result: ScoringResult) -> Mask:
