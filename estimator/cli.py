@@ -279,6 +279,8 @@ def _print_scores(scores: Scores) -> None:
         tables.append((title, cells.LIMIT_HEADERS, cells.limit_cells, cells.LIMIT_NOTE))
     if any(map(cells.has_groups, variants)):
         tables.append(("by device and map", cells.GROUP_HEADERS, cells.group_cells, cells.GROUP_NOTE))
+    if any(of_variant.downlink for of_variant in variants):
+        tables.append(("identities", cells.IDENTITY_HEADERS, cells.identity_cells, cells.IDENTITY_NOTE))
     if any(of_variant.failed for of_variant in variants):
         tables.append(("failed frames by good LEDs", cells.LOST_HEADERS, cells.lost_cells, cells.LOST_NOTE))
     for title, headers, of_variant, note in tables:

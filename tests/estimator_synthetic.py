@@ -129,7 +129,7 @@ def write_exr(path: Path, image_dn: NDArray[np.uint32]) -> str:
 
 
 SPOT = pa.struct([("led", pa.int64()), ("u_px", pa.float64()), ("v_px", pa.float64())])
-TRUTH_LED = pa.struct([*SPOT, pa.field("visible_fraction", pa.float64())])
+TRUTH_LED = pa.struct([*SPOT, pa.field("visible_fraction", pa.float64()), pa.field("bits", pa.string())])
 FRAMES_SCHEMA = pa.schema(
     [
         ("frame", pa.int64()),

@@ -7,7 +7,7 @@ import numpy as np
 from estimator.receiver.signal import ChipWave, Floats, Signal, overlaps
 
 NOT_SEEN = "-"
-MIN_SEEN = 0.5
+MIN_SEEN = 0.15
 """Chips that the lines show with less than this share of the best chip's weight are not decided."""
 RIDGE = 1e-6
 

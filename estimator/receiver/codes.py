@@ -150,7 +150,8 @@ def match_code_of_frames(
     """The LED whose code fits the signals of one LED in the frames of a burst best, as a match for each signal.
 
     The phase goes on from frame to frame by their times, within CLOCK_SIGMAS standard deviations of the clock's
-    relative error. Correlation and misfits are those of all lines; levels are free in each frame. None where nothing is found.
+    relative error. Correlation and misfits are those of all lines; levels are free in each frame. None where nothing is
+    found.
     """
     used = [signal for signal in signals if len(signal) >= MIN_LINES and signal.centred.any()]
     if not used:

@@ -244,6 +244,37 @@ def as_received(frame: DeviceFrame, receptions: Sequence[Reception]) -> DeviceFr
     )
 
 
+def with_identities(frame: DeviceFrame) -> DeviceFrame:
+    """The frame, received by itself if its identities have to be decoded and have not been; its other cameras too."""
+    others = tuple(with_identities(other) for other in frame.other_cameras)
+    if others != frame.other_cameras:
+        frame = replace(frame, other_cameras=others)
+    asked = frame.downlink is not None and frame.downlink.demodulation == "pixels"
+    return receive_frames((frame,))[0] if asked and frame.identities is None else frame
+
+
 def receive_frames(frames: Sequence[DeviceFrame]) -> tuple[DeviceFrame, ...]:
-    """Frames of one burst and camera as received: `receive`, then `as_received` of each."""
+    """Decode what the LEDs send from the pixels of a burst.
+
+    `estimate` and `run` do this where a dataset's `demodulation` is "pixels". Call it for frames of your own that
+    belong to one burst: together they show more of what is sent than one by one.
+
+    Parameters
+    ----------
+    frames
+        Frames of one burst and camera, in the order of time, by `read_frame` or `frame`.
+
+    Returns
+    -------
+    tuple of DeviceFrame
+        The frames with the decoded identities as `spots`, all LED images in `identities`, and the gains of the LEDs by
+        lines in `gains`. Where the map is null, `leds` are those that packets told.
+
+    Raises
+    ------
+    InputError
+        The frames are not in the order of time.
+    EstimationFailure
+        The lens cannot be undone at an LED image.
+    """
     return tuple(as_received(frame, some) for frame, some in zip(frames, receive(frames), strict=True))

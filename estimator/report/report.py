@@ -20,6 +20,8 @@ from estimator.evaluate.score_table import (
     ERROR_NOTE,
     GROUP_HEADERS,
     GROUP_NOTE,
+    IDENTITY_HEADERS,
+    IDENTITY_NOTE,
     LIMIT_HEADERS,
     LIMIT_NOTE,
     LOST_HEADERS,
@@ -29,6 +31,7 @@ from estimator.evaluate.score_table import (
     error_cells,
     group_cells,
     has_groups,
+    identity_cells,
     limit_cells,
     lost_cells,
     pair_cells,
@@ -91,6 +94,7 @@ class Section:
     scores: Table
     limits: Table | None
     groups: Table | None
+    identities: Table | None
     lost: Table | None
     pairs: Table | None
     best: str
@@ -136,6 +140,7 @@ def _section(folder: Path, scores: Scores) -> Section:
         scores=_table(ERROR_HEADERS, [(index, error_cells(v)) for index, v in enumerate(variants)], ERROR_NOTE),
         limits=_limit_table(variants),
         groups=_group_table(variants),
+        identities=_identity_table(variants),
         lost=_lost_table(variants),
         pairs=_pair_table(variants),
         best=best(variants).variant if variants else "",
@@ -165,6 +170,14 @@ def _group_table(variants: Sequence[VariantScore]) -> Table | None:
     if not any(map(has_groups, variants)):
         return None
     return _table(GROUP_HEADERS, [(index, group_cells(variant)) for index, variant in enumerate(variants)], GROUP_NOTE)
+
+
+def _identity_table(variants: Sequence[VariantScore]) -> Table | None:
+    """Table of identities that a receiver decoded; None where they were given."""
+    if not any(variant.downlink for variant in variants):
+        return None
+    cells = [(index, identity_cells(variant)) for index, variant in enumerate(variants)]
+    return _table(IDENTITY_HEADERS, cells, IDENTITY_NOTE)
 
 
 def _lost_table(variants: Sequence[VariantScore]) -> Table | None:
