@@ -17,7 +17,8 @@ from estimator.io.device import DeviceFrame, DiscLed
 from estimator.io.shutter import Gyroscope, Shutter
 from estimator.methods import gravity_fit, pnp, self_calibrated, up2p
 from estimator.methods.variant import Estimate
-from estimator.solvers.observations import Observations, moving_slopes, observe, second_order_m2
+from estimator.solvers import second_order
+from estimator.solvers.observations import Observations, moving_slopes, observe
 from estimator.solvers.reprojection import fit
 from estimator.solvers.shutter_motion import HAND_RATE_SIGMA_DEG_S, ShutterMotion, motion_prior
 from estimator.spots.detect import Spot
@@ -315,7 +316,7 @@ def test_the_second_order_of_the_position_is_that_of_draws() -> None:
     covariance = np.zeros((6, 6))
     covariance[:3, :3] = 0.03**2 * np.linalg.inv(to_turn) @ np.linalg.inv(to_turn).T
     covariance[3:, 3:] = 1e-8 * np.eye(3)
-    found = sight @ second_order_m2(x, covariance) @ sight + 1e-8
+    found = sight @ second_order.of_pose_vector(x, covariance) @ sight + 1e-8
     assert ((moved @ sight) ** 2).mean() == pytest.approx(found, rel=0.02)
 
 

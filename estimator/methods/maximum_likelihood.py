@@ -48,6 +48,7 @@ from estimator.pixels.search import (
     image_parameters,
     unexplained,
 )
+from estimator.solvers import second_order
 from estimator.solvers.observations import Observations, observe
 from estimator.solvers.reprojection import fit
 from estimator.solvers.uncertainty import assumed_uncertainty
@@ -132,6 +133,9 @@ def ml(frame: DeviceFrame) -> Estimate:
     covariance_m2 = found.covariance[:3, :3]
     if not _camera_is_assumed(frame, found.components):
         covariance_m2 = covariance_m2 + unchecked_m2
+    if observations.motion is not None:
+        centre_m = observations.leds_m[inliers].mean(axis=0)
+        covariance_m2 = covariance_m2 + second_order.of_pose(found.pose, frame.camera, centre_m, found.covariance)
     return Estimate(found.pose.position_m, covariance_m2=covariance_m2, ambiguous=is_ambiguous)
 
 

@@ -270,30 +270,3 @@ def position_slopes(x: Floats) -> Floats:
     R_cam_world, by_vector = cv2.Rodrigues(x[:3])
     by_rotation = np.column_stack([-by_vector[k].reshape(3, 3).T @ x[3:] for k in range(3)])
     return np.hstack([by_rotation, -R_cam_world.T])
-
-
-def second_order_m2(x: Floats, covariance: Floats) -> Floats:
-    """Second-order part (3, 3) of the mean square error of the position, by the covariance (k, k) of the parameters x.
-
-    Few LEDs fix the camera's distance from them to less than a millimetre and leave its direction open to centimetres
-    where its motion is not known: an arc, which the derivatives take for a straight line. With R = exp(-[a]x) R0 and
-    t = t0 + b the position is centre - R0^T exp([a]x) (t0 + b), whose terms of second order in the normal a and b are
-    -R0^T (a (a . t0) / 2 - t0 a^2 / 2 + a x b).
-    """
-    R_cam_world, by_vector = cv2.Rodrigues(x[:3])
-    t = x[3:6]
-    to_local = np.eye(6)
-    for k, slope in enumerate(by_vector.reshape(3, 3, 3)):
-        turn = slope @ R_cam_world.T
-        to_local[:3, k] = -turn[2, 1], -turn[0, 2], -turn[1, 0]
-    local = to_local @ covariance[:6, :6] @ to_local.T
-    hessians = np.zeros((3, 6, 6))
-    for i, axis in enumerate(np.eye(3)):
-        hessians[i, :3, :3] = (np.outer(axis, t) + np.outer(t, axis)) / 2 - t[i] * np.eye(3)
-        # Component i of a x b is a^T L b with L[j, k] = epsilon_ijk.
-        hessians[i, :3, 3:] = np.cross(np.eye(3), axis)
-        hessians[i, 3:, :3] = hessians[i, :3, 3:].T
-    scaled = hessians @ local
-    traces = np.trace(scaled, axis1=1, axis2=2)
-    second = (np.outer(traces, traces) + 2 * np.einsum("iab,jba->ij", scaled, scaled)) / 4
-    return np.asarray(R_cam_world.T @ second @ R_cam_world)

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from estimator.camera.pose import Pose
-from estimator.solvers.observations import Observations, centroid_images, pose_slopes, pose_vector, second_order_m2
+from estimator.solvers import second_order
+from estimator.solvers.observations import Observations, centroid_images, pose_slopes, pose_vector
 from estimator.solvers.robust_fit import OUTLIER_PROBABILITY
 
 Floats = NDArray[np.float64]
@@ -45,5 +46,5 @@ def ordinary_covariance(observations: Observations, pose: Pose) -> Floats:
     moved = gain @ (lifted - centres).ravel()
     total = gain @ covariance @ gain.T + np.outer(moved, moved)
     if observations.motion is not None:
-        total = total + second_order_m2(pose_vector(observations, pose), of_pose @ covariance @ of_pose.T)
+        total = total + second_order.of_pose_vector(pose_vector(observations, pose), of_pose @ covariance @ of_pose.T)
     return np.asarray(total)

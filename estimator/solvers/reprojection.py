@@ -20,7 +20,8 @@ from scipy.spatial.transform import Rotation
 from estimator.camera.motion import MOTION_PARAMETERS
 from estimator.camera.pose import POSE_PARAMETERS, Pose
 from estimator.errors import EstimationFailure
-from estimator.solvers.observations import Observations, moving_slopes, position_slopes, second_order_m2
+from estimator.solvers import second_order
+from estimator.solvers.observations import Observations, moving_slopes, position_slopes
 
 Floats = NDArray[np.float64]
 
@@ -215,7 +216,7 @@ def _fit(observations: Observations, start: Pose, whitening: Floats, loss: Liter
     of_position[:, :POSE_PARAMETERS] = position_slopes(found.x[:POSE_PARAMETERS])
     covariance_m2 = of_position @ covariance @ of_position.T
     if motion is not None:
-        covariance_m2 = covariance_m2 + second_order_m2(found.x, covariance)
+        covariance_m2 = covariance_m2 + second_order.of_pose_vector(found.x, covariance)
     # At the minimum J^T C^-1 r with the shares of gravity and motion is zero, and so q = C^-1 r.
     roots = whitening.reshape(2 * count, count, 2) if whitening.ndim == 2 else None
     if roots is None:
