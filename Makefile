@@ -32,6 +32,7 @@ figures: $(READY)
 	$(BIN)/python docs/measure.py
 	$(BIN)/python docs/measure_belief.py
 	$(BIN)/python docs/measure_budget.py
+	$(BIN)/python docs/measure_downlink.py
 
 bench: $(READY)
 	$(BIN)/python benchmarks/full_frame.py

@@ -34,6 +34,7 @@ UNITS = {
     "nm": "nm",
     "px": "px",
     "um": "um",
+    "us": "us",
     "c": "deg C",
     "e": "e",
     "g": "g",

@@ -3,19 +3,24 @@
     python docs/measure_downlink.py [SECTION ...]
 
 Sections: `waves` (integrals of the waves against numerical ones), `codes` (parts of codes that are found twice),
-`flicker` (modulation against IEEE 1789).
+`flicker` (modulation against IEEE 1789), `burst_cost` (time of a further frame of a burst).
 """
 
 import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import perf_counter
 
 import numpy as np
 from measure import Measurement, heading, number, row
 from numpy.typing import NDArray
 
+import vlcrender as vr
 from vlcrender.config.toml_model import check, read_toml
+from vlcrender.dataset.frame_job import Job, make_frame
+from vlcrender.dataset.timeline import Burst
 from vlcrender.modulation.codes import code_book
 from vlcrender.modulation.flicker import flicker_of
 from vlcrender.modulation.keys import Downlink
@@ -31,6 +36,8 @@ EXPOSURES = 40
 POINTS = 1 << 22
 """Points of the midpoint rule. It is off by at most half a point's share of the step at each edge: 7e-7 for three edges
 from 0 to 2."""
+BURSTS = 8
+FURTHER_FRAMES = 2
 SENDERS: dict[str, dict[str, object]] = {
     "code": {"send": "code"},
     "code, depth 0.5": {"send": "code", "depth": 0.5},
@@ -117,7 +124,32 @@ def flicker(chosen: Chosen) -> None:
             row(name, limit, *own, f"{beyond} of {found.leds}")
 
 
-SECTIONS: dict[str, Callable[[Chosen], None]] = {section.__name__: section for section in (waves, codes, flicker)}
+def burst_cost(chosen: Chosen) -> None:
+    """Time of a further frame of a burst over that of the first, in one process; recipe downlink_codes, no bound."""
+    plan = vr.load_recipe("downlink_codes")
+    burst = Burst(frames=1 + FURTHER_FRAMES, frame_rate_hz=30.0)
+    heading("what is read out", "bursts", "first frame", "a further frame", "ratio (median; smallest to largest)")
+    for name, regions in (("full frame", None), ("regions of LEDs", plan.recipe.regions)):
+        recipe = plan.recipe.model_copy(update={"burst": burst, "bound": False, "regions": regions})
+        with TemporaryDirectory(dir=chosen.measurement.out) as folder:
+            for part in ("frames", "previews"):
+                (Path(folder) / part).mkdir()
+            settings = plan.scene.settings.model_dump_json()
+            job = Job(recipe.model_dump_json(), settings, str(plan.scene.folder), folder)
+            seconds = np.zeros((1 + BURSTS, burst.frames))
+            for number in np.ndindex(seconds.shape):
+                start = perf_counter()
+                make_frame(job, number[0] * burst.frames + number[1])
+                seconds[number] = perf_counter() - start
+        first, further = seconds[1:, 0], seconds[1:, 1:].mean(axis=1)  # the first burst compiles kernels
+        ratios = further / first
+        own = [f"{np.median(first):.2f} s", f"{np.median(further):.2f} s"]
+        row(name, BURSTS, *own, f"{np.median(ratios):.2f} ({ratios.min():.2f} to {ratios.max():.2f})")
+
+
+SECTIONS: dict[str, Callable[[Chosen], None]] = {
+    section.__name__: section for section in (waves, codes, flicker, burst_cost)
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -1,4 +1,4 @@
-"""Pictures of a rolling shutter for the estimator's tests: every line by a pose of its own, and every LED's gain at it."""
+"""Pictures of a rolling shutter for the estimator's tests: every line by a pose and with gains of its own."""
 
 from collections.abc import Callable, Sequence
 

@@ -98,7 +98,17 @@ def test_a_frame_has_the_bits_of_a_data_set(preset: str | None, regions: bool, t
     overrides = [*SMALL, "poses.count=1", "accelerometer.error_deg=0.3"]
     overrides += [f"sensor.preset={preset}", "camera.pixel_pitch_um=12.0"] if preset else []
     overrides += ["regions.kind=leds", "regions.margin_px=3"] if regions else []
-    plan = vr.load_recipe("quickstart", overrides)
+    assert_frame_of_a_dataset(vr.load_recipe("quickstart", overrides), tmp_path)
+
+
+@pytest.mark.slow
+def test_a_frame_of_codes_has_the_bits_of_a_data_set(tmp_path: Path) -> None:
+    overrides = [*SMALL, "poses.count=1", "bound=false", "camera.pixel_pitch_um=12.0", "camera.shutter.row_time_us=20"]
+    assert_frame_of_a_dataset(vr.load_recipe("downlink_codes", overrides), tmp_path)
+
+
+def assert_frame_of_a_dataset(plan: "vr.Plan", tmp_path: Path) -> None:
+    """The first frame of a plan's dataset is that of the API, as device and as truth."""
     assert vr.generate(plan, tmp_path / "set")
     assert vr.verify(tmp_path / "set") == []
     device = pq.read_table(tmp_path / "set/frames.parquet").to_pylist()[0]
@@ -106,7 +116,8 @@ def test_a_frame_has_the_bits_of_a_data_set(preset: str | None, regions: bool, t
     tilts = (truth["tilt_x_deg"], truth["tilt_y_deg"], truth["yaw_deg"])
     recipe = plan.recipe
     mean = vr.render(plan.scene, recipe.camera, vr.Pose(tuple(truth["position_m"]), *tilts), regions=recipe.regions)
-    raw = vr.expose(mean, recipe.sensor, recipe.exposure_s or 0.0, recipe.seed, recipe.accelerometer)
+    timing = {"start_s": device["start_s"], "demodulation": recipe.demodulation}
+    raw = vr.expose(mean, recipe.sensor, recipe.exposure_s or 0.0, recipe.seed, recipe.accelerometer, **timing)
     record = raw.record()
     with OpenEXR.File(str(tmp_path / "set" / device["file"]), separate_channels=True) as file:
         assert len(file.parts) == len(raw.parts)
@@ -119,9 +130,12 @@ def test_a_frame_has_the_bits_of_a_data_set(preset: str | None, regions: bool, t
     assert record["exposure_s"] == device["exposure_s"]
     dataset = json.loads((tmp_path / "set/dataset.json").read_text())
     assert json.loads(json.dumps(record["camera"])) == dataset["cameras"]["main"]
-    for key in ("sensor", "accelerometer", "led_map"):
+    for key in ("sensor", "accelerometer", "led_map", "downlink"):
         assert json.loads(json.dumps(record[key])) == dataset[key], key
-    assert {key: truth[key] for key in mean.truth} == mean.truth
+    assert record["start_s"] == device["start_s"]
+    waves = ("clock_error", "phase", "bits")  # of the seed and the start, which a view has not
+    leds = [{key: value for key, value in led.items() if key not in waves} for led in truth["leds"]]
+    assert {**{key: truth[key] for key in mean.truth}, "leds": leds} == mean.truth
 
 
 def test_noise_is_of_the_seed_and_the_frame(mean: vr.ExpectedFrame) -> None:
@@ -160,6 +174,25 @@ def test_regions_alone_have_no_full_image(office: vr.Scene, small_camera: vr.Cam
         _ = raw.image_dn
 
 
+def test_waves_are_of_the_seed_and_the_start(mean: vr.ExpectedFrame, small_camera: vr.Camera) -> None:
+    """The LEDs of a frame add up to other light at another time; steady ones do not change."""
+    sensor = vr.Sensor(noise="none", gain_e_per_dn=20.0, bits=14, full_well_e=1e6)
+    rolling = vr.Camera.model_validate(
+        {**small_camera.model_dump(), "shutter": {"kind": "rolling", "row_time_us": 20.0}}
+    )
+    coded = vr.render(vr.load_scene("office_codes"), rolling, POSE)
+    first, again, late, other = (
+        vr.expose(coded, sensor, 40e-6, seed, start_s=start_s).image_dn
+        for seed, start_s in ((1, 0.0), (1, 0.0), (1, 1e-4), (2, 0.0))
+    )
+    assert np.array_equal(first, again)
+    assert not np.array_equal(first, late)
+    assert not np.array_equal(first, other)
+    assert vr.expose(coded, sensor, 40e-6, 1, demodulation="pixels").spots == ()
+    steady = [vr.expose(mean, sensor, 40e-6, 1, start_s=start_s).image_dn for start_s in (0.0, 1e-4)]
+    assert np.array_equal(*steady)
+
+
 def test_mistakes_are_refused_in_one_line(mean: vr.ExpectedFrame, office: vr.Scene, tmp_path: Path) -> None:
     calls = {
         "offic: is neither a file nor one of the scenes there are: .*office": lambda: vr.load_scene("offic"),
@@ -167,6 +200,8 @@ def test_mistakes_are_refused_in_one_line(mean: vr.ExpectedFrame, office: vr.Sce
         "no.toml": lambda: vr.load_scene(tmp_path / "no.toml"),
         "camera.f_number": lambda: vr.load_recipe("quickstart", {"camera.f_number": "fast"}),
         "exposure_s = nan": lambda: vr.expose(mean, vr.Sensor(), float("nan"), 1),
+        "start_s = -1: has to be from 0": lambda: vr.expose(mean, vr.Sensor(), 1e-4, 1, start_s=-1.0),
+        'demodulation = "guess"': lambda: vr.expose(mean, vr.Sensor(), 1e-4, 1, demodulation="guess"),
         "seed = -1": lambda: vr.expose(mean, vr.Sensor(), 1e-4, -1),
         "not inside the room": lambda: vr.render(office, mean.camera, vr.Pose((9.0, 1.0, 1.0))),
         'preset = "phone"': lambda: vr.Sensor.preset("phone"),

@@ -21,6 +21,7 @@ from hypothesis import strategies as st
 
 from estimator.errors import InputError
 from estimator.io.dataset import FrameRecord, read_dataset, read_frame
+from estimator.io.device import Identity
 from estimator.io.estimates import EstimateRow, LedRange, estimates_path, read_estimates, write_estimates
 
 Rows = list[dict[str, Any]]
@@ -494,6 +495,10 @@ ROWS = (
         position_m=None,
         ranges=(LedRange(led=10, range_m=3.5),),
         time_s=0.2,
+        identities=(
+            Identity(led=10, u_px=1.5, v_px=2.5, correlation=0.99, bits="01-1", position_m=(1.0, 2.0, 3.5)),
+            Identity(led=None, u_px=7.0, v_px=8.0, correlation=0.5),
+        ),
     ),
 )
 
@@ -512,6 +517,8 @@ def test_estimates_come_back_as_written_in_the_formats_types(folder: Path) -> No
         "ambiguous": "bool",
         "ranges": "list<element: struct<led: int64, range_m: double>>",
         "time_s": "double",
+        "identities": "list<element: struct<led: int64, u_px: double, v_px: double, correlation: double, "
+        "bits: string, position_m: list<element: double>>>",
     }
     assert [entry.name for entry in path.parent.iterdir()] == ["some.parquet"]
 

@@ -536,6 +536,13 @@ def test_flicker_of_a_scene(
     assert flicker_of(vr.load_scene("office").leds.transmitters) == ()
 
 
+@pytest.mark.parametrize("name", ["office_codes", "office_packets"])
+def test_packaged_scenes_flicker_without_observable_effect(name: str) -> None:
+    (found,) = flicker_of(vr.load_scene(name).leds.transmitters)
+    assert (found.leds, found.no_effect_exceeded) == (1225, 0)
+    assert 0 < found.worst.no_effect.share < 1
+
+
 def test_show_prints_the_flicker_and_warns(
     capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:

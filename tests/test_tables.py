@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -25,6 +26,7 @@ from vlcrender.dataset.tables import read_table, write_table
 from vlcrender.errors import InputError
 
 SPOT = [("led", pa.int64()), ("u_px", pa.float64()), ("v_px", pa.float64())]
+WAVE = [("clock_error", pa.float64()), ("phase", pa.float64()), ("bits", pa.string())]
 
 
 def test_the_columns_are_those_of_the_format() -> None:
@@ -32,6 +34,8 @@ def test_the_columns_are_those_of_the_format() -> None:
     expected = {
         "frame": pa.int64(),
         "shot": pa.int64(),
+        "burst": pa.int64(),
+        "start_s": pa.float64(),
         "pose": pa.int64(),
         "device": pa.int64(),
         "file": pa.string(),
@@ -40,6 +44,7 @@ def test_the_columns_are_those_of_the_format() -> None:
         "exposure_s": pa.float64(),
         "capturable": pa.bool_(),
         "accelerometer_m_s2": pa.list_(pa.float64(), 3),
+        "gyro_rad_s": pa.list_(pa.float64(), 3),
         "spots": pa.list_(pa.struct(SPOT)),
     }
     assert pa.schema(list(expected.items())).equals(FRAMES_SCHEMA)
@@ -54,7 +59,9 @@ def test_the_columns_are_those_of_the_format() -> None:
         "tilt_x_deg": pa.float64(),
         "tilt_y_deg": pa.float64(),
         "yaw_deg": pa.float64(),
-        "leds": pa.list_(pa.struct([*SPOT, ("visible_fraction", pa.float64())])),
+        "angular_velocity_rad_s": pa.list_(pa.float64(), 3),
+        "linear_velocity_m_s": pa.list_(pa.float64(), 3),
+        "leds": pa.list_(pa.struct([*SPOT, ("visible_fraction", pa.float64()), *WAVE])),
         "bound_m2": pa.list_(pa.float64(), 9),
         "bound_exact_m2": pa.list_(pa.float64(), 9),
     }
@@ -91,6 +98,8 @@ def record(rng: np.random.Generator, bound: bool) -> FrameRecord:
     device = {
         "frame": 3,
         "shot": 2,
+        "burst": 1,
+        "start_s": numbers(1)[0],
         "pose": 1,
         "device": 1,
         "file": "frames/000003.exr",
@@ -99,8 +108,12 @@ def record(rng: np.random.Generator, bound: bool) -> FrameRecord:
         "exposure_s": exposure,
         "capturable": True,
         "accelerometer_m_s2": numbers(3),
+        "gyro_rad_s": numbers(3) if bound else None,
         "spots": (SpotRow(led=7, u_px=u, v_px=v),),
     }
+    wave: dict[str, Any] = {"clock_error": None, "phase": None, "bits": None}
+    if bound:
+        wave = {"clock_error": numbers(1)[0], "phase": numbers(1)[0], "bits": "0110"}
     truth = {
         "frame": 3,
         "shot": 2,
@@ -110,7 +123,9 @@ def record(rng: np.random.Generator, bound: bool) -> FrameRecord:
         "position_m": numbers(3),
         "R_cam_world": numbers(9),
         **dict(zip(("tilt_x_deg", "tilt_y_deg", "yaw_deg"), tilts, strict=True)),
-        "leds": (LedTruth(led=7, u_px=v, v_px=u, visible_fraction=share),),
+        "angular_velocity_rad_s": numbers(3) if bound else None,
+        "linear_velocity_m_s": numbers(3) if bound else None,
+        "leds": (LedTruth(led=7, u_px=v, v_px=u, visible_fraction=share, **wave),),
         "bound_m2": numbers(9) if bound else None,
         "bound_exact_m2": numbers(9) if bound else None,
     }

@@ -20,11 +20,12 @@ from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.roi import LedRegions, Roi
 from vlcrender.config.packaged import find_file
 from vlcrender.errors import InputError
-from vlcrender.rendering.expected_image import ExpectedImage, Image
+from vlcrender.rendering.expected_image import ExpectedImage, Gain, Gains, Image
 from vlcrender.scene.loader import Scene
 from vlcrender.sensor.sensor import Sensor
 
 if TYPE_CHECKING:
+    from vlcrender.dataset.downlink_entry import Demodulation
     from vlcrender.dataset.error_budget import ErrorBudget
     from vlcrender.dataset.progress import ProgressCallback
     from vlcrender.dataset.recipe import Plan
@@ -38,6 +39,8 @@ Overrides = Mapping[str, object] | Iterable[str]
 MAX_RENDERERS = 4
 """Renderers that are kept, one for each scene and spectral response; the one used longest ago is dropped first."""
 MAX_EXPOSURE_S = 100.0
+MAX_START_S = 1e7
+"""Latest start of a frame: the phase of a wave of 1 ms is then known to 1e-6 periods."""
 MAX_SEED = 2**63
 
 
@@ -108,7 +111,11 @@ class RawFrame:
     accelerometer_m_s2: NDArray[np.float64]
     """Reading (3,) of the accelerometer at rest, in camera axes."""
     spots: "tuple[SpotRow, ...]"
-    """Decoded identities: `led`, and a rough pixel `u_px`, `v_px`."""
+    """Decoded identities: `led`, and a rough pixel `u_px`, `v_px`; none with `demodulation` "pixels"."""
+    start_s: float = 0.0
+    """Start of the exposure of the first line that is read, by the clock of the waves of the LEDs."""
+    demodulation: "Demodulation" = "given"
+    """Whether identities are given, or a receiver has to read them from the pixels."""
 
     @property
     def image_dn(self) -> NDArray[np.uint32]:
@@ -120,19 +127,24 @@ class RawFrame:
     def record(self) -> dict[str, Any]:
         """The frame in the words of datasets/FORMAT.md, for `estimator.frame`; nothing of the truth is in it.
 
-        Keys: `camera`, `sensor`, `accelerometer` and `led_map` as in dataset.json, `exposure_s`, `accelerometer_m_s2`
-        and `spots` as in frames.parquet, and `parts`: `row`, `column` and `image_dn` of each region.
+        Keys: `camera`, `sensor`, `accelerometer`, `led_map` and `downlink` as in dataset.json, `exposure_s`, `start_s`,
+        `accelerometer_m_s2` and `spots` as in frames.parquet, and `parts`: `row`, `column` and `image_dn` of each
+        region.
         """
         from vlcrender.camera.rig import mounted_cameras
+        from vlcrender.dataset.downlink_entry import downlink_entry
         from vlcrender.dataset.schema import SensorEntry, accelerometer_entry, camera_entry, led_map
 
         (mounted,) = mounted_cameras(self.camera, ())
+        downlink = downlink_entry(self.scene.leds, self.demodulation)
         return {
             "camera": camera_entry(mounted).model_dump(mode="json"),
             "sensor": SensorEntry(**self.sensor.acting()).model_dump(mode="json"),
             "accelerometer": accelerometer_entry(self.accelerometer).model_dump(mode="json"),
             "led_map": [entry.model_dump(mode="json") for entry in led_map(self.scene.leds)],
+            "downlink": None if downlink is None else downlink.model_dump(mode="json"),
             "exposure_s": self.exposure_s,
+            "start_s": self.start_s,
             "accelerometer_m_s2": self.accelerometer_m_s2.tolist(),
             "spots": [spot.model_dump() for spot in self.spots],
             "parts": [
@@ -180,6 +192,7 @@ def render(
 ) -> ExpectedFrame:
     """Render the expected image: mean photoelectrons a second of every pixel, without noise, and the truth.
 
+    Where LEDs transmit, this is the mean over time: `expose` adds their waves.
     Of the `sensor`, by default `Sensor()`, quantum efficiency, mosaic and crosstalk count. With `regions` the regions
     around the LEDs are rendered alone. The scene's light is computed once and kept in the cache folder; renderers are
     kept for each scene object and spectral response. Raises InputError if the camera is not inside the room, or if
@@ -188,7 +201,8 @@ def render(
     sensor = sensor or Sensor()
     if regions is not None and regions.overscan and camera.distortion is not None:
         raise InputError("regions.overscan = true: a camera with distortion is not defined far beyond its sensor")
-    image = _renderer(scene, sensor).expected_image(PosedCamera(camera, pose), regions)
+    modulated = any(transmitter.modulated for transmitter in scene.leds.transmitters)
+    image = _renderer(scene, sensor).expected_image(PosedCamera(camera, pose), regions, room_apart=modulated)
     return ExpectedFrame(image.parts, scene, camera, pose, sensor, regions)
 
 
@@ -200,13 +214,18 @@ def expose(
     accelerometer: "TiltError | Imu | None" = None,
     *,
     frame: int = 0,
+    start_s: float = 0.0,
+    demodulation: "Demodulation" = "given",
 ) -> RawFrame:
     """Expose an expected image: noise, saturation and quantization of a sensor, as digital numbers.
 
     Noise depends on `seed`, `frame` and the pixel: the result has the bits of frame number `frame` of a dataset with
-    this seed, one camera and no repeats. `accelerometer` is `TiltError()` by default, with 0.1 deg of error. If the
-    quantum efficiency, mosaic or crosstalk of `sensor` differs from those that `mean` was rendered with, the view is
-    rendered again with the sensor's. Raises InputError for an exposure time or a seed out of range.
+    this seed, one camera and no repeats. Where LEDs of the scene transmit, the exposure of the first line starts
+    `start_s` after the start of their waves (`start_s` of that frame in frames.parquet); clocks and phases follow from
+    `seed`. With `demodulation` "pixels" no identities are given. `accelerometer` is `TiltError()` by default, with
+    0.1 deg of error. If the quantum efficiency, mosaic or crosstalk of `sensor` differs from those that `mean` was
+    rendered with, the view is rendered again with the sensor's. Raises InputError for a time, a seed or a demodulation
+    that is not allowed.
     """
     from vlcrender.core.random_keys import random_key, stream
     from vlcrender.dataset.downlink import decoded_spots
@@ -216,6 +235,11 @@ def expose(
     exposure_s = float(exposure_s)
     if not (isfinite(exposure_s) and 0 < exposure_s <= MAX_EXPOSURE_S):
         raise InputError(f"exposure_s = {exposure_s:g}: has to be above 0 and at most {MAX_EXPOSURE_S:g}")
+    start_s = float(start_s)
+    if not (isfinite(start_s) and 0 <= start_s <= MAX_START_S):
+        raise InputError(f"start_s = {start_s:g}: has to be from 0 to {MAX_START_S:g}")
+    if demodulation not in ("given", "pixels"):
+        raise InputError(f'demodulation = "{demodulation}": has to be "given" or "pixels"')
     for name, number in (("seed", seed), ("frame", frame)):
         if not 0 <= int(number) < MAX_SEED:
             raise InputError(f"{name} = {number}: has to be an integer from 0 to 2**63 - 1")
@@ -223,12 +247,13 @@ def expose(
         mean = render(mean.scene, mean.camera, mean.pose, sensor=sensor, regions=mean.regions)
     device = accelerometer or TiltError()
     noise = random_key(int(seed), int(frame), "shot-noise")
+    gains, room_gain = _gains(mean, exposure_s, int(seed), start_s)
     parts = tuple(
         RawRegion(
             part.roi,
             digital_numbers(
                 sensor,
-                part.expected_electrons(exposure_s),
+                part.expected_electrons(exposure_s, gains, room_gain),
                 noise,
                 part.roi.row,
                 part.roi.column,
@@ -237,7 +262,9 @@ def expose(
         )
         for part in mean.parts
     )
-    spots = decoded_spots(mean.parts, mean.camera.width_px, stream(int(seed), int(frame), "demodulator"))
+    spots: tuple[SpotRow, ...] = ()
+    if demodulation == "given":
+        spots = decoded_spots(mean.parts, mean.camera.width_px, stream(int(seed), int(frame), "demodulator"))
     return RawFrame(
         mean.scene,
         mean.camera,
@@ -246,8 +273,24 @@ def expose(
         exposure_s,
         parts,
         device.reading_m_s2(mean.pose, stream(int(seed), int(frame), "accelerometer")),
-        tuple(spots),
+        spots,
+        start_s,
+        demodulation,
     )
+
+
+def _gains(mean: ExpectedFrame, exposure_s: float, seed: int, start_s: float) -> tuple[Gains | None, Gain]:
+    """Gains of the LEDs and of the room's light in an exposure, for each line; None and 1 where all light is steady."""
+    from vlcrender.modulation.exposure import LineGains, MeanWave
+    from vlcrender.modulation.transmission import led_waves
+
+    leds = mean.scene.leds
+    waves = led_waves(leds.transmitters, seed)
+    if not waves:
+        return None, 1.0
+    starts_s = start_s + mean.camera.line_starts_s()
+    room = MeanWave.of(waves, dict(zip(leds.ids.tolist(), leds.fluxes_lm.tolist(), strict=True)))
+    return LineGains(waves, starts_s, exposure_s), room.mean(starts_s, exposure_s)
 
 
 def generate(

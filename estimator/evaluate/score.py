@@ -129,7 +129,7 @@ class Scores(Row):
     format: Literal["estimator-scores"] = "estimator-scores"
     version: Literal[4] = 4
     dataset: str
-    room_m: tuple[Positive, Positive, Positive]
+    room_m: tuple[Positive, Positive, Positive] | None
     led_map: tuple[AnyLed, ...]
     variants: tuple[VariantScore, ...]
 

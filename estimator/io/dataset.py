@@ -26,6 +26,7 @@ from estimator.io.device import (
     Sensor,
     decoding_problem,
     depth_problem,
+    gravity_problem,
     gyro_problem,
     leds_by_id,
     luminaires_by_id,
@@ -76,7 +77,7 @@ class FrameRecord(Row):
     camera: str
     exposure_s: Positive
     capturable: bool
-    accelerometer_m_s2: Triple
+    accelerometer_m_s2: Triple | None
     spots: Annotated[tuple[DecodedSpot, ...], Strict(False)]
     device: DeviceNumber
     burst: int = Field(ge=0, le=INT64_MAX)
@@ -109,9 +110,9 @@ class _Description(Row):
     frame_count: int = Field(ge=0, le=INT64_MAX)
     cameras: dict[str, Camera]
     sensor: Sensor
-    accelerometer: Accelerometer
+    accelerometer: Accelerometer | None
     led_map: tuple[AnyLed, ...] | None
-    room_m: tuple[Positive, Positive, Positive]
+    room_m: tuple[Positive, Positive, Positive] | None
     luminaires: tuple[Luminaire, ...]
     map_datum: MapDatum | None
     gyroscope: Gyroscope | None
@@ -136,17 +137,17 @@ class _Description(Row):
 class Dataset:
     """Device knowledge of a dataset, and its frame records; `read_frame` reads the images, a frame at a time.
 
-    `cameras` are by name, `leds` and `luminaires` by id; `room_m` is the room's extent along x, y and z, metres. `leds`
-    is empty where the map is null: a receiver then makes it of the packets that the LEDs send.
+    `cameras` are by name, `leds` and `luminaires` by id; `room_m` is the room's extent along x, y and z, metres, None
+    where it is not known. `leds` is empty where the map is null: a receiver then makes it of the packets that the LEDs send.
     """
 
     folder: Path
     name: str
     cameras: dict[str, Camera]
     sensor: Sensor
-    accelerometer: Accelerometer
+    accelerometer: Accelerometer | None
     leds: dict[int, AnyLed]
-    room_m: tuple[float, float, float]
+    room_m: tuple[float, float, float] | None
     frames: tuple[FrameRecord, ...]
     luminaires: dict[int, Luminaire]
     map_datum: MapDatum | None
@@ -224,6 +225,7 @@ def _check_frames(path: Path, dataset: Dataset, frame_count: int) -> None:
             known = ", ".join(dataset.cameras) or "none"
             raise InputError(f"{path}: frame {index}: unknown camera {record.camera!r}; cameras: {known}")
         problem = spots_problem(dataset.downlink, record.spots) or decoding_problem(record.spots, dataset.leds)
+        problem = problem or gravity_problem(record.accelerometer_m_s2, dataset.accelerometer)
         if problem := problem or gyro_problem(record.gyro_rad_s, dataset.gyroscope):
             raise InputError(f"{path}: frame {index}: {problem}")
     _check_bursts(path, dataset.frames)
@@ -370,3 +372,11 @@ def _check_headers(record: FrameRecord, headers: list[dict[str, object]], camera
     if problem := regions_problem(boxes, camera):
         raise InputError(f"{record.file}: {problem}")
     return boxes
+
+
+def write_image(path: Path, image_dn: NDArray[np.uint32], exposure_s: float) -> str:
+    """Write a full frame's digital numbers (rows, columns) as frames/*.exr; returns the file's sha256."""
+    header = {"compression": OpenEXR.PIZ_COMPRESSION, "type": OpenEXR.scanlineimage, "expTime": exposure_s}
+    with OpenEXR.File(header, {"Y": np.ascontiguousarray(image_dn)}) as file:
+        file.write(str(path))
+    return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -190,13 +190,13 @@ class Camera(Row):
 class Sensor(Row):
     """Sensor of a device; keys as in dataset.json: `dn = round(min(e, full_well_e) / gain_e_per_dn) + black_level_dn`.
 
-    Noise other than shot noise is given by standard deviations, as in a data sheet. `crosstalk` is the share of a
+    A photograph says neither gain nor full well: both are None, and electrons are then digital numbers. Noise other than shot noise is given by standard deviations, as in a data sheet. `crosstalk` is the share of a
     pixel's electrons that its four neighbours collect, a quarter each.
     """
 
     bits: int = Field(ge=1, le=32)
-    gain_e_per_dn: Positive
-    full_well_e: Positive
+    gain_e_per_dn: Positive | None
+    full_well_e: Positive | None
     black_level_dn: float = Field(ge=0, le=2**32)
     noise: Literal["shot", "none", "full"]
     crosstalk: float = Field(default=0.0, ge=0, le=1)
@@ -209,9 +209,19 @@ class Sensor(Row):
     column_offset_e: NotNegative
     mosaic: str
 
+    @property
+    def gain(self) -> float:
+        """Electrons a digital number; 1 where the device does not state them."""
+        return 1.0 if self.gain_e_per_dn is None else self.gain_e_per_dn
+
+    def _well_dn(self) -> float:
+        """Digital number at the full well, infinite where the device does not state it."""
+        full_e = np.inf if self.full_well_e is None else self.full_well_e
+        return float(np.rint(full_e / self.gain)) + self.black_level_dn
+
     def saturation_dn(self) -> float:
         """Digital number of a saturated pixel: at the full well, or the ADC's last code if that is lower."""
-        return min(2.0**self.bits - 1, float(np.rint(self.full_well_e / self.gain_e_per_dn)) + self.black_level_dn)
+        return min(2.0**self.bits - 1, self._well_dn())
 
     def clipping_dn(self) -> float:
         """Lowest digital number that a saturated pixel may have.
@@ -220,21 +230,20 @@ class Sensor(Row):
         last code needs no such margin: a pixel that reads less has not reached it.
         """
         added_e = float(np.hypot(self.read_noise_e, np.hypot(self.row_offset_e, self.column_offset_e)))
-        spread_dn = float(np.hypot(added_e / self.gain_e_per_dn, self.adc_noise_dn))
-        well_dn = float(np.rint(self.full_well_e / self.gain_e_per_dn)) + self.black_level_dn
-        return min(2.0**self.bits - 1, well_dn - FULL_SIGMA * spread_dn)
+        spread_dn = float(np.hypot(added_e / self.gain, self.adc_noise_dn))
+        return min(2.0**self.bits - 1, self._well_dn() - FULL_SIGMA * spread_dn)
 
     def floor_e2(self) -> float:
         """Signal-independent variance of a pixel, electrons squared.
 
         Offsets of whole rows and columns are left out: subtracting a spot's local background removes most of them.
         """
-        added = self.dsnu_e**2 + self.read_noise_e**2 + (self.adc_noise_dn * self.gain_e_per_dn) ** 2
+        added = self.dsnu_e**2 + self.read_noise_e**2 + (self.adc_noise_dn * self.gain) ** 2
         return added + self.rounding_e2()
 
     def rounding_e2(self) -> float:
         """Variance of the ADC's rounding, electrons squared; 0 where whole electrons are counted."""
-        return self.gain_e_per_dn**2 / 12 if self.noise == "full" or self.gain_e_per_dn != 1 else 0.0
+        return self.gain**2 / 12 if self.noise == "full" or self.gain != 1 else 0.0
 
 
 class Luminaire(Row):
@@ -281,9 +290,14 @@ class Led(Row):
     gradient_sigma: NotNegative | None = None
 
     @property
+    def has_size(self) -> bool:
+        """Whether the map says how large the LED is."""
+        return True
+
+    @property
     @abstractmethod
     def half_width_m(self) -> float:
-        """Radius of a disc, half the side of a square, metres."""
+        """Radius of a disc, half the side of a square, metres; NaN where the map does not say it."""
 
     @property
     @abstractmethod
@@ -293,12 +307,15 @@ class Led(Row):
     @property
     @abstractmethod
     def mean_square_extent_m2(self) -> float:
-        """Mean of x^2 over the face, x measured from the centre along any direction of the face, m^2."""
+        """Mean of x^2 over the face, x measured from the centre along any direction of the face, m^2.
+
+        0, that of a point, where the map does not say the size.
+        """
 
     @property
     def shift_by_gradient_m(self) -> float:
         """Shift s^2 / r of the centre of the light by a gradient of 1, with the mean square extent s^2, metres."""
-        return self.mean_square_extent_m2 / self.half_width_m
+        return self.mean_square_extent_m2 / self.half_width_m if self.has_size else 0.0
 
     def sigmas(self) -> Floats:
         """Standard deviations (6,) of the position along x, y, z and of the half width, metres, and of gx and gy.
@@ -318,10 +335,10 @@ class Led(Row):
 
 
 class DiscLed(Led):
-    """Disc of radius `radius_m`, of standard deviation `radius_sigma_m`."""
+    """Disc of radius `radius_m`, of standard deviation `radius_sigma_m`; None where the map does not say the radius."""
 
     shape: Literal["disc"] = "disc"
-    radius_m: Positive
+    radius_m: Positive | None
     radius_sigma_m: NotNegative | None = None
 
     @model_validator(mode="before")
@@ -335,14 +352,19 @@ class DiscLed(Led):
         return self.radius_sigma_m
 
     @property
+    def has_size(self) -> bool:
+        """Whether the radius is known."""
+        return self.radius_m is not None
+
+    @property
     def half_width_m(self) -> float:
-        """The radius, metres."""
-        return self.radius_m
+        """The radius, metres; NaN where it is not known."""
+        return np.nan if self.radius_m is None else self.radius_m
 
     @property
     def mean_square_extent_m2(self) -> float:
-        """A quarter of the radius squared, m^2."""
-        return self.radius_m**2 / 4
+        """A quarter of the radius squared, m^2; 0 where it is not known."""
+        return 0.0 if self.radius_m is None else self.radius_m**2 / 4
 
 
 class SquareLed(Led):
@@ -445,6 +467,15 @@ def gyro_problem(reading_rad_s: Sequence[float] | None, gyroscope: Gyroscope | N
     return "gyro_rad_s is given, but gyroscope is null" if reading_rad_s is not None and gyroscope is None else None
 
 
+def gravity_problem(reading_m_s2: Sequence[float] | None, accelerometer: "Accelerometer | None") -> str | None:
+    """What is wrong with a frame's reading of the accelerometer, None if nothing: one of the two without the other."""
+    if reading_m_s2 is not None and accelerometer is None:
+        return "accelerometer_m_s2 is given, but accelerometer is null"
+    if reading_m_s2 is None and accelerometer is not None:
+        return "accelerometer_m_s2 is null, but accelerometer is given"
+    return None
+
+
 class Accelerometer(Row):
     """Error of the accelerometer as the device knows it, degrees, one standard deviation.
 
@@ -483,15 +514,15 @@ class LineGains(Protocol):
 class DeviceFrame:
     """A frame as the device has it: the regions read out (one for a full frame), and all that the device knows.
 
-    `accelerometer_m_s2` is the reading in the axes of this frame's camera; `spots` are decoded identities; `leds` is
+    `accelerometer_m_s2` is the reading in the axes of this frame's camera, None without an accelerometer; `spots` are decoded identities; `leds` is
     the LED map by id.
     """
 
     parts: tuple[Part, ...]
     camera: Camera
     sensor: Sensor
-    accelerometer_m_s2: tuple[float, float, float]
-    accelerometer: Accelerometer
+    accelerometer_m_s2: tuple[float, float, float] | None
+    accelerometer: Accelerometer | None
     exposure_s: float
     spots: tuple[DecodedSpot, ...]
     leds: Mapping[int, Led]
@@ -523,8 +554,8 @@ class DeviceFrame:
         image = part.image_dn.astype(np.float32)
         if self.sensor.black_level_dn != 0:
             image -= np.float32(self.sensor.black_level_dn)
-        if self.sensor.gain_e_per_dn != 1:
-            image *= np.float32(self.sensor.gain_e_per_dn)
+        if self.sensor.gain != 1:
+            image *= np.float32(self.sensor.gain)
         return image
 
     def clipped(self, part: Part) -> NDArray[np.bool_]:
@@ -538,10 +569,10 @@ class _Record(Row):
 
     camera: Camera
     sensor: Sensor
-    accelerometer: Accelerometer
+    accelerometer: Accelerometer | None
     led_map: tuple[AnyLed, ...] | None
     exposure_s: Positive
-    accelerometer_m_s2: Triple
+    accelerometer_m_s2: Triple | None
     spots: tuple[DecodedSpot, ...]
     luminaires: tuple[Luminaire, ...] = ()
     map_datum: MapDatum | None = None
@@ -597,6 +628,7 @@ def frame(record: Mapping[str, Any]) -> DeviceFrame:
         raise InputError(f"record: {error}") from None
     problem = downlink_problem(known.downlink, None if known.led_map is None else leds.keys())
     problem = problem or gyro_problem(known.gyro_rad_s, known.gyroscope)
+    problem = problem or gravity_problem(known.accelerometer_m_s2, known.accelerometer)
     if problem := problem or spots_problem(known.downlink, known.spots) or decoding_problem(known.spots, leds):
         raise InputError(f"record: {problem}")
     return DeviceFrame(

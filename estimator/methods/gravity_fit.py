@@ -65,7 +65,7 @@ def agreement(observations: Observations) -> Consensus:
         return [*upright_pairs(observations), *_from_triples(observations)]
 
     gravity_optional = determine_orientation(observations.leds_m)
-    return consensus(observations, _starts(observations), more_starts, gravity_optional)
+    return consensus(observations, initial_poses(observations), more_starts, gravity_optional)
 
 
 def ambiguous(agreed: Consensus) -> bool:
@@ -73,7 +73,7 @@ def ambiguous(agreed: Consensus) -> bool:
     return any(other.cost - agreed.best.cost < AMBIGUOUS_CHI2 for other in agreed.others)
 
 
-def _starts(observations: Observations) -> list[Pose]:
+def initial_poses(observations: Observations) -> list[Pose]:
     """Initial poses: the upright one by gravity, and without gravity IPPE's two, or SQPNP's for LEDs in no plane."""
     starts = [pose for pose in [upright_pose(observations)] if pose is not None]
     if len(observations.leds_m) >= MIN_FOR_IPPE:

@@ -108,8 +108,10 @@ def ml(frame: DeviceFrame) -> Estimate:
     """The most likely position and its covariance; raises EstimationFailure.
 
     The initial pose is that of `gravity_fit`, which also decides whether the estimate is ambiguous and whether gravity
-    is used. With two spots the initial pose is the fit to them and gravity.
+    is used. With two spots the initial pose is the fit to them and gravity. LEDs without a size have no model.
     """
+    if not all(led.has_size for led in frame.leds.values()):
+        raise EstimationFailure("fit", "the map does not say how large its LEDs are")
     correspondences = find_correspondences(frame)
     observations = observe(frame, correspondences)
     inliers, use_gravity, is_ambiguous = np.ones(len(observations.leds_m), dtype=bool), True, False

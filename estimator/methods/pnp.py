@@ -32,6 +32,8 @@ Floats = NDArray[np.float64]
 # Depth over length of the LEDs' pattern, from which on the planar solver is no use. Its poses are initial values, so
 # that errors of the map, and luminaires that hang a little askew, may lift LEDs out of the plane.
 MAX_PLANE_DEPTH = 0.02
+IPPE_ONLY = (cv2.SOLVEPNP_IPPE,)
+SQPNP_ONLY = (cv2.SOLVEPNP_SQPNP,)
 
 
 def pnp(frame: DeviceFrame) -> Estimate:
@@ -41,12 +43,12 @@ def pnp(frame: DeviceFrame) -> Estimate:
 
 def ippe(frame: DeviceFrame) -> Estimate:
     """Infinitesimal plane-based pose estimation (Collins & Bartoli 2014): the better of its two poses."""
-    return _estimate(frame, (cv2.SOLVEPNP_IPPE,))
+    return _estimate(frame, IPPE_ONLY)
 
 
 def sqpnp(frame: DeviceFrame) -> Estimate:
     """PnP as a quadratically constrained quadratic program (Terzakis & Lourakis 2020)."""
-    return _estimate(frame, (cv2.SOLVEPNP_SQPNP,))
+    return _estimate(frame, SQPNP_ONLY)
 
 
 def _estimate(frame: DeviceFrame, methods: Sequence[int]) -> Estimate:

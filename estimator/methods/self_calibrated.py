@@ -63,9 +63,11 @@ def fit_correspondences(frame: DeviceFrame, correspondences: Sequence[Correspond
 
 def _view(frame: DeviceFrame, correspondences: Sequence[Correspondence], agreed: Consensus) -> DeviceView:
     inliers = [one for one, use in zip(correspondences, agreed.inliers, strict=True) if use]
+    stated = frame.accelerometer
+    if stated is None or frame.accelerometer_m_s2 is None:
+        raise EstimationFailure("leveling", "the device has no accelerometer")
     x, y, z = (frame.camera.R_cam_rig_array().T @ frame.accelerometer_m_s2).tolist()
     tilt = tilt_from_gravity((x, y, z))
-    stated = frame.accelerometer
     total_rad = np.radians(max(stated.error_deg, MIN_TILT_SIGMA_DEG))
     lever = tilt_sigmas(stated, tilt[1]) / total_rad
     shot_deg = stated.error_deg if stated.shot_error_deg is None else stated.shot_error_deg

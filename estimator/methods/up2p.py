@@ -61,6 +61,8 @@ def fit_correspondences(
     frame: DeviceFrame, correspondences: Sequence[Correspondence], centroid_sigma_px: float = 0.0
 ) -> Estimate:
     """The estimate from identified spots; of the frame, camera, accelerometer and map are used."""
+    if frame.accelerometer is None:
+        raise EstimationFailure("leveling", "the device has no accelerometer")
     observations = observe(frame, correspondences, centroid_sigma_px)
     starts = _from_pairs(observations)
     if determine_orientation(observations.leds_m) and not observations.displaced:

@@ -20,6 +20,7 @@ from estimator.pixels.led_model import (
 )
 from estimator.pixels.nuisances import (
     NO_COMPONENTS,
+    NO_GRAVITY,
     SIZE,
     Components,
     Gravity,
@@ -63,7 +64,9 @@ class Start:
 
 
 def gravity_of(frame: DeviceFrame) -> Gravity:
-    """Prior of the rig's tilts by a frame's accelerometer."""
+    """Prior of the rig's tilts by a frame's accelerometer; NO_GRAVITY without one."""
+    if frame.accelerometer is None or frame.accelerometer_m_s2 is None:
+        return NO_GRAVITY
     x, y, z = (frame.camera.R_cam_rig_array().T @ frame.accelerometer_m_s2).tolist()
     tilts = tilt_from_gravity((x, y, z))
     return Gravity(np.array(tilts), tilt_sigmas(frame.accelerometer, tilts[1]))

@@ -69,7 +69,7 @@ class Noise:
         """Noise of a frame's sensor."""
         sensor = frame.sensor
         dark_e2 = sensor.floor_e2() + sensor.row_offset_e**2 + sensor.column_offset_e**2
-        saturation_e = (sensor.clipping_dn() - sensor.black_level_dn) * sensor.gain_e_per_dn
+        saturation_e = (sensor.clipping_dn() - sensor.black_level_dn) * sensor.gain
         return Noise(dark_e2, sensor.prnu**2, saturation_e)
 
 

@@ -1,10 +1,9 @@
 """Bits: hard decisions on the chips that an LED image shows, and how often theory has them wrong."""
 
-from math import erfc, sqrt
-
 import numpy as np
+from scipy.special import erfc
 
-from estimator.receiver.signal import ChipWave, Floats, Signal, overlaps
+from estimator.receiver.signal import ChipWave, Floats, Ints, Signal, overlaps
 
 NOT_SEEN = "-"
 MIN_SEEN = 0.15
@@ -47,8 +46,8 @@ def bits_seen(signal: Signal, wave: ChipWave) -> str:
     return "".join("01"[int(e > 0)] if s else NOT_SEEN for e, s in zip(evidence, seen, strict=True))
 
 
-def bit_error_rate(shares: Floats, electrons: Floats, variance_e2: Floats, first: int) -> float:
-    """Expected error rate of a bit in Manchester code that is decided by least squares.
+def bit_error_rates(shares: Floats, electrons: Floats, variance_e2: Floats, noise_e2: Floats, firsts: Ints) -> Floats:
+    """Expected error rates of bits in Manchester code that are decided by least squares.
 
     Parameters
     ----------
@@ -57,19 +56,22 @@ def bit_error_rate(shares: Floats, electrons: Floats, variance_e2: Floats, first
     electrons
         Electrons of each line while the LED is bright, (n,).
     variance_e2
-        Variance of each line, shot noise included, (n,), electrons squared.
-    first
-        The first of the bit's two chips.
+        Variance of each line that the least squares take, (n,), electrons squared.
+    noise_e2
+        Variance that each line has, shot noise of its own light included, (n,), electrons squared.
+    firsts
+        The first of each bit's two chips, (bits,).
 
     Returns
     -------
-    float
-        `Q(1 / sqrt(v))` with `v = f^T (A^T S^-1 A)^-1 f`, A the shares times electrons, S the variances, f = +1, -1 on
-        the bit's chips: their difference is 1 in size, with variance v. Normal noise is assumed.
+    array
+        `Q(1 / sqrt(v))`, (bits,). Where both variances are S, `v = f^T (A^T S^-1 A)^-1 f`, A the shares times
+        electrons, f = +1, -1 on the bit's chips: their difference is 1 in size, with variance v. Normal noise is
+        assumed.
     """
     design = shares * electrons[:, None]
     normal = design.T @ (design / variance_e2[:, None])
     normal += RIDGE * np.trace(normal) / len(normal) * np.eye(len(normal))
-    covariance = np.linalg.inv(normal)
-    variance = covariance[first, first] + covariance[first + 1, first + 1] - 2 * covariance[first, first + 1]
-    return erfc(1 / sqrt(2 * variance)) / 2
+    solution = np.linalg.solve(normal, design.T / variance_e2)
+    differences = solution[firsts] - solution[firsts + 1]
+    return np.asarray(erfc(1 / np.sqrt(2 * differences**2 @ noise_e2)) / 2)

@@ -20,10 +20,11 @@ MIN_MISFIT_RATIO = 1.5
 MIN_MISFIT = 1e-12
 MIN_LINES = 8
 CLOCK_SIGMAS = 3.0
-PHASES = 8
+PHASES = 4
 """Phases within a chip that are tried for every code; those of the best codes are refined."""
 REFINED = 6
-REFINED_PHASES = 9
+REFINED_PHASES = 7
+PHASE_STEP_CHIPS = 2e-3
 CONSTANT = 1e-4
 """Variance of gains, of chips 0 and 1, below which a code counts as constant over the lines."""
 
@@ -125,7 +126,7 @@ class CodeBook:
         """Phase near `phase`, chips, at which a code fits best, and its correlation there."""
         at_s, step = float(signal.start_s[0]), 1.0 / PHASES
         correlation = -1.0
-        while step > 0.5 / PHASES**3:
+        while step > PHASE_STEP_CHIPS:
             tried = phase + step * np.linspace(-1, 1, REFINED_PHASES)
             found = [
                 signal.correlation(self.wave(row, one, at_s).gains(signal.start_s, signal.exposure_s)) for one in tried

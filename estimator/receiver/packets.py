@@ -231,10 +231,9 @@ def decode_packet(
             continue
         others = [float(some.min()) for other, some in enumerate(misfits) if other != number]
         ratio = min(others, default=np.inf) / max(own, 1e-12 * fits[number].square)
-        waves = tuple(
-            ChipWave(chips, clock.chip_s, packets.depth, clock.at_s, clock.phase - float(delays[index]) - start)
-            for index in hypotheses[number]
-        )
+        late = [float(delays[index]) + start for index in hypotheses[number]]
+        clock = clock.refined(images, chips, late, packets)
+        waves = tuple(clock.wave(chips, one, packets.depth) for one in late)
         return PacketMatch(data, explained, erased, ratio, hypotheses[number], waves)
     return None
 
@@ -300,6 +299,38 @@ class _Clock:
         level = signal.level - 0.5
         square = float(signal.weight @ level**2)
         return _Fit(weighted.T @ folded, level @ weighted, square, np.zeros(period, dtype=np.int64))
+
+    def wave(self, chips: Ints, late: float, depth: float) -> ChipWave:
+        """Wave of an LED that starts its chips `late` chips after the clock."""
+        return ChipWave(chips, self.chip_s, depth, self.at_s, self.phase - late)
+
+    def refined(
+        self, images: Sequence[Sequence[Signal]], chips: Ints, late: Sequence[float], packets: Packets
+    ) -> "_Clock":
+        """The clock near this one with which the waves of all LED images fit best, in phase and then in rate."""
+        pairs = [(signal, delay) for some, delay in zip(images, late, strict=True) for signal in some]
+        span = max(float(signal.start_s[-1]) for signal, _ in pairs) - self.at_s
+
+        def misfit(clock: _Clock) -> float:
+            left = 0.0
+            for signal, delay in pairs:
+                gains = clock.wave(chips, delay, packets.depth).gains(signal.start_s, signal.exposure_s)
+                left += float(signal.weight @ signal.centred**2) * (1 - max(signal.correlation(gains), 0.0) ** 2)
+            return left
+
+        best = self
+        for reach in (0.2, 0.05):
+            for turned in (1, -1):
+                # Ahead by as much at the first line as at the last one; then ahead at the one, behind at the other.
+                shifts = reach * np.linspace(-1, 1, 5)
+                tried = [best.shifted(shift, turned * shift, span) for shift in shifts.tolist()]
+                best = min(tried, key=misfit)
+        return best
+
+    def shifted(self, first: float, last: float, span_s: float) -> "_Clock":
+        """The clock that is so many chips ahead at `at_s`, and `span_s` later."""
+        rate = 1 / self.chip_s + (last - first) / span_s
+        return _Clock(1 / rate, self.phase + first, self.at_s)
 
     def misfit(self, signal: Signal) -> float:
         """Weighted squares that free chips leave in one signal."""

@@ -70,7 +70,10 @@ def find_groups(
     """Groups of LED images over the frames of a burst; `images` are those of each frame."""
     offsets = np.array(packets.offsets_m)
     pitch_m = _pitch_m(offsets)
-    gravity = np.mean([frame.accelerometer_m_s2 for frame in frames], axis=0)
+    readings = [frame.accelerometer_m_s2 for frame in frames if frame.accelerometer_m_s2 is not None]
+    if not readings:
+        return ()
+    gravity = np.mean(readings, axis=0)
     R_cam_world = rotation(*tilt_from_gravity((float(gravity[0]), float(gravity[1]), float(gravity[2]))))
     levels = [_level(frame, some, packets, R_cam_world) for frame, some in zip(frames, images, strict=True)]
     places, numbers = _matched(levels, pitch_m)

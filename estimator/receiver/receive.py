@@ -13,13 +13,14 @@ import numpy as np
 
 from estimator.errors import InputError
 from estimator.io.device import AnyLed, DecodedSpot, DeviceFrame, DiscLed, Identity, Led, Luminaire, SquareLed
-from estimator.io.downlink import INDEX_BITS, Codes, DiscFace, Packets
+from estimator.io.downlink import INDEX_BITS, Codes, DiscFace, Packets, Tones
 from estimator.receiver.bits import bits_seen
 from estimator.receiver.codes import code_books, match_code, match_code_of_frames
-from estimator.receiver.lamps import lamps_of
 from estimator.receiver.packets import PacketFormat, decode_packet
 from estimator.receiver.panels import find_groups, same_images
-from estimator.receiver.signal import ChipWave, Floats, LedImage, WaveGains, led_image
+from estimator.receiver.signal import ChipWave, Floats, LedImage, PulseWave, WaveGains, led_image
+from estimator.receiver.tones import match_tones
+from estimator.spots.lamps import lamps_of
 from estimator.spots.striped import Lamp
 
 MIN_OWN_CORRELATION = 0.8
@@ -51,7 +52,7 @@ class Reception:
     led: int | None = None
     correlation: float = 0.0
     bits: str | None = None
-    wave: ChipWave | None = None
+    wave: ChipWave | PulseWave | None = None
     told: Told | None = None
 
     def identity(self) -> Identity:
@@ -108,6 +109,11 @@ def received(frames: Sequence[DeviceFrame], lamps: Sequence[Sequence[Lamp]]) -> 
             left = [[one.led is None for one in some] for some in found]
             for (frame, number), reception in _by_packets(frames, lamps, images, left, packets):
                 found[frame][number] = reception
+    for which, one_frame in enumerate(frames):
+        rest = [number for number, one in enumerate(found[which]) if one.led is None and one.lamp.striped]
+        by_tones = _by_tones(one_frame, [lamps[which][n] for n in rest], [images[which][n] for n in rest])
+        for number, reception in by_tones:
+            found[which][rest[number]] = reception
     return tuple(tuple(_each_led_once(some)) for some in found)
 
 
@@ -172,6 +178,22 @@ def _by_packets(
                             bits = bits_seen(signal, wave)
                             yield (f, number), Reception(lamps[f][number], told.led, correlation, bits, wave, told)
             break
+
+
+def _by_tones(frame: DeviceFrame, lamps: Sequence[Lamp], images: Sequence[LedImage]) -> Iterator[tuple[int, Reception]]:
+    """LED images of a frame, by number, that are identified by a tone that one LED alone has."""
+    if frame.downlink is None:
+        return
+    tones = {led: one for one in frame.downlink.transmitters if isinstance(one, Tones) for led in one.leds}
+    signals = [image.signal for image in images]
+    row_time_s = frame.camera.shutter.row_time_s
+    for number, match in enumerate(match_tones(signals, frame.downlink, row_time_s)):
+        if match is not None and len(match.leds) == 1:
+            (led,), signal = match.leds, signals[number]
+            sent = tones[led]
+            wave = PulseWave(match.fit.frequency_hz, sent.duty, sent.depth, float(signal.start_s[0]), match.fit.phase)
+            correlation = signal.correlation(wave.gains(signal.start_s, signal.exposure_s))
+            yield number, Reception(lamps[number], led, correlation, None, wave)
 
 
 def _told(packets: Packets, coordinates: tuple[int, int, int], index: int, leds: Mapping[int, Led]) -> Told | None:

@@ -13,8 +13,10 @@ from estimator.spots.striped import Lamp
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-# Error of a line's level that its noise does not include, as a share of the level: chord, vignetting, face. Ours.
+# Error of a line's level that its noise does not include, as a share of the bright lines' level: chord, background,
+# vignetting, face. It is the same for all lines: dark ones, of little noise, would else decide alone. Ours.
 ENVELOPE_SHARE = 0.02
+BRIGHT_PERCENTILE = 90.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +79,8 @@ def signal_of(lamp: Lamp, frame: DeviceFrame) -> Signal:
     lines = lines_of(frame.camera.shutter, profile.lines, frame.camera.line_count)
     order = np.argsort(lines)
     level = profile.level_e[order]
-    variance = 1 / profile.weight[order] + (ENVELOPE_SHARE * level) ** 2
+    bright = float(np.percentile(level, BRIGHT_PERCENTILE)) if len(level) else 0.0
+    variance = 1 / profile.weight[order] + (ENVELOPE_SHARE * bright) ** 2
     start_s = frame.start_s + lines[order] * frame.camera.shutter.row_time_s
     return Signal(np.asarray(start_s, dtype=np.float64), frame.exposure_s, level, 1 / variance)
 
@@ -116,10 +119,35 @@ class ChipWave:
 
 
 @dataclass(frozen=True, eq=False)
+class PulseWave:
+    """Square wave of mean 1: bright for the share `duty` of each period; at `at_s` it has made `phase` periods.
+
+    Dark it has the share 1 - `depth` of the bright level.
+    """
+
+    frequency_hz: float
+    duty: float
+    depth: float
+    at_s: float
+    phase: float
+
+    def gains(self, start_s: Floats, exposure_s: float) -> Floats:
+        """Mean of the wave over exposures that start at (n,), exact."""
+        at = (start_s - self.at_s) * self.frequency_hz + self.phase
+        during = exposure_s * self.frequency_hz
+        return np.asarray((self._integral(at + during) - self._integral(at)) / during)
+
+    def _integral(self, at: Floats) -> Floats:
+        bright = 1 / (self.duty + (1 - self.duty) * (1 - self.depth))
+        whole = np.floor(at)
+        return np.asarray(whole + np.interp(at - whole, [0.0, self.duty, 1.0], [0.0, self.duty * bright, 1.0]))
+
+
+@dataclass(frozen=True, eq=False)
 class WaveGains:
     """Gains of an LED at the lines of one frame, by the wave that was decoded (`estimator.io.device.LineGains`)."""
 
-    wave: ChipWave
+    wave: ChipWave | PulseWave
     frame_start_s: float
     row_time_s: float
     exposure_s: float
@@ -129,9 +157,9 @@ class WaveGains:
         start_s = self.frame_start_s + np.asarray(lines, dtype=np.float64) * self.row_time_s
         return self.wave.gains(np.asarray(start_s), self.exposure_s)
 
-    def later(self, chips: float) -> "WaveGains":
-        """The gains if the wave were `chips` chips further in its period."""
-        return replace(self, wave=replace(self.wave, start_chips=self.wave.start_chips + chips))
+    def advanced(self, seconds: float) -> "WaveGains":
+        """The gains if the wave were `seconds` further in its period."""
+        return replace(self, wave=replace(self.wave, at_s=self.wave.at_s - seconds))
 
 
 def overlaps(signal: Signal, chip_s: float, phase: float) -> Floats:

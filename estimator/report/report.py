@@ -128,14 +128,14 @@ def page(datasets: Sequence[tuple[Path, Scores]]) -> str:
 
 def _section(folder: Path, scores: Scores) -> Section:
     variants = scores.variants
-    x, y, z = scores.room_m
+    room_m = scores.room_m
     leds_m = [led.position_m for led in scores.led_map]
     previews = sorted((folder / "previews").glob("*.png"))
     return Section(
         name=scores.dataset,
         frames=variants[0].frames if variants else 0,
         leds=len(leds_m),
-        room=f"{x:g} × {y:g} × {z:g}",
+        room="unknown" if room_m is None else " × ".join(f"{side:g}" for side in room_m),
         variants=variants,
         scores=_table(ERROR_HEADERS, [(index, error_cells(v)) for index, v in enumerate(variants)], ERROR_NOTE),
         limits=_limit_table(variants),
@@ -150,8 +150,9 @@ def _section(folder: Path, scores: Scores) -> Section:
         distribution_plot=Markup(distribution_plot(variants)),
         device_plots=[Markup(device_plot(variants, nees)) for nees in (False, True) if any(map(has_groups, variants))],
         plans=[
-            (Markup(floor_plan(scores.room_m, leds_m, v, index)), estimates_outside(scores.room_m, v))
+            (Markup(floor_plan(room_m, leds_m, v, index)), estimates_outside(room_m, v))
             for index, v in enumerate(variants)
+            if room_m is not None
         ],
         previews=_selected(previews),
         preview_count=len(previews),

@@ -175,7 +175,10 @@ def observe(
     to_pixels = camera.matrix()[:2, :2] @ projection_of(camera).project(rays)[1][:, :, :2]
     from_pixels = np.linalg.inv(to_pixels)
     covariance = from_pixels @ (covariance_px2 + added_px2 * np.eye(2)) @ from_pixels.transpose(0, 2, 1)
-    tilt = tilt_from_gravity(frame.accelerometer_m_s2)
+    tilt, tilt_sigma_rad = (0.0, 0.0), np.full(2, np.inf)
+    if frame.accelerometer is not None:
+        tilt = tilt_from_gravity(frame.accelerometer_m_s2)
+        tilt_sigma_rad = tilt_sigmas(frame.accelerometer, tilt[1])
     return Observations(
         leds_m=led_positions_m(correspondences),
         lift_m2=np.array([4 * one.led.mean_square_extent_m2 for one in correspondences]),
@@ -184,7 +187,7 @@ def observe(
         whitening=np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)), dtype=np.float64),
         from_pixels=np.asarray(from_pixels, dtype=np.float64),
         tilt_rad=np.array(tilt),
-        tilt_sigma_rad=tilt_sigmas(frame.accelerometer, tilt[1]),
+        tilt_sigma_rad=tilt_sigma_rad,
         uncertainty=uncertainty(camera, [one.led for one in correspondences], frame.luminaires, frame.map_datum),
         motion=None if prior is None else ShutterMotion(camera.times_s(*centroids_px(correspondences).T), prior),
     )

@@ -9,6 +9,7 @@ pixel that the LED image covers. A plain centroid follows the stripes, some pixe
    light around it, which neither a symmetric blur nor the pixels displace.
 3. The edges of a disc lie on an ellipse. In line y they are `m + s (y - y0) -+ A sqrt(1 - ((y - y0) / B)^2)`, here
    averaged over the line's width. Those of a square lie on a parallelogram. The fit is weighted and robust.
+   A lamp without such edges, whose luminance falls off towards its rim, has isophotes (`estimator.spots.glow`).
 4. The light of a line over the chord of the outline is the profile: the wave, at the times of the lines.
 
 Below, x runs along a line and y counts lines: x is u and y is v where lines are rows, x is v
@@ -25,6 +26,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from estimator.spots.detect import MAX_BLOB_OF_FRAME, MAX_BLOBS, MIN_BLOB_PX, Readout, Spot, brightest_of, levels_of
+from estimator.spots.glow import glow
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -62,6 +64,10 @@ CLIPPED_BLUR = 1.0
 SHARP_RISE_PX = 3.0
 # Share of the correction for blur that remains as its standard deviation.
 BLUR_UNCERTAINTY = 0.5
+# Edges that are blurred by more than this share of the shorter half extent are no outline.
+MAX_BLUR = 0.15
+# Half width of the band of columns that gives the profile of a lamp without edges, as a share of its half chord.
+BAND = 0.5
 # Share of the edges that a single LED image leaves at most: more are of two LED images, or of none.
 MAX_OUTLIERS = 0.35
 # The root mean square of the inliers' residuals of an LED image, as a share of its half extent.
@@ -228,8 +234,9 @@ class Lamp:
 
     `covariance_px2` (2, 2) is the centre's, u and v. `along` says what lines are. `touches_border` marks an outline
     that may be cut by the border of its region, `clipped` one with a pixel that is or may be saturated, `striped` a
-    profile that is not constant. `residual_px` is the root mean square of the edges' residuals; `peak_e` the level of
-    its bright lines.
+    profile that is not constant, `uniform` a lamp whose outline is by edges, not isophotes. `residual_px` is the root
+    mean square of the edges' residuals; `peak_e` the level of the bright lines; `brightest_px` the centre (u, v) of the
+    brightest pixel.
     """
 
     u_px: float
@@ -243,6 +250,8 @@ class Lamp:
     touches_border: bool
     clipped: bool
     striped: bool
+    uniform: bool
+    brightest_px: tuple[float, float]
 
     @property
     def moments_px2(self) -> Floats:
@@ -267,8 +276,8 @@ class Lamp:
             u_px=self.u_px,
             v_px=self.v_px,
             covariance_px2=self.covariance_px2,
-            brightest_u_px=self.u_px,
-            brightest_v_px=self.v_px,
+            brightest_u_px=self.brightest_px[0],
+            brightest_v_px=self.brightest_px[1],
             area_px=round(area),
             peak_e=self.peak_e,
             touches_border=self.touches_border,
@@ -751,23 +760,18 @@ def _lamp(
     light = _light(turned, blob, background_e)
     box = np.s_[blob.top : blob.bottom, blob.left : blob.right]
     edges = _edges(light, blob, turned.clipped[box] & blob.own)
-    if edges is None:
-        return None
-    found = _ellipse(edges)
-    if any_square:
-        square = _square(edges, stripe_px)
-        if square is not None and (found is None or square.cost < found.cost):
-            found = square
-    if found is None or found.outliers > MAX_OUTLIERS:
+    found = None if edges is None else _sharp(edges, any_square, stripe_px)
+    uniform = found is not None
+    if found is None:
+        found = _faded(light, blob)
+    if found is None:
         return None
     outline = found.outline
-    if found.residual_px > max(MAX_RESIDUAL * float(outline.extent.min()), 5 * np.sqrt(np.median(edges.variance))):
-        return None
     rows, columns = light.signal.shape
     centre, extent = outline.centre, outline.extent
     if not ((centre > -extent) & (centre < np.array([columns, rows]) + extent)).all():
         return None
-    profile, peak_e = _profile(turned, blob, light, outline)
+    profile, peak_e = _profile(turned, blob, light, outline, uniform)
     if profile is None:
         return None
     low = centre - extent + (blob.left, blob.top)
@@ -777,6 +781,11 @@ def _lamp(
     x, y = (centre + (blob.left + turned.across, blob.top + turned.line)).tolist()
     moved = _moved(outline, blob.left + turned.across, blob.top + turned.line)
     covariance = found.covariance
+    line, column = np.unravel_index(np.argmax(np.where(blob.own, light.signal, -np.inf)), light.signal.shape)
+    brightest = (
+        float(column) + blob.left + turned.across + 0.5,
+        float(line) + blob.top + turned.line + 0.5,
+    )
     if along == "columns":
         x, y, covariance = y, x, covariance[::-1, ::-1]
     return Lamp(
@@ -791,7 +800,37 @@ def _lamp(
         touches_border=touches,
         clipped=bool(profile.clipped.any()),
         striped=_is_striped(profile),
+        uniform=uniform,
+        brightest_px=(brightest[0], brightest[1]) if along == "rows" else (brightest[1], brightest[0]),
     )
+
+
+def _sharp(edges: _Edges, any_square: bool, stripe_px: float) -> _Found | None:
+    """The outline by edges, None if there is none that explains them."""
+    found = _ellipse(edges)
+    if any_square:
+        square = _square(edges, stripe_px)
+        if square is not None and (found is None or square.cost < found.cost):
+            found = square
+    if found is None or found.outliers > MAX_OUTLIERS:
+        return None
+    extent = float(found.outline.extent.min())
+    limit_px = max(MAX_RESIDUAL * extent, 5 * float(np.sqrt(np.median(edges.variance))))
+    sharp = np.sqrt(edges.blur_px2) <= max(MAX_BLUR * extent, 1.0)
+    return found if sharp and found.residual_px <= limit_px else None
+
+
+def _faded(light: _Light, blob: _Blob) -> _Found | None:
+    """The outline by isophotes, None if there are none."""
+    smooth = cv2.blur(np.where(light.usable, light.signal, 0.0), (SMOOTHING_PX, 1))
+    noise = float(np.sqrt(np.median(light.variance[~blob.own]) / SMOOTHING_PX)) if (~blob.own).any() else 0.0
+    peak = float(np.percentile(smooth[blob.own], 98))
+    found = glow(smooth, blob.own & light.usable, peak, 6 * noise)
+    if found is None:
+        return None
+    one = found.ellipse
+    ellipse = EdgeEllipse(one.x0, one.y0, one.slope, one.half_chord, one.half_extent)
+    return _Found(ellipse, np.diag(found.variance), 0.0, float(np.sqrt(found.variance.mean())), 0.0)
 
 
 def _moved(outline: Outline, x: float, y: float) -> Outline:
@@ -800,17 +839,27 @@ def _moved(outline: Outline, x: float, y: float) -> Outline:
     raise TypeError(f"{type(outline).__name__} is no outline")
 
 
-def _profile(turned: _Turned, blob: _Blob, light: _Light, outline: Outline) -> tuple[Profile | None, float]:
-    """Light by lines over the chord, for lines with a chord of MIN_PLATEAU_PX and more; and the bright lines' level."""
+def _profile(
+    turned: _Turned, blob: _Blob, light: _Light, outline: Outline, uniform: bool
+) -> tuple[Profile | None, float]:
+    """Light by lines over the chord, for lines with a chord of MIN_PLATEAU_PX and more; and the bright lines' level.
+
+    Without edges, the mean in a band of columns about the centre, for all lines of the blob.
+    """
     rows, columns = light.signal.shape
     lines = np.arange(rows, dtype=np.float64)
     low, high = outline.edges(lines)
+    if not uniform:
+        half = max(BAND * float(outline.extent[0]), MIN_PLATEAU_PX)
+        inside = blob.own.any(axis=1)
+        x0 = float(outline.centre[0])
+        low, high = np.where(inside, x0 - half, x0), np.where(inside, x0 + half, x0)
     chord = high - low
     usable = (chord >= MIN_PLATEAU_PX) & (low >= 0) & (high <= columns)
     if not usable.any():
         return None, 0.0
-    x = np.arange(columns) + 0.5
-    support = (x >= low[:, None] - EDGE_PX) & (x <= high[:, None] + EDGE_PX)
+    x, margin = np.arange(columns) + 0.5, EDGE_PX if uniform else 0.0
+    support = (x >= low[:, None] - margin) & (x <= high[:, None] + margin)
     usable &= (light.usable | ~support).all(axis=1)
     if not usable.any():
         return None, 0.0

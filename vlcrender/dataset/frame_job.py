@@ -1,7 +1,7 @@
 """One frame of a dataset: render, expose, write its files, and return its rows."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache
 from pathlib import Path
 
@@ -38,7 +38,7 @@ from vlcrender.modulation.transmission import led_waves
 from vlcrender.modulation.wave import Wave
 from vlcrender.rendering.bayer import MosaicRenderer
 from vlcrender.rendering.crlb import FrameSlopes
-from vlcrender.rendering.expected_image import ExpectedImage, Gain, Gains, LedPatch, gain_in
+from vlcrender.rendering.expected_image import ExpectedImage, Gain, Gains, LedPatch
 from vlcrender.rendering.readout import RollingPoses
 from vlcrender.rendering.renderer import Renderer
 from vlcrender.scene.loader import Scene, build_scene
@@ -214,10 +214,42 @@ class _View:
             RegionImage(part.roi, part.expected_electrons(self.exposure_s, gains, room_gain))
             for part in self.image.parts
         ]
-        hybrid, exact = _bounds_m2(
-            self.recipe, self.renderer, self.mounted, self.main, self.exposure_s, expected, gains
+        return _Exposed(expected, *self._bounds_m2(expected, gains))
+
+    def _bounds_m2(self, expected: Sequence[RegionImage], gains: Gains | None) -> tuple[Flat9 | None, Flat9 | None]:
+        """Cramér-Rao bounds of the frame's position, row by row: hybrid, and exact; the same without [belief].
+
+        gains: of the LEDs by id, which the bound takes as known; 1 where not given. None where the recipe does not ask
+        for them, or where the frame does not determine a position.
+        """
+        recipe = self.recipe
+        if not recipe.bound or self._slopes is None:
+            return None, None
+        variance = [RegionImage(roi, variance_e2(recipe.sensor, mean, self.exposure_s)) for roi, mean in expected]
+        slopes = self._slopes.exposed(variance, gains)
+        tilts_deg = tilt_sigmas_deg(recipe, self.main)
+        exact = slopes.exact_bound_m2(tilts_deg)
+        hybrid = exact
+        if recipe.belief is not None:
+            uncertainty = uncertainty_of(recipe, self.renderer.scene, self.mounted)
+            hybrid = slopes.hybrid_bound_m2(tilts_deg, self.renderer.scene.leds, uncertainty)
+        return None if hybrid is None else flat9(hybrid), None if exact is None else flat9(exact)
+
+    @cached_property
+    def _slopes(self) -> FrameSlopes | None:
+        """Slopes of the LEDs' images in steady light, without the variance of an exposure."""
+        recipe, renderer, mounted, main = self.recipe, self.renderer, self.mounted, self.main
+        at = mounted.posed(main)
+        return FrameSlopes.rendered(
+            mounted,
+            main,
+            lambda posed: renderer.led_patches(posed, recipe.regions, at.pose),
+            self.exposure_s,
+            [],
+            float(np.median(np.linalg.norm(renderer.scene.leds.centers_m - at.position_m, axis=1))),
+            recipe.regions is not None and recipe.regions.overscan,
+            halo_of=renderer.halo_of(mounted.camera),
         )
-        return _Exposed(expected, hybrid, exact)
 
 
 @lru_cache(maxsize=1)
@@ -248,50 +280,6 @@ def _waves(job: Job, map_number: int) -> dict[int, Wave]:
     """The wave of each LED of a map that is not steady, by its id."""
     recipe, renderer = _renderer(job.recipe_json, job.scene_json, job.scene_folder)
     return led_waves(renderer.scene.leds.transmitters, recipe.seed, map_number)
-
-
-def _bounds_m2(
-    recipe: Recipe,
-    renderer: Renderer | MosaicRenderer,
-    mounted: Mounted,
-    main: Pose,
-    exposure_s: float,
-    expected: Sequence[RegionImage],
-    gains: Gains | None,
-) -> tuple[Flat9 | None, Flat9 | None]:
-    """Cramér-Rao bounds of the frame's position, row by row: hybrid, and exact; the same without [belief].
-
-    gains: of the LEDs by id, which the bound takes as known; 1 where not given. None where the recipe does not ask for
-    them, or where the frame does not determine a position.
-    """
-    if not recipe.bound:
-        return None, None
-    at = mounted.posed(main)
-    slopes = FrameSlopes.rendered(
-        mounted,
-        main,
-        lambda posed: [_with_gain(p, gains) for p in renderer.led_patches(posed, recipe.regions, at.pose)],
-        exposure_s,
-        [RegionImage(roi, variance_e2(recipe.sensor, image, exposure_s)) for roi, image in expected],
-        float(np.median(np.linalg.norm(renderer.scene.leds.centers_m - at.position_m, axis=1))),
-        recipe.regions is not None and recipe.regions.overscan,
-        halo_of=renderer.halo_of(mounted.camera),
-    )
-    if slopes is None:
-        return None, None
-    tilts_deg = tilt_sigmas_deg(recipe, main)
-    exact = slopes.exact_bound_m2(tilts_deg)
-    hybrid = exact
-    if recipe.belief is not None:
-        uncertainty = uncertainty_of(recipe, renderer.scene, mounted)
-        hybrid = slopes.hybrid_bound_m2(tilts_deg, renderer.scene.leds, uncertainty)
-    return None if hybrid is None else flat9(hybrid), None if exact is None else flat9(exact)
-
-
-def _with_gain(patch: LedPatch, gains: Gains | None) -> LedPatch:
-    if gains is None or patch.led_id not in gains:
-        return patch
-    return replace(patch, electrons_per_s=patch.electrons_per_s * gain_in(gains[patch.led_id], patch.roi))
 
 
 def poses_of(

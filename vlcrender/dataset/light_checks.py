@@ -50,8 +50,8 @@ def check_light(recipe: "Recipe", scene: Scene, source: str, scale: int = 1) -> 
     shortest_us = 1e6 * min((_shortest_level_s(wave) for wave in waves.values()), default=np.inf)
     if scale > 1 and shortest_us < row_us:
         raise InputError(
-            f"{source}: --scale {scale}: a binned line takes {row_us:g} us, longer than the shortest level of the LEDs' "
-            f"waves, {shortest_us:g} us: stripes would vanish; choose a smaller --scale, or longer chips or periods"
+            f"{source}: --scale {scale}: a binned line takes {row_us:g} us, and the shortest level of the LEDs' waves "
+            f"{shortest_us:g} us: stripes would vanish; choose a smaller --scale, or longer chips or periods"
         )
 
 

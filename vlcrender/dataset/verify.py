@@ -1,11 +1,14 @@
 """Verification of a dataset on disk: every file present and intact, and the truth consistent with the LED map."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from functools import cache, partial
+from itertools import pairwise
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from vlcrender.camera.distortion import Distortion
 from vlcrender.camera.intrinsics import Camera, transform
@@ -25,11 +28,22 @@ from vlcrender.dataset.schema import (
 )
 from vlcrender.dataset.tables import read_table
 from vlcrender.errors import InputError
+from vlcrender.modulation.transmission import Transmitter, led_waves
+from vlcrender.modulation.wave import Wave
+from vlcrender.scene.leds import transmitters_of
+from vlcrender.scene.schema import SceneSettings
 
 R = TypeVar("R", FrameRow, TruthRow)
 S = TypeVar("S", DeviceTruthRow, MapTruthRow)
-Positions = Mapping[int, NDArray[np.float64]]
+Array = NDArray[np.float64]
+Positions = Mapping[int, Array]
 """Centre (3,) of each LED, by id."""
+MAX_TIME_ERROR_S = 1e-9
+"""Rounding of start times: a double of 10^6 s has steps of 1e-10 s."""
+MAX_PHASE_ERROR = 1e-6
+"""Rounding of phases, periods: waves of 10 kHz after 10^5 s."""
+LINE_ROUNDS = 200
+"""Largest number of steps to an image at its own line's time; each divides the error by 2 at least."""
 
 
 def verify(directory: Path) -> list[str]:
@@ -52,6 +66,7 @@ def verify(directory: Path) -> list[str]:
     devices: list[DeviceTruthRow] | None = None
     if recipe.get("belief") is not None:
         devices = _read_sealed(directory / "truth_devices.parquet", DeviceTruthRow, problems)
+    if recipe.get("belief") is not None or dataset.led_map is None:
         built = _read_sealed(directory / "truth_map.parquet", MapTruthRow, problems)
         problems += _sealed_problems(devices, built, dataset)
         maps = {}
@@ -60,11 +75,15 @@ def verify(directory: Path) -> list[str]:
     folders = extra_folders(bool(recipe.get("expected")), recipe.get("processed") is not None)
     missing = missing_files(directory, folders, range(dataset.frame_count))
     problems += [f"{path}: is missing" for path in missing.values()]
+    problems += _time_problems(frames, dataset)
+    waves = cache(partial(_waves_of, dataset))
     for number, pose in enumerate(truth):
+        if frames:
+            problems += _wave_problems(pose, frames[number].start_s, waves(pose.map))
         name = frames[number].camera if frames else None
         entry = dataset.cameras.get(name) if name is not None else None
         if name is None or entry is None:
-            problems += _truth_problems(pose, None, maps)
+            problems += _truth_problems(pose, None, maps, np.zeros(3))
             continue
         problems += _device_problems(frames[number], pose, entry, dataset, devices)
         try:
@@ -72,7 +91,8 @@ def verify(directory: Path) -> list[str]:
         except InputError as error:
             problems.append(str(error))
             continue
-        problems += _truth_problems(pose, camera, maps)
+        offset = _offset_in_camera(frames[number], entry, devices)
+        problems += _truth_problems(pose, camera, maps, offset)
     return problems
 
 
@@ -96,7 +116,9 @@ def missing_files(directory: Path, folders: Iterable[str], frames: Iterable[int]
 def _camera_of(entry: CameraEntry, source: str) -> Camera:
     """A camera that images points as the entry says. `source` names it in the InputError for an impossible one."""
     (fx, skew, u), (_, fy, v), _ = entry.K
-    shared = entry.model_dump(include={"width_px", "height_px", "pixel_pitch_um", "projection", "distortion"})
+    shared = entry.model_dump(
+        include={"width_px", "height_px", "pixel_pitch_um", "projection", "distortion", "shutter"}
+    )
     # A lens focused at infinity has its image distance as focal length, and a projection uses nothing else.
     lens = {"focal_length_mm": entry.image_distance_mm, "principal_point_px": (u, v), "skew_px": skew}
     lens |= {"aspect_ratio": fx / fy if fy > 0 else 1.0}
@@ -175,15 +197,16 @@ def _read_sealed(path: Path, model: type[S], problems: list[str]) -> list[S]:
 
 
 def _sealed_problems(
-    devices: Sequence[DeviceTruthRow], built: Sequence[MapTruthRow], dataset: DatasetFile
+    devices: Sequence[DeviceTruthRow] | None, built: Sequence[MapTruthRow], dataset: DatasetFile
 ) -> list[str]:
     """Rows of the sealed tables that are missing, repeated or out of order. A table without rows has a line already."""
-    belief = dataset.provenance["recipe"]["belief"]
+    belief = dataset.provenance["recipe"].get("belief") or {"devices": 0, "maps": 1}
     problems = []
     expected = [(device, camera) for device in range(belief["devices"]) for camera in dataset.cameras]
     if devices and [(row.device, row.camera) for row in devices] != expected:
         problems.append("truth_devices.parquet: has not one row for each device and camera, in order")
-    leds = [(number, led.id) for number in range(belief["maps"]) for led in dataset.led_map or ()]
+    ids = sorted(led for transmitter in _transmitters_of(dataset) for led in transmitter.led_ids)
+    leds = [(number, led) for number in range(belief["maps"]) for led in ids]
     if built and [(row.map, row.led) for row in built] != leds:
         problems.append("truth_map.parquet: has not one row for each map and LED, in order")
     return problems
@@ -218,7 +241,94 @@ def _device_problems(
     return []
 
 
-def _truth_problems(row: TruthRow, camera: Camera | None, maps: Mapping[int, Positions]) -> list[str]:
+def _time_problems(frames: Sequence[FrameRow], dataset: DatasetFile) -> list[str]:
+    """Contradictions of bursts, start times, gyroscope and decoded identities with the recipe."""
+    recipe = dataset.provenance.get("recipe", {})
+    burst = recipe.get("burst") or {"frames": 1, "frame_rate_hz": 1.0}
+    by_pixels = dataset.downlink is not None and dataset.downlink.demodulation == "pixels"
+    first_s: dict[int, float] = {}
+    problems = []
+    for row in frames:
+        where = f"frames.parquet: frame {row.frame}"
+        if row.burst != row.shot // burst["frames"]:
+            problems.append(f"{where}: burst {row.burst}, but a burst has {burst['frames']} shots")
+        later_s = row.shot % burst["frames"] / burst["frame_rate_hz"]
+        start_s = first_s.setdefault(row.burst, row.start_s - later_s)
+        if not abs(row.start_s - start_s - later_s) <= MAX_TIME_ERROR_S:
+            problems.append(f"{where}: start_s = {row.start_s}: is not {later_s} s after the start of its burst")
+        if (row.gyro_rad_s is None) != (dataset.gyroscope is None):
+            problems.append(f"{where}: gyro_rad_s and the gyroscope of dataset.json: one is null")
+        if by_pixels and row.spots:
+            problems.append(f'{where}: has spots, but demodulation is "pixels"')
+    starts_s = [first_s[number] for number in sorted(first_s)]
+    if any(starts_s) and any(later <= before for before, later in pairwise(starts_s)):
+        problems.append("frames.parquet: bursts do not start one after another")
+    return problems
+
+
+def _waves_of(dataset: DatasetFile, map_number: int) -> dict[int, Wave]:
+    """The waves of a map's LEDs, from the scene and the seed."""
+    transmitters = _transmitters_of(dataset)
+    return led_waves(transmitters, int(dataset.provenance["recipe"]["seed"]), map_number) if transmitters else {}
+
+
+def _transmitters_of(dataset: DatasetFile) -> tuple[Transmitter, ...]:
+    """What LEDs transmit by the scene of the provenance; nothing where there is none."""
+    scene = dataset.provenance.get("scene")
+    return () if scene is None else transmitters_of(check(scene, SceneSettings, "dataset.json: provenance.scene"))
+
+
+def _wave_problems(row: TruthRow, start_s: float, waves: Mapping[int, Wave]) -> list[str]:
+    """LEDs whose clock error, bits or phase at the start of the frame are not those of their wave."""
+    problems = []
+    for led in row.leds:
+        where = f"truth.parquet: frame {row.frame}: LED {led.led}"
+        wave = waves.get(led.led)
+        if wave is None:
+            if (led.clock_error, led.phase, led.bits) != (None, None, None):
+                problems.append(f"{where}: is steady, but clock_error, phase and bits are not null")
+        elif led.clock_error is None or led.phase is None:
+            problems.append(f"{where}: is modulated, but clock_error or phase is null")
+        else:
+            off = abs(led.phase - float(wave.phase(start_s)))
+            if not min(off, 1 - off) <= MAX_PHASE_ERROR or (led.clock_error, led.bits) != (wave.clock_error, wave.bits):
+                problems.append(f"{where}: clock_error, phase or bits are not those of its wave")
+    return problems
+
+
+def _offset_in_camera(frame: FrameRow, entry: CameraEntry, devices: Sequence[DeviceTruthRow] | None) -> Array:
+    """From the projection centre of `main` to that of a frame's camera, (3,), in the camera's axes."""
+    rotation, offset_m = np.array(entry.R_cam_rig), np.array(entry.offset_m)
+    for row in devices or ():
+        if (row.device, row.camera) == (frame.device, frame.camera):
+            rotation, offset_m = np.array(row.R_cam_rig).reshape(3, 3), np.array(row.offset_m)
+    return transform(rotation, offset_m)
+
+
+def _image_at_own_line(row: TruthRow, camera: Camera, offset_m: Array, point_m: Array) -> Array:
+    """Pixel (2,) of a world point at the time of its own line; `offset_m` of `_offset_in_camera`.
+
+    The camera `main` moves along a line, and the rig turns about it.
+    """
+    rotation, position_m = np.array(row.R_cam_world).reshape(3, 3), np.array(row.position_m)
+    turning, moving = (np.array(v or (0.0, 0.0, 0.0)) for v in (row.angular_velocity_rad_s, row.linear_velocity_m_s))
+    of_main = moving - transform(rotation.T, np.cross(turning, offset_m))
+
+    def image(time_s: float) -> Array:
+        turned = transform(Rotation.from_rotvec(-turning * time_s).as_matrix(), rotation.T).T
+        swing = transform(turned.T, offset_m) - transform(rotation.T, offset_m)
+        return camera.image_of_points(transform(turned, point_m - (position_m + of_main * time_s + swing)))
+
+    pixel = image(0.0)
+    if row.angular_velocity_rad_s is not None:
+        for _ in range(LINE_ROUNDS):
+            before, pixel = pixel, image(float(camera.times_s(*pixel)))
+            if not np.abs(pixel - before).max() > 1e-9:
+                break
+    return pixel
+
+
+def _truth_problems(row: TruthRow, camera: Camera | None, maps: Mapping[int, Positions], offset_m: Array) -> list[str]:
     where = f"truth.parquet: frame {row.frame}"
     rotation = np.array(row.R_cam_world).reshape(3, 3)
     if not (np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-9) and np.linalg.det(rotation) > 0):
@@ -229,7 +339,7 @@ def _truth_problems(row: TruthRow, camera: Camera | None, maps: Mapping[int, Pos
     for led in row.leds:
         if led.led not in positions:
             return [f"{where}: LED {led.led} is not in the LED map"]
-        u, v = camera.image_of_points(transform(rotation, positions[led.led] - np.array(row.position_m)))
+        u, v = _image_at_own_line(row, camera, offset_m, positions[led.led])
         # Not `>`: a point that the lens does not image has NaN pixels, which compare false.
         if not np.hypot(u - led.u_px, v - led.v_px) <= 1e-6:
             return [f"{where}: LED {led.led} is not where the pose puts it"]

@@ -28,7 +28,7 @@ other groups are part of the background.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +39,7 @@ from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.rig import Mounted
 from vlcrender.camera.roi import LedRegions, RegionImage, Roi, led_regions
 from vlcrender.core.planar_shapes import Disc
-from vlcrender.rendering.expected_image import LedPatch
+from vlcrender.rendering.expected_image import Gains, LedPatch, gain_in
 from vlcrender.rendering.led_coverage import intersections_with_plane
 from vlcrender.rendering.led_radiance import face_of_led
 from vlcrender.rendering.uncertainty import (
@@ -149,6 +149,28 @@ class FrameSlopes:
             )
             pairs.append((plus, minus))
         return cls(mounted, main, at_pose, pairs, steps, exposure_s, variance_e2, overscan, halo_of)
+
+    def exposed(self, variance_e2: Sequence[RegionImage], gains: Gains | None = None) -> "FrameSlopes":
+        """The slopes of one exposure of the same view: with the variance of its pixels, and known gains of LEDs by id.
+
+        Gains belong to lines of the sensor, not to the images that move. Of a lens with glare they have to be 1.
+        """
+
+        def lit(patch: LedPatch) -> LedPatch:
+            if gains is None or patch.led_id not in gains:
+                return patch
+            gain = gain_in(gains[patch.led_id], patch.roi)
+            return replace(patch, electrons_per_s=patch.electrons_per_s * gain)
+
+        return replace(
+            self,
+            at_pose=[lit(patch) for patch in self.at_pose],
+            pairs=[
+                ({led: lit(patch) for led, patch in plus.items()}, {led: lit(patch) for led, patch in minus.items()})
+                for plus, minus in self.pairs
+            ],
+            variance_e2=variance_e2,
+        )
 
     def exact_bound_m2(self, tilt_sigmas_deg: tuple[float, float]) -> Array | None:
         """Bound of the position, (3, 3), m2, where lens and map are known; None where it is not determined."""

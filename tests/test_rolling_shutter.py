@@ -1,0 +1,679 @@
+"""Rolling shutters: gains of lines against sums over time, the room's flicker, lines of a moving camera, bursts."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+from conftest import ROOT, SMALL, copy_of
+
+import vlcrender as vr
+from vlcrender.api import _renderer
+from vlcrender.camera.intrinsics import Camera, Pose
+from vlcrender.camera.posed_camera import PosedCamera
+from vlcrender.camera.rig import mounted_cameras
+from vlcrender.camera.roi import RegionImage, Roi
+from vlcrender.camera.vignetting import relative_illumination
+from vlcrender.dataset import frame_job
+from vlcrender.dataset.light_checks import light_warnings
+from vlcrender.dataset.motion import Motion, poses_during
+from vlcrender.dataset.recipe import Plan
+from vlcrender.dataset.schema import FrameRow, MapTruthRow, TruthRow
+from vlcrender.dataset.tables import read_table, write_table
+from vlcrender.dataset.true_world import gyro_rad_s
+from vlcrender.errors import InputError
+from vlcrender.modulation.exposure import LineGains, MeanWave
+from vlcrender.modulation.transmission import led_waves
+from vlcrender.modulation.wave import CosineWave, TwoLevelWave, Wave
+from vlcrender.rendering.crlb import position_bound_m2
+from vlcrender.rendering.expected_image import LedPatch, gain_in
+from vlcrender.rendering.readout import RollingPoses
+from vlcrender.rendering.renderer import Renderer
+from vlcrender.scene.loader import Scene, load_scene
+
+CODE = 'send = "code"\nchip_us = 250.0'
+DIRECTIONS = ("down", "up", "right", "left")
+
+
+def rolling(direction: str = "down", row_time_us: float = 10.0) -> dict[str, object]:
+    return {"kind": "rolling", "row_time_us": row_time_us, "direction": direction}
+
+
+def scene_file(folder: Path, downlink: str = CODE, ambient_lux: float = 400.0) -> Path:
+    """Table 1's room whose LEDs transmit."""
+    text = (ROOT / "scenes/table1.toml").read_text(encoding="utf-8")
+    text = text.replace("illuminance_lux = 400.0", f"illuminance_lux = {ambient_lux}")
+    for luminance in ("4000.0", "8000.0", "12000.0", "16000.0"):
+        text = text.replace(
+            f"luminance_cd_m2 = {luminance}", f"luminance_cd_m2 = {luminance}\n[led.downlink]\n{downlink}"
+        )
+    path = folder / "sending.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def sending(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return load_scene(scene_file(tmp_path_factory.mktemp("scene")))
+
+
+def plan_of(folder: Path, *assignments: str, downlink: str = CODE, scale: int = 1) -> Plan:
+    """Frames of the small camera in the room whose LEDs transmit."""
+    scene = scene_file(folder, downlink)
+    changes = [*SMALL, f"scene={scene}", "poses.count=2", "poses.min_leds=2", "expected=true", *assignments]
+    return vr.load_recipe(ROOT / "datasets/quickstart.toml", changes, scale=scale)
+
+
+ROLLING = ('camera.shutter={kind="rolling",row_time_us=100.0}',)
+
+
+def mean_by_sampling(wave: Wave, start_s: float, exposure_s: float) -> float:
+    """Mean of a code's levels, chip by chip, at many instants of an exposure."""
+    assert wave.bits is not None
+    instants = start_s + exposure_s * (np.arange(40_000) + 0.5) / 40_000
+    chip_s = wave.period_s / len(wave.bits)
+    periods = instants / wave.period_s + wave.start_phase
+    chips = np.floor(periods * len(wave.bits)).astype(int) % len(wave.bits)
+    assert chip_s > 0
+    return float(2 * np.array([bit == "1" for bit in wave.bits])[chips].mean())
+
+
+POSE = Pose((0.65, 1.35, 0.5), 1.0, -1.0, 5.0)
+"""Below three of the LEDs of Table 1, whose images spread over the sensor."""
+
+
+@pytest.mark.parametrize("direction", DIRECTIONS)
+def test_each_line_of_a_lamp_has_the_mean_of_its_wave_over_its_own_exposure(
+    sending: Scene, small_camera: Camera, direction: str
+) -> None:
+    """Rows or columns of each patch over those of the steady image, against sums over 40 000 instants.
+
+    An instant more or less at each of up to 2 edges of chips errs by 2 / 40 000 = 5e-5 each; float32 by 1e-7.
+    """
+    camera = small_camera.model_copy(update={"shutter": vr.Camera(shutter=rolling(direction, 100.0)).shutter})
+    image = Renderer(sending).expected_image(PosedCamera(camera, POSE), room_apart=True)
+    waves = led_waves(sending.leds.transmitters, 7)
+    start_s, exposure_s = 0.123, 3e-4
+    gains = LineGains(waves, start_s + camera.line_starts_s(), exposure_s)
+    (part,) = image.parts
+    without = part.expected_electrons(exposure_s, dict.fromkeys(waves, 0.0))
+    lit = part.expected_electrons(exposure_s, gains) - without
+    steady = part.expected_electrons(exposure_s) - without
+    assert len(part.patches) >= 3
+    checked = 0
+    for patch in part.patches:
+        axis = 1 if direction in ("down", "up") else 0
+        here = part.roi.slices(patch.roi)
+        mine, alone = lit[here].sum(axis=axis, dtype=float), steady[here].sum(axis=axis, dtype=float)
+        first = patch.row if axis == 1 else patch.column
+        size = camera.height_px if axis == 1 else camera.width_px
+        for number in np.flatnonzero(alone > 0.1 * alone.max()).tolist():
+            line = first + number
+            order = line if direction in ("down", "right") else size - 1 - line
+            expected = mean_by_sampling(waves[patch.led_id], start_s + order * 100e-6, exposure_s)
+            assert mine[number] / alone[number] == pytest.approx(expected, abs=2e-4)
+            checked += 1
+    assert checked > 20
+
+
+def test_a_global_shutter_has_one_gain_for_all_rows(sending: Scene, small_camera: Camera) -> None:
+    waves = led_waves(sending.leds.transmitters, 7)
+    gains = LineGains(waves, 0.123 + small_camera.line_starts_s(), 3e-4)
+    (part,) = Renderer(sending).expected_image(PosedCamera(small_camera, POSE)).parts
+    exposed = part.expected_electrons(3e-4, gains)
+    numbers = {led: mean_by_sampling(wave, 0.123, 3e-4) for led, wave in waves.items()}
+    assert exposed == pytest.approx(part.expected_electrons(3e-4, numbers), rel=2e-4)
+    assert len({round(number, 3) for number in numbers.values()}) > 1
+
+
+def test_the_room_flickers_with_all_leds_by_their_flux(tmp_path: Path, small_camera: Camera) -> None:
+    """Floor and walls without ambient light, from a camera that sees no LED: each row is the mean of all waves.
+
+    All LEDs have the same size and order, so that luminances are the weights. Sampling errs by 5e-5 for each edge, one
+    LED of Table 1 in four weighs up to 0.4: 2e-4.
+    """
+    scene = load_scene(scene_file(tmp_path, ambient_lux=0.0))
+    camera = small_camera.model_copy(update={"shutter": vr.Camera(shutter=rolling("down", 100.0)).shutter})
+    looking_away = Pose((5.0, 5.0, 1.0), 0.0, 0.0, 0.0)
+    image = Renderer(scene).expected_image(PosedCamera(camera, looking_away), room_apart=True)
+    assert not image.patches
+    waves = led_waves(scene.leds.transmitters, 7)
+    starts_s = 0.5 + camera.line_starts_s()
+    fluxes = dict(zip(scene.leds.ids.tolist(), scene.leds.fluxes_lm.tolist(), strict=True))
+    room = MeanWave.of(waves, fluxes).mean(starts_s, 3e-4)
+    (part,) = image.parts
+    ratio = part.expected_electrons(3e-4, {}, room) / part.expected_electrons(3e-4)
+    weights = {1: 4 / 40, 2: 8 / 40, 3: 12 / 40, 4: 16 / 40}
+    for row in range(0, 300, 37):
+        expected = sum(w * mean_by_sampling(waves[led], 0.5 + row * 100e-6, 3e-4) for led, w in weights.items())
+        assert ratio[row] == pytest.approx(np.full(400, expected), abs=2e-4)
+    assert np.ptp(ratio[:, 0]) > 0.5
+
+
+def test_ambient_light_does_not_flicker(sending: Scene, small_camera: Camera) -> None:
+    """With LEDs dark, the room has its ambient light alone: 400 lux times the reflectance of the ceiling over pi."""
+    looking_away = Pose((5.0, 5.0, 1.0), 0.0, 0.0, 0.0)
+    renderer = Renderer(sending)
+    image = renderer.expected_image(PosedCamera(small_camera, looking_away), room_apart=True)
+    dark = image.expected_electrons(1.0, {}, 0.0)
+    rates = renderer._rates(small_camera)
+    assert dark[150, 200] == pytest.approx(rates.ambient * 400 * 0.8 / np.pi, rel=1e-4)
+    assert image.expected_electrons(1.0)[150, 200] > dark[150, 200]
+
+
+def test_a_room_gain_needs_the_light_of_leds_apart(sending: Scene, small_camera: Camera) -> None:
+    image = Renderer(sending).expected_image(PosedCamera(small_camera, POSE))
+    with pytest.raises(ValueError, match="room_gain"):
+        image.expected_electrons(1.0, {}, 0.5)
+    assert np.array_equal(image.expected_electrons(1.0, {}, 1.0), image.expected_electrons(1.0))
+
+
+def waves_of_all_kinds() -> dict[int, Wave]:
+    chips = [TwoLevelWave.of_chips(bits, 50e-6, depth) for bits, depth in (("00101101", 1.0), ("01110010", 0.6))]
+    waves: dict[int, Wave] = {}
+    for led in range(12):
+        waves[led] = chips[led % 2].started(1e-4, (0.3 + led * 3 / 8) % 1)
+    waves[12] = chips[0].started(2e-4, 0.3)
+    waves[13] = chips[0].started(1e-4, 0.3 + 0.01)
+    waves[14] = TwoLevelWave.of_pulse(1700.0, 0.3, 0.9).started(0.0, 0.2)
+    waves[15] = waves[16] = CosineWave(0.01, depth=0.4).started(0.0, 0.9)
+    return waves
+
+
+def test_the_mean_of_many_waves_is_the_sum_of_their_means() -> None:
+    """Chips that coincide are summed before; the same to rounding, 1e-12. LEDs 17 and 18 are steady."""
+    waves = waves_of_all_kinds()
+    weights = {led: 1.0 + led % 5 for led in range(19)}
+    starts_s = np.linspace(0.0, 3.0, 1001)[:, None]
+    mean = MeanWave.of(waves, weights)
+    direct = sum(
+        weight * (waves[led].mean(starts_s, 70e-6) if led in waves else 1.0) for led, weight in weights.items()
+    ) / sum(weights.values())
+    assert mean.mean(starts_s, 70e-6) == pytest.approx(direct, abs=1e-10)
+    assert len(mean.chips) + len(mean.others) == 5
+
+
+GLARE = {"share": 0.1, "radius_um": 300.0}
+
+
+@pytest.mark.parametrize("direction", ["down", "right"])
+def test_a_line_of_a_halo_is_that_of_all_leds_at_the_line_s_gains(
+    sending: Scene, small_camera: Camera, direction: str
+) -> None:
+    """Against the halo with numbers as gains, line by line; float32 and convolution by FFT, 1e-5 of the largest."""
+    camera = Camera(**{**small_camera.model_dump(), "shutter": rolling(direction, 100.0), "glare": GLARE})
+    (part,) = Renderer(sending).expected_image(PosedCamera(camera, POSE), room_apart=True).parts
+    assert part.halo is not None
+    waves = led_waves(sending.leds.transmitters, 7)
+    gains = LineGains(waves, camera.line_starts_s(), 3e-4)
+    by_lines = part.halo.electrons_per_s(part.roi, gains, gains[1] / 2)
+    for line in (0, 57, 290):
+        at = np.s_[line, :] if direction == "down" else np.s_[:, line]
+        numbers = {led: float(gains[led].ravel()[line]) for led in gains}
+        alone = part.halo.electrons_per_s(part.roi, numbers, numbers[1] / 2)
+        assert by_lines[at] == pytest.approx(alone[at], abs=1e-5 * float(alone.max()))
+
+
+def test_light_of_leds_apart_is_no_part_of_it_with_crosstalk_and_mosaic(sending: Scene, small_camera: Camera) -> None:
+    """Through a mosaic, with crosstalk: what remains is ambient light, of the axis the same in each pixel of a colour.
+
+    Of 1e7 electrons a second float32 has 6e-8 each; a difference of two, of a sum of five: 1e-6. cos^4 is as in the
+    middle of five pixels: its curvature, 4 / 1500^2, is 2e-6. A pixel off by one tells more, 3e-3.
+    """
+    curves = {"red": (0.2, 0.6), "green": (0.5, 0.4), "blue": (0.6, 0.1)}
+    sensor = vr.Sensor(
+        mosaic="rggb",
+        crosstalk=0.1,
+        quantum_efficiency={"wavelengths_nm": (380.0, 780.0), **curves},
+    )
+    renderer = _renderer(sending, sensor)
+    looking_away = PosedCamera(small_camera, Pose((5.0, 5.0, 1.0), 0.0, 0.0, 0.0))
+    (part,) = renderer.expected_image(looking_away, room_apart=True).parts
+    assert part.led_background_e_per_s is not None
+    ambient = part.background_e_per_s - part.led_background_e_per_s
+    u, v = part.roi.centers_px()
+    of_axis = ambient / relative_illumination(small_camera, u, v)
+    assert of_axis[10:290, 10:390] == pytest.approx(np.tile(of_axis[150:152, 200:202], (140, 190)), rel=1e-5)
+    assert part.led_background_e_per_s.min() > 0
+
+
+def test_a_gain_of_lines_is_cut_to_a_region() -> None:
+    column, row, one = np.arange(300.0)[:, None], np.arange(400.0)[None, :], np.array([[2.0]])
+    roi = Roi(10, 20, 3, 4)
+    assert gain_in(column, roi).tolist() == [[10], [11], [12]]
+    assert gain_in(row, roi).tolist() == [[20, 21, 22, 23]]
+    assert gain_in(one, roi).tolist() == [[2]]
+    assert gain_in(0.5, roi) == 0.5
+
+
+def pixels(path: Path) -> np.ndarray:
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        image: np.ndarray = file.channels()["Y"].pixels.astype(float)
+    return image
+
+
+def frames_of(folder: Path) -> tuple[list[FrameRow], list[TruthRow]]:
+    return read_table(folder / "frames.parquet", FrameRow), read_table(folder / "truth.parquet", TruthRow)
+
+
+BURSTS = ("repeats=2", "burst={frames=3,frame_rate_hz=30.0}", "gyroscope={noise_deg_s=0.3,bias_deg_s=1.0}")
+RIG = "rig=[{ name = 'beside', offset_m = [0.1, 0.02, 0.0], tilt_x_deg = 5.0, yaw_deg = 30.0 }]"
+MOTION = "motion={angular_velocity_deg_s=[4.0,-3.0,8.0],linear_velocity_m_s=[0.2,-0.1,0.3]}"
+
+
+@pytest.fixture(scope="module")
+def bursts(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two poses, two bursts of three shots each, by two cameras: 24 frames."""
+    folder = tmp_path_factory.mktemp("bursts")
+    assert vr.generate(plan_of(folder, *ROLLING, *BURSTS, RIG), folder / "set")
+    return folder / "set"
+
+
+@pytest.fixture(scope="module")
+def moving(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One pose, a burst of two shots by two cameras that move and turn: 4 frames."""
+    folder = tmp_path_factory.mktemp("moving")
+    burst = ("burst={frames=2,frame_rate_hz=25.0}", "poses.count=1")
+    assert vr.generate(plan_of(folder, *ROLLING, *burst, RIG, MOTION), folder / "set")
+    return folder / "set"
+
+
+def test_a_burst_is_shot_at_its_frame_rate_and_two_bursts_start_at_random(bursts: Path) -> None:
+    frames, truth = frames_of(bursts)
+    assert [row.burst for row in frames] == [number for number in range(4) for _ in range(6)]
+    assert [row.shot for row in frames] == [number for number in range(12) for _ in range(2)]
+    assert [row.pose for row in frames] == [0] * 12 + [1] * 12
+    starts_s = np.array([row.start_s for row in frames]).reshape(4, 3, 2)
+    assert (starts_s[:, :, 0] == starts_s[:, :, 1]).all()
+    assert starts_s[:, :, 0] - starts_s[:, :1, 0] == pytest.approx(np.tile([0.0, 1 / 30, 2 / 30], (4, 1)), abs=1e-12)
+    assert (np.diff(starts_s[:, 0, 0]) > 2 / 30).all()
+    phases = [led.phase for row in truth[::6] for led in row.leds[:1]]
+    assert len({round(phase, 6) for phase in phases if phase is not None}) == 4
+
+
+def test_phases_run_on_from_frame_to_frame_by_the_led_s_own_clock(bursts: Path) -> None:
+    """Periods of 8 ms (32 chips of 250 us) by a clock 1e-4 fast or slow; phases in double precision."""
+    frames, truth = frames_of(bursts)
+    for row, later in zip(truth[:-2], truth[2:], strict=True):
+        elapsed_s = frames[later.frame].start_s - frames[row.frame].start_s
+        leds = {led.led: led for led in later.leds}
+        for led in row.leds:
+            if led.led in leds:
+                assert led.clock_error is not None
+                assert led.phase is not None
+                periods = elapsed_s / 8e-3 * (1 + led.clock_error)
+                after = leds[led.led].phase
+                assert after is not None
+                assert (led.phase + periods - after + 0.5) % 1 == pytest.approx(0.5, abs=1e-9)
+                assert 0 < abs(led.clock_error) < 1e-3
+
+
+def test_frames_of_a_burst_differ_in_phase_and_noise_alone(bursts: Path) -> None:
+    """Each line of each frame over the steady image of the same pose, against the truth's phase, clock and bits."""
+    frames, truth = frames_of(bursts)
+    plan = plan_of(bursts.parent, *ROLLING, *BURSTS, RIG)
+    camera = plan.recipe.camera
+    renderer = Renderer(plan.scene)
+    row = truth[0]
+    pose = Pose(row.position_m, row.tilt_x_deg, row.tilt_y_deg, row.yaw_deg)
+    (view,) = renderer.expected_image(PosedCamera(camera, pose)).parts
+    exposure_s = frames[0].exposure_s
+    checked = 0
+    for number in (0, 2, 4, 6):
+        assert truth[number].position_m == row.position_m
+        image = pixels(bursts / f"expected/{number:06d}.exr")
+        for patch in view.patches:
+            led = next(led for led in truth[number].leds if led.led == patch.led_id)
+            assert led.bits is not None
+            assert led.phase is not None
+            assert led.clock_error is not None
+            v, u = int(patch.center_px[1]), int(patch.center_px[0])
+            if not (0 <= v < 300 and 0 <= u < 400):
+                continue
+            light = patch.electrons_per_s[v - patch.row, u - patch.column] * exposure_s
+            instants = v * 100e-6 + exposure_s * (np.arange(4000) + 0.5) / 4000
+            periods = led.phase + instants / 8e-3 * (1 + led.clock_error)
+            chips = np.floor(periods * 32).astype(int) % 32
+            gain = 2 * np.mean([led.bits[chip] == "1" for chip in chips])
+            background = view.background_e_per_s[v, u] * exposure_s
+            # the background's light of LEDs is 1e-3 of its own, and light the LED's above it
+            assert image[v, u] == pytest.approx(background + gain * light, rel=2e-3)
+            checked += 1
+    assert checked >= 8
+    images = [pixels(bursts / f"frames/{number:06d}.exr") for number in (0, 2)]
+    assert not np.array_equal(*images)
+
+
+def test_a_burst_is_rendered_once_for_each_camera(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    views: list[tuple[int, int]] = []
+    rendered = frame_job._rendered
+
+    def counted(job: object, pose: int, number: int, which: int, frame: int | None) -> object:
+        views.append((pose, which))
+        return rendered(job, pose, number, which, frame)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(frame_job, "_rendered", counted)
+    vr.generate(plan_of(tmp_path, *ROLLING, *BURSTS, RIG), tmp_path / "set")
+    assert views == [(0, 0), (0, 1), (1, 0), (1, 1)]
+
+
+def test_more_workers_make_the_same_bits(bursts: Path, tmp_path: Path) -> None:
+    vr.generate(plan_of(bursts.parent, *ROLLING, *BURSTS, RIG), tmp_path / "set", workers=2)
+    for name in ("frames.parquet", "truth.parquet", *(f"frames/{n:06d}.exr" for n in range(24))):
+        assert (tmp_path / "set" / name).read_bytes() == (bursts / name).read_bytes()
+
+
+def test_steady_leds_under_a_rolling_shutter_have_the_bits_of_a_global_one(tmp_path: Path) -> None:
+    steady = 'send = "steady"'
+    for name, shutter in (("rolling", ROLLING), ("global", ())):
+        vr.generate(plan_of(tmp_path, *shutter, downlink=steady), tmp_path / name)
+    for number in range(2):
+        images = [
+            pixels(tmp_path / name / f"{folder}/{number:06d}.exr")
+            for folder in ("frames", "expected")
+            for name in ("rolling", "global")
+        ]
+        assert np.array_equal(images[0], images[1])
+        assert np.array_equal(images[2], images[3])
+    frames, truth = frames_of(tmp_path / "global")
+    assert [(row.burst, row.start_s, row.gyro_rad_s) for row in frames] == [(0, 0.0, None), (1, 0.0, None)]
+    assert all((led.clock_error, led.phase, led.bits) == (None, None, None) for row in truth for led in row.leds)
+
+
+def test_a_gyroscope_has_the_noise_of_each_shot_and_the_bias_of_its_device(tmp_path: Path) -> None:
+    """1000 shots: noise to 5 standard errors about a bias that stays; biases of 1000 seeds to 5 standard errors."""
+    plan = plan_of(tmp_path, *BURSTS, MOTION)
+    recipe, gyroscope = plan.recipe, plan.recipe.gyroscope
+    assert gyroscope is not None
+    count = 1000
+    true = np.radians([4.0, -3.0, 8.0])
+    shots = np.array([gyro_rad_s(recipe, gyroscope, 0, shot) for shot in range(count)]) - true
+    assert shots.std(axis=0, ddof=1) == pytest.approx(np.full(3, np.radians(0.3)), rel=5 / np.sqrt(2 * count))
+    biases = np.array(
+        [
+            gyro_rad_s(
+                recipe.model_copy(update={"seed": seed}), gyroscope.model_copy(update={"noise_deg_s": 0.0}), 0, 0
+            )
+            for seed in range(count)
+        ]
+    )
+    assert (biases - true).std(axis=0, ddof=1) == pytest.approx(np.full(3, np.radians(1.0)), rel=5 / np.sqrt(2 * count))
+    own = gyro_rad_s(recipe, gyroscope.model_copy(update={"noise_deg_s": 0.0}), 0, 0) - true
+    assert shots.mean(axis=0) == pytest.approx(own, abs=5 * np.radians(0.3) / np.sqrt(count))
+
+
+def test_a_camera_beside_reads_the_gyroscope_in_its_own_axes(bursts: Path) -> None:
+    frames, _ = frames_of(bursts)
+    (mounted,) = (c for c in plan_of(bursts.parent, RIG).recipe.cameras if c.name == "beside")
+    for main, beside in zip(frames[::2], frames[1::2], strict=True):
+        assert main.gyro_rad_s is not None
+        assert beside.gyro_rad_s == pytest.approx(mounted.rotation @ np.array(main.gyro_rad_s), abs=1e-15)
+    assert len({row.gyro_rad_s for row in frames}) == len(frames)
+
+
+@pytest.mark.parametrize("direction", DIRECTIONS)
+def test_an_led_of_a_moving_camera_is_where_its_own_line_sees_it(
+    sending: Scene, small_camera: Camera, direction: str
+) -> None:
+    """A turn of 20 deg/s about y moves images by -524 px/s; the LED's line is (v - 150) * 100 us from the middle.
+
+    tan: at 100 px of 1500 the speed is 0.4 % more.
+    """
+    camera = Camera(**{**small_camera.model_dump(), "shutter": rolling(direction, 100.0)})
+    (mounted,) = mounted_cameras(camera, ())
+    motion = Motion(angular_velocity_deg_s=(0.0, 20.0, 0.0))
+    during = poses_during(motion, mounted, POSE, 1e-5, sending)
+    assert isinstance(during, RollingPoses)
+    image = Renderer(sending).expected_image(PosedCamera(camera, POSE), None, during)
+    at_rest = Renderer(sending).expected_image(PosedCamera(camera, POSE))
+    still = {patch.led_id: patch.center_px for patch in at_rest.patches}
+    speed = -1500 * np.radians(20.0)
+    compared = 0
+    for patch in image.patches:
+        (u, v), (u0, v0) = patch.center_px, still[patch.led_id]
+        lines = {"down": v - 150, "up": 150 - v, "right": u - 200, "left": 200 - u}[direction]
+        assert u - u0 == pytest.approx(speed * lines * 100e-6, abs=0.01 * abs(speed * lines * 100e-6) + 1e-4)
+        assert v - v0 == pytest.approx(0, abs=0.1)
+        compared += abs(u - u0) > 0.5
+    assert compared >= 2
+
+
+@pytest.mark.parametrize("direction", DIRECTIONS)
+def test_the_light_of_a_moving_camera_is_where_the_truth_puts_it(
+    sending: Scene, small_camera: Camera, direction: str
+) -> None:
+    """Centroid of each patch less the motion, against the truth's centre, of discs of 5 px radius.
+
+    A centroid lies beside the centre's image by 0.001 px (perspective) at rest; subtracted. Shear within the disc moves
+    no centroid. A line whose weight changes with the motion, by speed times row time 5 %, shifts it by less than 5 % of
+    the second moment over the radius times the change of speed: 1e-3. Interpolation between knots of half a pixel and
+    the pixel's own area, for edges that are curved: 0.01 px.
+    """
+    camera = Camera(**{**small_camera.model_dump(), "shutter": rolling(direction, 100.0)})
+    (mounted,) = mounted_cameras(camera, ())
+    motion = Motion(angular_velocity_deg_s=(12.0, 15.0, -20.0), linear_velocity_m_s=(0.3, 0.2, -0.4))
+    during = poses_during(motion, mounted, POSE, 1e-5, sending)
+    renderer = Renderer(sending)
+    found = renderer.expected_image(PosedCamera(camera, POSE), None, during).patches
+    still = renderer.expected_image(PosedCamera(camera, POSE)).patches
+    offsets = []
+    for patches in (found, still):
+        centroids = {}
+        for patch in patches:
+            rows, columns = np.indices(patch.electrons_per_s.shape)
+            weights = patch.electrons_per_s.astype(float)
+            centroid = np.array([(columns * weights).sum(), (rows * weights).sum()]) / weights.sum()
+            centroids[patch.led_id] = centroid + [patch.column + 0.5, patch.row + 0.5] - patch.center_px
+        offsets.append(centroids)
+    whole = [patch.led_id for patch in still if patch.visible_fraction > 0.999]
+    assert len(whole) >= 2
+    for led in whole:
+        assert offsets[0][led] == pytest.approx(offsets[1][led], abs=0.02)
+
+
+def test_lines_of_the_room_have_their_own_pose(office: Scene, small_camera: Camera) -> None:
+    """Rows of the background of a moving camera are rows of cameras at rest at the poses of the rows."""
+    camera = Camera(**{**small_camera.model_dump(), "shutter": rolling("down", 100.0)})
+    (mounted,) = mounted_cameras(camera, ())
+    motion = Motion(angular_velocity_deg_s=(12.0, 15.0, -20.0), linear_velocity_m_s=(0.3, 0.2, -0.4))
+    pose = Pose((3.15, 3.1, 0.6), 6, -8, 20)
+    renderer = Renderer(office)
+    during = poses_during(motion, mounted, pose, 1e-5, office)
+    (moving_part,) = renderer.expected_image(PosedCamera(camera, pose), None, during).parts
+    moving_image = moving_part.expected_electrons(1.0)
+    (middle,) = renderer.expected_image(PosedCamera(camera, pose)).parts
+    unlike = 0.0
+    for row in (3, 80, 151, 290):
+        at = PosedCamera(camera, motion.pose_at(pose, (row - 149.5) * 100e-6))
+        (still,) = renderer.expected_image(at).parts
+        expected, other = still.expected_electrons(1.0)[row], middle.expected_electrons(1.0)[row]
+        # edges of LEDs are interpolated between knots of half a pixel: a pixel errs by up to a quarter of its light
+        off = np.abs(moving_image[row] - expected) > 1e-3 * expected
+        assert off.mean() < 0.05
+        unlike = max(unlike, float((np.abs(other - expected) > 1e-3 * expected).mean()))
+    assert unlike > 0.1
+
+
+def test_a_motion_of_zero_has_the_bits_of_a_camera_at_rest(sending: Scene, small_camera: Camera) -> None:
+    camera = Camera(**{**small_camera.model_dump(), "shutter": rolling("down", 100.0)})
+    (mounted,) = mounted_cameras(camera, ())
+    level = Pose((0.3, 1.9, 0.5))
+    assert poses_during(Motion(), mounted, level, 1e-5, sending) == (level,)
+
+
+def test_a_moving_set_is_consistent_and_its_burst_moves_on(moving: Path) -> None:
+    assert vr.verify(moving) == []
+    frames, truth = frames_of(moving)
+    first, second = np.array(truth[0].position_m), np.array(truth[2].position_m)
+    assert second - first == pytest.approx(np.array([0.2, -0.1, 0.3]) * 0.04, abs=1e-12)
+    assert truth[0].angular_velocity_rad_s == pytest.approx(np.radians([4.0, -3.0, 8.0]))
+    assert truth[0].linear_velocity_m_s == pytest.approx([0.2, -0.1, 0.3])
+    later = [row.start_s for row in frames]
+    assert later[2] - later[0] == pytest.approx(0.04)
+    # the camera beside, from its positions in two frames: (p2 - p1) / t is its mean velocity
+    beside = (np.array(truth[3].position_m) - truth[1].position_m) / 0.04
+    mean = (np.array(truth[1].linear_velocity_m_s) + truth[3].linear_velocity_m_s) / 2
+    # the offset of 0.1 m turns at 9.4 deg/s = 0.16 rad/s: its jerk over 0.04 s is 0.1 * 0.16^3 * 0.04^2 / 12
+    assert beside == pytest.approx(mean, abs=1e-6)
+
+
+Rows = tuple[FrameRow, TruthRow]
+
+
+def of_leds(row: TruthRow, **changes: object) -> TruthRow:
+    return row.model_copy(update={"leds": tuple(led.model_copy(update=changes) for led in row.leds)})
+
+
+DAMAGE: dict[str, tuple[Callable[[FrameRow, TruthRow], Rows], str]] = {
+    "burst": (lambda d, t: (d.model_copy(update={"burst": 1}), t), "burst 1, but a burst has 2 shots"),
+    "start_s": (lambda d, t: (d.model_copy(update={"start_s": d.start_s + 1e-3}), t), "start_s = "),
+    "gyro": (lambda d, t: (d.model_copy(update={"gyro_rad_s": (0.0, 0.0, 0.0)}), t), "gyro_rad_s and the gyroscope"),
+    "still": (
+        lambda d, t: (d, t.model_copy(update={"angular_velocity_rad_s": (0.0, 0.0, 0.0)})),
+        "is not where the pose puts it",
+    ),
+    "phase": (lambda d, t: (d, of_leds(t, phase=0.5)), "clock_error, phase or bits are not those of its wave"),
+    "bits": (lambda d, t: (d, of_leds(t, bits="01" * 16)), "clock_error, phase or bits are not those of its wave"),
+    "steady": (lambda d, t: (d, of_leds(t, phase=None)), "is modulated, but clock_error or phase is null"),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGE)
+def test_verify_tells_a_column_that_contradicts(moving: Path, tmp_path: Path, name: str) -> None:
+    damage, line = DAMAGE[name]
+    folder = copy_of(moving, tmp_path / "set")
+    frames, truth = frames_of(folder)
+    frames[0], truth[0] = damage(frames[0], truth[0])
+    write_table(folder / "frames.parquet", frames, FrameRow)
+    write_table(folder / "truth.parquet", truth, TruthRow)
+    assert any(line in problem for problem in vr.verify(folder))
+
+
+def test_the_bound_of_striped_leds_is_that_of_their_lit_lines(tmp_path: Path) -> None:
+    """A direct call with each patch times its gains, in another frame of a burst; expected images are float32, 6e-8."""
+    burst = ("burst={frames=2,frame_rate_hz=30.0}", "poses.count=1", "bound=true", "exposure_s=0.9e-6")
+    plan = plan_of(tmp_path, *ROLLING, *burst)
+    vr.generate(plan, tmp_path / "set")
+    frames, truth = frames_of(tmp_path / "set")
+    bounds = []
+    for number in (0, 1):
+        row = truth[number]
+        assert row.bound_m2 is not None
+        pose = Pose(row.position_m, row.tilt_x_deg, row.tilt_y_deg, row.yaw_deg)
+        (mounted,) = plan.recipe.cameras
+        exposure_s = frames[number].exposure_s
+        waves = led_waves(plan.scene.leds.transmitters, plan.recipe.seed)
+        starts_s = frames[number].start_s + mounted.camera.line_starts_s()
+        gains = LineGains(waves, starts_s, exposure_s)
+        renderer = Renderer(plan.scene)
+
+        def striped(posed: PosedCamera, gains: LineGains = gains, renderer: Renderer = renderer) -> list[LedPatch]:
+            return [
+                replace(
+                    patch,
+                    electrons_per_s=patch.electrons_per_s * gains[patch.led_id][patch.row : patch.roi.end_row],
+                )
+                for patch in renderer.led_patches(posed)
+            ]
+
+        variance = RegionImage(Roi.of_sensor(mounted.camera), pixels(tmp_path / f"set/expected/{number:06d}.exr"))
+        distance_m = float(np.median(np.linalg.norm(plan.scene.leds.centers_m - row.position_m, axis=1)))
+        bound = position_bound_m2(mounted, pose, striped, exposure_s, [variance], distance_m, (0.1, 0.1))
+        assert bound is not None
+        found = np.array(row.bound_m2).reshape(3, 3)
+        assert found == pytest.approx(bound, rel=1e-5, abs=1e-5 * np.trace(bound))
+        bounds.append(np.trace(found))
+    assert abs(bounds[1] / bounds[0] - 1) > 0.01
+
+
+REFUSED = {
+    "overlapping frames": (["burst={frames=2,frame_rate_hz=40.0}"], r"burst.frame_rate_hz = 40: a frame takes 29.9"),
+    "overscan": (['regions={kind="leds",overscan=true}'], r"overscan = true: camera 'main' has a rolling shutter"),
+    "map without pixels": (
+        ['map="sent"'],
+        r'map = "sent": the map comes out of the light; set demodulation = "pixels"',
+    ),
+    "map from codes": (['map="sent"', 'demodulation="pixels"'], r'map = "sent": LEDs of scene .* send "code"'),
+    "bound in motion": (["bound=true", MOTION], r"bound = true: needs a camera at rest; remove \[motion\]"),
+    "bound with glare": (
+        ["bound=true", "camera.glare={share=0.1,radius_um=600.0}"],
+        r"bound = true: is not computed for a lens with glare where light is modulated",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_a_rolling_shutter_cannot_do_is_refused(tmp_path: Path, name: str) -> None:
+    assignments, message = REFUSED[name]
+    shutter = 'camera.shutter={kind="rolling",row_time_us=100.0}'
+    with pytest.raises(InputError, match=message):
+        plan_of(tmp_path, shutter, *assignments)
+
+
+def test_pixels_need_light_that_tells_its_led(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r'demodulation = "pixels": no LED of scene .* transmits what identifies it'):
+        plan_of(tmp_path, 'demodulation="pixels"', downlink='send = "pwm"')
+
+
+def test_a_scale_keeps_the_readout_and_is_refused_where_stripes_would_vanish(tmp_path: Path) -> None:
+    """Chips of 250 us: two binned lines of 100 us are shorter, four are longer."""
+    small = plan_of(tmp_path, *ROLLING, scale=2).recipe.camera
+    assert small.shutter.row_time_s == pytest.approx(200e-6)
+    assert small.line_starts_s().max() == pytest.approx(149 * 200e-6)
+    with pytest.raises(InputError, match=r"--scale 4: a binned line takes 400 us, and the shortest level .* 250 us"):
+        plan_of(tmp_path, *ROLLING, scale=4)
+    assert plan_of(tmp_path, *ROLLING, downlink='send = "steady"', scale=4).recipe.camera.height_px == 75
+
+
+def test_an_image_that_runs_along_with_the_readout_is_refused(sending: Scene, small_camera: Camera) -> None:
+    """600 deg/s moves images by 15 700 px/s, 1.6 px in a row time of 100 us; 120 deg/s by 0.3 px."""
+    camera = Camera(**{**small_camera.model_dump(), "shutter": rolling("down", 100.0)})
+    (mounted,) = mounted_cameras(camera, ())
+    with pytest.raises(
+        InputError, match=r"motion: moves the image by up to 1\.\d+ px from line to line; .* at most 0.5"
+    ):
+        poses_during(Motion(angular_velocity_deg_s=(600.0, 0.0, 0.0)), mounted, POSE, 1e-5, sending)
+    assert poses_during(Motion(angular_velocity_deg_s=(120.0, 0.0, 0.0)), mounted, POSE, 1e-5, sending)
+
+
+def warnings_of(plan: Plan) -> list[str]:
+    return list(light_warnings(plan.recipe, plan.scene))
+
+
+def test_lit_levels_that_saturate_and_bursts_in_step_are_warned_of(tmp_path: Path) -> None:
+    """The brightest LED gives 3 309 electrons in the small camera's frame: lit 6 618 of 4 095; 8 ms are a code."""
+    (warning,) = warnings_of(plan_of(tmp_path, *ROLLING))
+    assert "when lit, gives a pixel 66" in warning
+    assert "4095 saturate it" in warning
+    assert warnings_of(plan_of(tmp_path, *ROLLING, "exposure_s=0.9e-6")) == []
+    dark = ("exposure_s=0.9e-6", "burst={frames=2,frame_rate_hz=25.0}")
+    (warning,) = warnings_of(plan_of(tmp_path, *ROLLING, *dark))
+    assert "a frame takes 5.000 periods of 8 ms" in warning
+    assert warnings_of(plan_of(tmp_path, *ROLLING, "exposure_s=0.9e-6", "burst={frames=2,frame_rate_hz=27.0}")) == []
+
+
+def test_peak_metering_counts_the_mean(tmp_path: Path) -> None:
+    path = scene_file(tmp_path)
+    for share, count in ((0.6, 1), (0.45, 0)):
+        metering = f'exposure={{kind="peak",share_of_saturation={share},max_s=1e-3}}'
+        changes = [c for c in SMALL if "exposure" not in c] + [f"scene={path}", metering, "poses.min_leds=2"]
+        plan = vr.load_recipe(ROOT / "datasets/quickstart.toml", changes)
+        assert len(warnings_of(plan)) == count
+
+
+def test_a_sent_map_is_null_for_the_device_and_sealed_in_the_truth(tmp_path: Path) -> None:
+    packets = ('map="sent"', 'demodulation="pixels"', "poses.count=1")
+    plan = plan_of(tmp_path, *ROLLING, *packets, downlink='send = "packet"\nchip_us = 250.0')
+    vr.generate(plan, tmp_path / "set")
+    dataset = json.loads((tmp_path / "set/dataset.json").read_text(encoding="utf-8"))
+    assert dataset["led_map"] is None
+    assert dataset["luminaires"] == []
+    assert dataset["downlink"]["demodulation"] == "pixels"
+    assert dataset["cameras"]["main"]["shutter"] == rolling("down", 100.0)
+    rows = read_table(tmp_path / "set/truth_map.parquet", MapTruthRow)
+    assert {row.led: row.position_m for row in rows}[4] == (0.9, 1.1, 3.5)
+    assert frames_of(tmp_path / "set")[0][0].spots == ()
+    assert vr.verify(tmp_path / "set") == []
