@@ -43,7 +43,9 @@ def attitude(
     InputError
         Several statements, or one that is no direction.
     """
-    given = [name for name, value in (("--gravity", gravity), ("--tilt", tilt), ("--level", level_deg)) if value is not None]
+    given = [
+        name for name, value in (("--gravity", gravity), ("--tilt", tilt), ("--level", level_deg)) if value is not None
+    ]
     if len(given) > 1:
         raise InputError(f"{' and '.join(given)}: give one")
     if sigma_deg is not None and given not in (["--gravity"], ["--tilt"]):

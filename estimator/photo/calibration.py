@@ -1,7 +1,8 @@
 """Calibrations: intrinsics of a camera by OpenCV, ROS, Kalibr or NumPy files, as the format's camera.
 
 OpenCV counts pixels from their centres, and the format from the border: the principal point moves by half a pixel. A
-calibration for pictures of another size is rescaled. Coefficients that the format's lens cannot hold exactly are refused.
+calibration for pictures of another size is rescaled. Coefficients that the format's lens cannot hold exactly are
+refused.
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.errors import InputError
-from estimator.io.device import Camera, CameraUncertainty, Distortion, Shutter
+from estimator.io.device import Camera, CameraUncertainty, Distortion
+from estimator.io.shutter import Shutter
 from estimator.photo.yaml_subset import YamlError, parse_yaml
 
 Floats = NDArray[np.float64]
@@ -51,8 +53,8 @@ FISHEYE_MODELS = ("equidistant", "fisheye", "kannala_brandt4")
 class Calibration:
     """Intrinsics: `K` (3, 3), in pixels with pixel centres at +0.5, of pictures of `size_px` (width, height).
 
-    `size_px` is None where the file does not say it. `focal_sigma` is the relative standard deviation of the focal length,
-    None where not stated. `source` says in a few words where it is from, `remarks` what was changed.
+    `size_px` is None where the file does not say it. `focal_sigma` is the relative standard deviation of the focal
+    length, None where not stated. `source` says in a few words where it is from, `remarks` what was changed.
     """
 
     K: Floats
@@ -75,12 +77,18 @@ class Calibration:
         what = f"{self.source}: is of {width} x {height} px, the picture has {width_px} x {height_px}"
         if abs(across / down - 1) > MAX_ASPECT:
             turned = abs(width_px * width / (height_px * height) - 1) <= MAX_ASPECT
-            hint = "turned by 90 degrees: try --orientation" if turned else "of another shape: cropped pictures are not allowed"
+            hint = (
+                "turned by 90 degrees: try --orientation"
+                if turned
+                else "of another shape: cropped pictures are not allowed"
+            )
             raise InputError(f"{what}, {hint}")
         # The mean keeps square pixels square: sides of pictures are rounded to whole pixels.
         scale = float(np.sqrt(across * down))
         said = f"{what}: rescaled by {scale:.6g}"
-        return replace(self, K=np.diag([scale, scale, 1.0]) @ self.K, size_px=(width_px, height_px), remarks=(*self.remarks, said))
+        return replace(
+            self, K=np.diag([scale, scale, 1.0]) @ self.K, size_px=(width_px, height_px), remarks=(*self.remarks, said)
+        )
 
     def camera(self, shutter: Shutter, f_number: float | None, focal_length_mm: float | None) -> Camera:
         """The camera of the format; `for_size` comes first."""
@@ -121,7 +129,9 @@ class Calibration:
         )
 
 
-def simple_calibration(focal_px: float, size_px: tuple[int, int], source: str, sigma: float | None = None) -> Calibration:
+def simple_calibration(
+    focal_px: float, size_px: tuple[int, int], source: str, sigma: float | None = None
+) -> Calibration:
     """A pinhole with the principal point in the middle of the picture."""
     width_px, height_px = size_px
     K = np.array([[focal_px, 0.0, width_px / 2], [0.0, focal_px, height_px / 2], [0.0, 0.0, 1.0]])
@@ -153,10 +163,17 @@ def read_calibration(path: Path) -> Calibration:
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     entries = _npz(path) if path.suffix.lower() == ".npz" else _yaml(path)
-    first = next((value for key, value in sorted(entries.items()) if key.startswith("cam") and isinstance(value, Mapping) and "intrinsics" in value), None)
+    first = next(
+        (
+            value
+            for key, value in sorted(entries.items())
+            if key.startswith("cam") and isinstance(value, Mapping) and "intrinsics" in value
+        ),
+        None,
+    )
     source = path.name
     if first is not None:
-        entries = first
+        entries = dict(first)
     return _calibration(entries, source)
 
 
@@ -165,7 +182,9 @@ def _npz(path: Path) -> dict[str, Any]:
         with np.load(path, allow_pickle=False) as archive:
             return {key: archive[key].tolist() for key in archive.files}
     except (OSError, ValueError, KeyError, EOFError) as error:
-        raise InputError(f"{path}: not a readable .npz file ({str(error).splitlines()[0] if str(error) else 'damaged'})") from None
+        raise InputError(
+            f"{path}: not a readable .npz file ({str(error).splitlines()[0] if str(error) else 'damaged'})"
+        ) from None
 
 
 def _yaml(path: Path) -> dict[str, Any]:
@@ -199,7 +218,9 @@ def _calibration(entries: Mapping[str, Any], source: str) -> Calibration:
     if fisheye:
         if any(coefficients):
             told = ", ".join(f"k{k} = {value:g}" for k, value in enumerate(coefficients, 1) if value)
-            raise InputError(f"{source}: fish-eye with {told}: the format's fish-eye is equidistant, all of k1 to k4 have to be 0")
+            raise InputError(
+                f"{source}: fish-eye with {told}: the format's fish-eye is equidistant, all of k1 to k4 have to be 0"
+            )
         return Calibration(K, "equidistant", None, size, source)
     return Calibration(K, "perspective", brown_conrady(source, coefficients), size, source)
 
@@ -212,7 +233,10 @@ def brown_conrady(source: str, coefficients: Sequence[float]) -> Distortion | No
     named = dict(zip(COEFFICIENTS.get(count, "").split(), coefficients, strict=True))
     beyond = [f"{name} = {value:g}" for name, value in named.items() if value and name not in Distortion.model_fields]
     if beyond:
-        raise InputError(f"{source}: {', '.join(beyond)}: the format's lens has k1, k2, k3, p1, p2 alone; calibrate with five coefficients")
+        raise InputError(
+            f"{source}: {', '.join(beyond)}: the format's lens has k1, k2, k3, p1, p2 alone; "
+            "calibrate with five coefficients"
+        )
     if not any(named.values()):
         return None
     return Distortion(**{name: float(named.get(name, 0.0)) for name in Distortion.model_fields})

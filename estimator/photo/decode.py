@@ -24,6 +24,8 @@ LEVEL_SHARE = 0.1
 FLOOR_SHARE = 0.01
 # Standard deviation of a frequency measured in a photograph beside the fit's: envelope and saturation. Ours.
 ADDED_SIGMA_HZ = 25.0
+# Bright shares of a period that are tried: the tone curve and saturation widen the bright half.
+DUTIES = (0.5, 0.55, 0.6)
 # The band of trial frequencies reaches this much beyond the map's.
 BAND_BEYOND = 1.6
 # A lamp in the middle of a picture has as much gradient along both axes: stripes have several times as much along one.
@@ -55,13 +57,14 @@ class FoundLamp:
         if self.tone.at_border:
             return f"{self.tone.frequency_hz:.0f} Hz is at the border of the band"
         if not self.tone.clear:
-            return f"{self.tone.frequency_hz:.0f} Hz explains {100 * self.tone.share:.0f} % of the stripes' energy"
+            share = max(100 * self.tone.share, 0.0)
+            return f"{self.tone.frequency_hz:.0f} Hz explains {share:.0f} % of the stripes' energy"
         return f"{self.tone.frequency_hz:.0f} Hz is no LED's tone"
 
 
 def readout_ratio(picture: Picture) -> tuple[Along, float]:
     """What lines are, by the gradients of the bright parts, and by how many times they exceed the other axis'."""
-    coded = picture.coded()
+    coded = picture.coded
     bright = (coded > LAMP_SHARE * coded.max()).view(np.uint8)
     near = cv2.dilate(bright, np.ones((2 * LAMP_RADIUS_PX + 1, 2 * LAMP_RADIUS_PX + 1), np.uint8)).view(np.bool_)
     down, right = np.diff(coded, axis=0) ** 2, np.diff(coded, axis=1) ** 2
@@ -81,32 +84,36 @@ def find(
 ) -> list[FoundLamp]:
     """Lamps of a picture with the tones of the map's LEDs; larger ones first.
 
-    `along` says what lines are, `line_time_s` is the time between two of them. `frequencies_hz` are those of the LEDs, by
-    id. Stripes are looked at in the coded picture, where dim and bright parts of a lamp weigh alike.
+    `along` says what lines are, `line_time_s` is the time between two of them. `frequencies_hz` are those of the LEDs,
+    by id. Stripes are looked at in the coded picture, where dim and bright parts of a lamp weigh alike.
     """
-    coded = picture.coded()
+    coded = picture.coded
     readout = Readout(0, 0, coded, coded, picture.clipped, FLOOR)
     longest_s = 0.5 / min(frequencies_hz.values()) + exposure_s
     lamps = find_lamps([readout], along, longest_s / line_time_s, coded.size, any_square)
-    band = min(frequencies_hz.values()) / BAND_BEYOND, max(frequencies_hz.values()) * BAND_BEYOND
+    lowest_hz, highest_hz = min(frequencies_hz.values()), max(frequencies_hz.values())
     found = []
     for lamp in lamps:
-        tone = _tone(lamp, line_time_s, exposure_s, band)
+        tone = _tone(lamp, line_time_s, exposure_s, lowest_hz, highest_hz)
         match = None if tone is None else match_tone(tone, frequencies_hz, added_sigma_hz=ADDED_SIGMA_HZ)
         found.append(FoundLamp(lamp, tone, match))
     return found
 
 
-def _tone(lamp: Lamp, line_time_s: float, exposure_s: float, band: tuple[float, float]) -> ToneFit | None:
-    """The tone of a lamp's profile; None without stripes."""
+def _tone(lamp: Lamp, line_time_s: float, exposure_s: float, lowest_hz: float, highest_hz: float) -> ToneFit | None:
+    """The tone of a lamp's profile, of frequencies about those of the map; None without stripes."""
     profile = lamp.profile
     if not lamp.striped or len(profile.lines) < 2:
         return None
     whole = Signal(profile.lines * line_time_s, exposure_s, profile.level_e, profile.weight)
-    envelope = envelope_of(whole, int(np.ceil(1 / band[0] / line_time_s)))
+    envelope = envelope_of(whole, int(np.ceil(1 / lowest_hz / line_time_s)))
     highest = float(envelope.max())
     used = envelope >= MIN_ENVELOPE * highest
     variance = (LEVEL_SHARE * envelope) ** 2 + (FLOOR_SHARE * highest) ** 2 + 1 / profile.weight
-    signal = Signal(whole.start_s[used], exposure_s, whole.level[used], 1 / variance[used])
+    weight = np.asarray(1 / variance[used], dtype=np.float64)
+    starts_s, levels = np.asarray(whole.start_s[used]), np.asarray(whole.level[used], dtype=np.float64)
+    signal = Signal(starts_s, exposure_s, levels, weight)
     low, high = band_hz(line_time_s, exposure_s, int(used.sum()))
-    return fit_tone(signal, (max(low, band[0]), min(high, band[1])), envelope=envelope[used])
+    band = max(low, lowest_hz / BAND_BEYOND), min(high, highest_hz * BAND_BEYOND)
+    fits = [fit for duty in DUTIES if (fit := fit_tone(signal, band, duty, envelope[used])) is not None]
+    return max(fits, key=lambda fit: fit.share, default=None)

@@ -34,7 +34,7 @@ MAX_COORDINATE_M = 1e6
 
 @dataclass(frozen=True)
 class LedEntry:
-    """LED of a table: `label`, position (x, y, z) and size in the table's units; None for what the table does not say."""
+    """LED of a table: `label`, position (x, y, z) and size in the table's units; None where the table says nothing."""
 
     id: int
     label: str
@@ -94,9 +94,9 @@ def read_led_table(path: Path, units: str | None = None) -> LedTable:
     Parameters
     ----------
     path
-        CSV with a header, or JSON: a list of objects, or an object with the list as `leds` and the unit as `units`. Each
-        LED has `x`, `y`, `z` (or `position`, a list); `id`, `frequency_hz`, `radius`, `side` and `shape` are optional. Of
-        several LEDs with one frequency, the geometry decides.
+        CSV with a header, or JSON: a list of objects, or an object with the list as `leds` and the unit as `units`.
+        Each LED has `x`, `y`, `z` (or `position`, a list); `id`, `frequency_hz`, `radius`, `side` and `shape` are
+        optional. Of several LEDs with one frequency, the geometry decides.
     units
         Unit of lengths: "m", "cm", "mm", "in" or "ft"; overrides the file's. Default: the file's, or metres.
 
@@ -140,7 +140,7 @@ def _json_rows(path: Path, text: str) -> tuple[str | None, list[Mapping[str, Any
         content = content.get("leds")
     if not isinstance(content, list) or not all(isinstance(row, dict) for row in content):
         raise InputError(f"{path}: needed a list of LEDs, or an object with one as leds")
-    rows = []
+    rows: list[Mapping[str, Any]] = []
     for row in content:
         place = row.get("position")
         axes = dict(zip("xyz", place, strict=False)) if isinstance(place, list) else {}
@@ -182,7 +182,14 @@ def _entry(where: str, number: int, row: Mapping[str, Any]) -> LedEntry:
     label = str(found.get("id", sizes.get("frequency_hz", number))).strip()
     if label.endswith(".0"):
         label = label[:-2]
-    return LedEntry(number, label, (x, y, z), sizes.get("frequency_hz"), sizes.get("radius") if shape == "disc" else None, sizes.get("side"))
+    return LedEntry(
+        number,
+        label,
+        (x, y, z),
+        sizes.get("frequency_hz"),
+        sizes.get("radius") if shape == "disc" else None,
+        sizes.get("side"),
+    )
 
 
 def _bare(key: str) -> str:

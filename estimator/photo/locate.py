@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.errors import EstimationFailure, InputError
-from estimator.io.device import DecodedSpot, DeviceFrame, Part, Shutter
+from estimator.io.device import DecodedSpot, DeviceFrame, Part
 from estimator.io.downlink import Downlink, Tones
-from estimator.io.shutter import GLOBAL
+from estimator.io.shutter import GLOBAL, Shutter
 from estimator.photo.attitude import Attitude
 from estimator.photo.calibration import Calibration, calibration_of_film, simple_calibration
 from estimator.photo.decode import MIN_AXIS_RATIO, FoundLamp, find, readout_ratio
@@ -32,7 +32,7 @@ UNKNOWN_EXPOSURE_SHARE = 0.05
 
 @dataclass(frozen=True)
 class Options:
-    """What the photographer states beside map, calibration and attitude; None for what EXIF or the picture are asked."""
+    """What the photographer states beside map, calibration and attitude; None where EXIF or the picture are asked."""
 
     tone: Tone = "srgb"
     orientation: Orientation = "stored"
@@ -165,7 +165,9 @@ def _axis(picture: Picture, options: Options) -> tuple[Along, str]:
     found, ratio = readout_ratio(picture)
     if options.readout == "auto":
         if ratio < MIN_AXIS_RATIO:
-            raise EstimationFailure("readout", f"gradients along both axes are alike ({ratio:.2g} times); give --readout")
+            raise EstimationFailure(
+                "readout", f"gradients along both axes are alike ({ratio:.2g} times); give --readout"
+            )
         return found, f"readout axis: lines are {found} ({ratio:.1f} times the gradient energy of the other axis)"
     said = f"readout axis: lines are {options.readout}, as given"
     if options.readout != found and ratio >= MIN_AXIS_RATIO:
@@ -191,7 +193,7 @@ def _centres_by_hand(picture: Picture, lamps: Sequence[FoundLamp], options: Opti
     if lamps:
         spots = [one.lamp.spot() for one in lamps]
     else:
-        coded = picture.coded()
+        coded = picture.coded
         readout = Readout(0, 0, coded, coded, picture.clipped, 2.0)
         near = np.array([(u, v) for _, u, v in options.spots])
         spots = list(detect([readout], coded.size, 0, near, near_px=gate_px(picture.width_px)))
@@ -203,7 +205,9 @@ def _centres_by_hand(picture: Picture, lamps: Sequence[FoundLamp], options: Opti
         if nearest < 0 or distance[nearest] > gate:
             raise InputError(f"--spots: no lamp within {gate:.0f} px of ({u:g}, {v:g})")
         if nearest in taken:
-            raise InputError(f"--spots: two spots are at the lamp at ({spots[nearest].u_px:.0f}, {spots[nearest].v_px:.0f})")
+            raise InputError(
+                f"--spots: two spots are at the lamp at ({spots[nearest].u_px:.0f}, {spots[nearest].v_px:.0f})"
+            )
         taken.add(nearest)
         centres.append(_centre_of(spots[nearest], (led,)))
     return centres
@@ -220,19 +224,26 @@ def _check_identified(
     """Say what the lamps are where none is an LED of the map."""
     if any(centre.candidates for centre in centres):
         return
-    reasons: dict[str, int] = {}
-    for one in lamps:
-        why = "cut by the border" if one.lamp.touches_border and one.candidates else one.why_not()
-        reasons[why] = reasons.get(why, 0) + 1
-    told = "; ".join(reasons) or "no lamp found"
+    causes = [
+        (sum(one.tone is None for one in lamps), "without stripes"),
+        (
+            sum(one.tone is not None and not one.tone.clear for one in lamps),
+            "whose stripes are no tone of the map's band",
+        ),
+        (sum(one.tone is not None and one.tone.clear and not one.candidates for one in lamps), "of another tone"),
+        (sum(bool(one.candidates) for one in lamps), "cut by the border"),
+    ]
+    told = ", ".join(f"{count} {cause}" for count, cause in causes if count) or "none found"
     found, ratio = readout_ratio(picture)
-    hint = f"; the stripes say that lines are {found}: try --readout {found}" if along is not None and along != found and ratio >= MIN_AXIS_RATIO else ""
-    raise EstimationFailure("identify", f"no lamp sends a tone of the map ({told}){hint}")
+    hint = (
+        f"; the stripes say that lines are {found}: try --readout {found}"
+        if along is not None and along != found and ratio >= MIN_AXIS_RATIO
+        else ""
+    )
+    raise EstimationFailure("identify", f"no lamp sends a tone of the map (lamps: {told}){hint}")
 
 
-def _marks(
-    centres: Sequence[Centre], lamps: Sequence[FoundLamp], solved: Solved, table: LedTable
-) -> tuple[Mark, ...]:
+def _marks(centres: Sequence[Centre], lamps: Sequence[FoundLamp], solved: Solved, table: LedTable) -> tuple[Mark, ...]:
     residual_of: dict[int, Floats] = {}
     best = next((answer for answer in solved.answers if answer.residuals_px is not None), None)
     if best is not None and best.residuals_px is not None:

@@ -35,9 +35,9 @@ class Mark:
 
 
 def write_overlay(path: Path, picture: Picture, marks: Sequence[Mark]) -> None:
-    """Write a PNG: the picture, marks on it, and a row of lamps enlarged below. Residuals are RESIDUAL_SCALE times long."""
+    """Write a PNG: the picture, marks on it, and lamps enlarged below it. Residuals are drawn RESIDUAL_SCALE times."""
     scale = min(1.0, MAX_SIDE_PX / max(picture.width_px, picture.height_px))
-    coded = picture.coded().astype(np.uint8)
+    coded = picture.coded.astype(np.uint8)
     small = cv2.resize(coded, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     whole = cv2.cvtColor(small, cv2.COLOR_GRAY2BGR)
     for mark in marks:
@@ -78,7 +78,9 @@ def _inset(coded: NDArray[np.uint8], mark: Mark) -> NDArray[np.uint8]:
     low = np.array([mark.u_px - half, mark.v_px - half])
     scale = INSET_PX / (2 * half)
     moved = np.array([[scale, 0, -low[0] * scale], [0, scale, -low[1] * scale]])
-    image = cv2.cvtColor(cv2.warpAffine(coded, moved, (INSET_PX, INSET_PX), flags=cv2.INTER_NEAREST), cv2.COLOR_GRAY2BGR)
+    image = cv2.cvtColor(
+        cv2.warpAffine(coded, moved, (INSET_PX, INSET_PX), flags=cv2.INTER_NEAREST), cv2.COLOR_GRAY2BGR
+    )
     colour = IDENTIFIED if mark.identified else REJECTED
     outline = np.rint((mark.contour_px - low) * scale).astype(np.int32)
     cv2.polylines(image, [outline.reshape(-1, 1, 2)], True, colour, 1, cv2.LINE_AA)

@@ -6,6 +6,7 @@ orientation is not applied unless asked for. A colour picture becomes grey.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -68,10 +69,16 @@ class Picture:
         """Rows."""
         return int(self.linear.shape[0])
 
+    @cached_property
     def coded(self) -> Pixels:
         """The picture with sRGB's tone curve, 0 to 255: dim and bright parts of a lamp have contrasts alike."""
+        coded = np.power(np.maximum(self.linear, 0), np.float32(1 / 2.4))
+        coded *= np.float32(1.055)
+        coded -= np.float32(0.055)
         low = self.linear <= 0.0031308
-        return np.where(low, 12.92 * self.linear, 1.055 * np.maximum(self.linear, 0) ** (1 / 2.4) - 0.055) * np.float32(255)
+        coded[low] = np.float32(12.92) * self.linear[low]
+        coded *= np.float32(255)
+        return coded
 
 
 def read_picture(path: Path, tone: Tone = "srgb", orientation: Orientation = "stored") -> Picture:
@@ -99,7 +106,9 @@ def read_picture(path: Path, tone: Tone = "srgb", orientation: Orientation = "st
     if path.suffix.lower() in RAW_SUFFIXES:
         values, bits, curve = _developed(path), 16, _CURVES["linear"]
     else:
-        decoded = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+        decoded = cv2.imdecode(
+            np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
+        )
         if decoded is None:
             raise InputError(f"{path}: not a readable picture; allowed: JPEG, PNG, TIFF, DNG")
         if decoded.dtype not in (np.uint8, np.uint16):
@@ -107,6 +116,8 @@ def read_picture(path: Path, tone: Tone = "srgb", orientation: Orientation = "st
         values, bits, curve = decoded, 8 * decoded.dtype.itemsize, _CURVES[tone]
     if values.shape[0] * values.shape[1] > MAX_PIXELS:
         raise InputError(f"{path}: {values.shape[1]} x {values.shape[0]} pixels, at most {MAX_PIXELS} are allowed")
+    # Curves by table: a picture has far more pixels than codes.
+    light = curve(np.linspace(0, 1, 2**bits, dtype=np.float32))
     share = np.float32(2**bits - 1)
     limit = (CLIPPED_OF_8_BITS if bits == 8 else CLIPPED) * share
     if values.ndim == 3 and values.shape[2] == 2:
@@ -115,11 +126,11 @@ def read_picture(path: Path, tone: Tone = "srgb", orientation: Orientation = "st
         values = values[:, :, :3]  # without alpha
         clipped = (values >= limit).any(axis=2)
         # Luminance of linear sRGB, in OpenCV's order of blue, green, red.
-        linear = curve(values / share) @ np.array([0.0722, 0.7152, 0.2126], dtype=np.float32)
+        linear = cv2.transform(light[values], np.array([[0.0722, 0.7152, 0.2126]], dtype=np.float32))
     else:
-        clipped, linear = values >= limit, curve(values / share)
+        clipped, linear = values >= limit, light[values]
     if orientation == "upright":
-        linear, clipped = _upright(linear, exif.orientation), _upright(clipped, exif.orientation)
+        linear, clipped = _upright(linear, exif.orientation), _upright(np.asarray(clipped), exif.orientation)
     return Picture(path, np.ascontiguousarray(linear, dtype=np.float32), np.ascontiguousarray(clipped), bits, exif)
 
 

@@ -44,7 +44,7 @@ def digital_numbers(picture: Picture) -> NDArray[np.uint32]:
     largest = 2**BITS - 1
     image = np.rint(np.clip(picture.linear, 0, 1) * (largest - 1)).astype(np.uint32)
     image[picture.clipped] = largest
-    return image
+    return np.asarray(image, dtype=np.uint32)
 
 
 def save(folder: Path, name: str, frames: Sequence[DeviceFrame], provenance: dict[str, Any]) -> None:

@@ -1,8 +1,8 @@
 """Positions from the lamps of a picture: identities by geometry where tones leave a choice, handedness, fits.
 
-A hypothesis says which axis of the map is reversed and which lamp is which LED. The likeliest one is taken if no other is
-nearly as likely. A real lamp's centroid errs by more than its noise: the further standard deviation of centroids follows
-from the residuals, with the prior that photographs have shown.
+A hypothesis says which axis of the map is reversed and which lamp is which LED. The likeliest one is taken if no other
+is nearly as likely. A real lamp's centroid errs by more than its noise: the further standard deviation of centroids
+follows from the residuals, with the prior that photographs have shown.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -35,13 +35,13 @@ MIN_LEDS = 3
 PRIOR_SIGMA_PX = 1.5
 PRIOR_RESIDUALS = 4.0
 SIGMA_ROUNDS = 3
-# Centroids of hypotheses have this standard deviation, as a share of the picture's width: the map may be off by as much.
+# Standard deviation of the centroids of hypotheses, as a share of the picture's width: the map may be off by as much.
 ROUGH_SHARE = 5e-4
 # A hypothesis is taken if it is this many times as likely as every other one: chi-square by 13.8.
 MIN_CLEAR_CHI2 = 2 * float(np.log(1000))
 MAX_HYPOTHESES = 4096
-# Residuals above this share of the picture's diagonal, root mean square, are no error of centroids: 5 mm at 2.5 m with a
-# wide lens.
+# Residuals above this share of the picture's diagonal, root mean square, are no error of centroids: 5 mm at 2.5 m with
+# a wide lens.
 MAX_RESIDUAL_SHARE = 1.5e-3
 MIN_INLIER_SHARE = 0.6
 VARIANTS = ("gravity-fit", "up2p", "pnp", "ippe", "sqpnp")
@@ -110,9 +110,9 @@ def solve(
 ) -> Solved:
     """Positions of a picture's camera; of the frame, camera and accelerometer are used.
 
-    `mirrors` are the ways to reverse an axis of the map that are tried. `sigma_px` is the further standard deviation of
-    each coordinate of a centroid; None for one by the residuals. Raises EstimationFailure if too few LEDs are identified,
-    no assignment is clearly the likeliest, or the map does not fit the spots.
+    `mirrors` are the ways to reverse an axis of the map that are tried. `sigma_px` is the further standard deviation
+    of each coordinate of a centroid; None for one by the residuals. Raises EstimationFailure if too few LEDs are
+    identified, no assignment is clearly the likeliest, or the map does not fit the spots.
     """
     identified = sum(bool(centre.candidates) for centre in centres)
     if identified < MIN_LEDS:
@@ -137,7 +137,11 @@ def solve(
 def _handed(mirror: Mirror, mirrors: Sequence[Mirror]) -> str:
     if len(mirrors) == 1:
         return "as given" if mirror == "none" else f"{mirror} reversed, as given"
-    return "right-handed" if mirror == "none" else f"left-handed: {mirror} is reversed inside, positions are in the map's axes"
+    return (
+        "right-handed"
+        if mirror == "none"
+        else f"left-handed: {mirror} is reversed inside, positions are in the map's axes"
+    )
 
 
 def _correspondences(
@@ -148,7 +152,9 @@ def _correspondences(
         if led is not None:
             covariance = np.reshape(centre.covariance_px2, (2, 2))
             u, v = centre.u_px, centre.v_px
-            made.append(Correspondence(leds[led], Spot(u, v, covariance, u, v, 0, 0.0, touches_border=False, saturated=False)))
+            made.append(
+                Correspondence(leds[led], Spot(u, v, covariance, u, v, 0, 0.0, touches_border=False, saturated=False))
+            )
     return made
 
 
@@ -270,14 +276,14 @@ def _check_fit(frame: DeviceFrame, answers: Sequence[Answer]) -> None:
         why = "; ".join(dict.fromkeys(answer.failure for answer in answers))
         raise EstimationFailure("position", f"no variant has a position ({why})")
     limit_px = MAX_RESIDUAL_SHARE * float(np.hypot(frame.camera.width_px, frame.camera.height_px))
-    best = min(usable, key=lambda answer: float(np.median(np.abs(answer.residuals_px))))
-    off = np.linalg.norm(best.residuals_px, axis=1) if best.residuals_px is not None else np.zeros(0)
+    distances = [np.linalg.norm(one.residuals_px, axis=1) for one in usable if one.residuals_px is not None]
+    off = min(distances, key=lambda some: float(np.median(some)))
     fitting = off <= 3 * limit_px
     if fitting.mean() < MIN_INLIER_SHARE or np.sqrt((off[fitting] ** 2).mean()) > limit_px:
         raise EstimationFailure(
             "position",
-            f"the map does not fit the spots: residuals of {np.sqrt((off**2).mean()):.0f} px, at most {limit_px:.0f} px are "
-            "allowed; check the map, its frequencies, --mirror, and the focal length",
+            f"the map does not fit the spots: residuals of {np.sqrt((off**2).mean()):.0f} px, at most {limit_px:.0f} "
+            "px are allowed; check the map, its frequencies, --mirror, and the focal length",
         )
 
 
