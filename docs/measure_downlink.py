@@ -3,7 +3,8 @@
     python docs/measure_downlink.py [SECTION ...]
 
 Sections: `waves` (integrals of the waves against numerical ones), `codes` (parts of codes that are found twice),
-`flicker` (modulation against IEEE 1789), `burst_cost` (time of a further frame of a burst).
+`flicker` (modulation against IEEE 1789), `burst_cost` (time of a further frame of a burst),
+`motion` (positions by a rolling shutter in motion).
 """
 
 import argparse
@@ -13,6 +14,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import perf_counter
 
+import measure_motion
 import numpy as np
 from measure import Measurement, heading, number, row
 from numpy.typing import NDArray
@@ -147,8 +149,14 @@ def burst_cost(chosen: Chosen) -> None:
         row(name, BURSTS, *own, f"{np.median(ratios):.2f} ({ratios.min():.2f} to {ratios.max():.2f})")
 
 
+def motion(chosen: Chosen) -> None:
+    """Rolling shutter of 10 us a row in motion: ignored, with a gyroscope of 0.3 deg/s, and with the rate estimated."""
+    measure_motion.projected()
+    measure_motion.rendered(chosen.measurement)
+
+
 SECTIONS: dict[str, Callable[[Chosen], None]] = {
-    section.__name__: section for section in (waves, codes, flicker, burst_cost)
+    section.__name__: section for section in (waves, codes, flicker, burst_cost, motion)
 }
 
 

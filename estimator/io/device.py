@@ -505,8 +505,8 @@ class Part:
 class LineGains(Protocol):
     """Gain of an LED at each line of the sensor: the mean of its wave, of mean 1, over the line's exposure."""
 
-    def __call__(self, lines: NDArray[np.int64]) -> Floats:
-        """Gains (n,) at lines (n,), counted in readout order from 0 on."""
+    def __call__(self, lines: Floats) -> Floats:
+        """Gains (n,) at lines (n,), counted in readout order from 0 on; between two whole lines too."""
         ...
 
 

@@ -1,8 +1,9 @@
 """Perspective-n-point: position from LEDs and their pixels alone, without gravity. Baseline: OpenCV defaults.
 
 Centroids stand for the images of the LEDs' centres, from which they differ slightly
-(`estimator.solvers.reprojection`), and all have equal weight. The covariance is that of such a fit
-(`estimator.solvers.ordinary_covariance`).
+(`estimator.solvers.observations`), and all have equal weight. The covariance is that of such a fit
+(`estimator.solvers.ordinary_covariance`). With a rolling shutter the turns that the gyroscope says are undone first;
+the rest of the motion is not fitted, but its prior counts in the covariance (`estimator.solvers.shutter_motion`).
 """
 
 from collections.abc import Sequence
@@ -12,14 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from estimator.camera.motion import turned_back
 from estimator.camera.pose import Pose
 from estimator.camera.undistort import pinhole_pixels
 from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame, normalized
 from estimator.io.records import is_covariance
 from estimator.methods.variant import Estimate, Variant
+from estimator.solvers.observations import observe
 from estimator.solvers.ordinary_covariance import ordinary_covariance
-from estimator.solvers.reprojection import observe
+from estimator.solvers.shutter_motion import motion_prior
 from estimator.solvers.trilateration import check_pattern
 from estimator.spots.correspondences import centroids_px, find_correspondences, led_positions_m
 from estimator.spots.identify import Correspondence
@@ -59,6 +62,9 @@ def fit_correspondences(
 ) -> Estimate:
     """The estimate from identified spots by OpenCV `methods`; of the frame, the camera is used."""
     pixels = pinhole_pixels(centroids_px(correspondences), frame.camera)
+    if (prior := motion_prior(frame)) is not None:
+        times_s = frame.camera.times_s(*centroids_px(correspondences).T)
+        pixels = frame.camera.to_pixels(turned_back(frame.camera.normalized(pixels), prior.velocity, times_s))
     pose = pose_from_pixels(led_positions_m(correspondences), pixels, frame.camera.matrix(), methods)
     covariance_m2 = ordinary_covariance(observe(frame, correspondences), pose)
     return Estimate(

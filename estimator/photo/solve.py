@@ -23,7 +23,7 @@ from estimator.methods import gravity_fit, pnp, up2p
 from estimator.methods.gravity_fit import initial_poses
 from estimator.methods.variant import Estimate
 from estimator.photo.led_table import LedTable, Mirror, mirror_signs
-from estimator.solvers.reprojection import observe
+from estimator.solvers.observations import observe
 from estimator.solvers.robust_fit import minima
 from estimator.spots.detect import Spot
 from estimator.spots.identify import Correspondence

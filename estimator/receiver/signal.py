@@ -152,8 +152,8 @@ class WaveGains:
     row_time_s: float
     exposure_s: float
 
-    def __call__(self, lines: Ints) -> Floats:
-        """Gains (n,) at lines (n,), counted in readout order from 0 on."""
+    def __call__(self, lines: Floats) -> Floats:
+        """Gains (n,) at lines (n,), counted in readout order from 0 on; between two whole lines too."""
         start_s = self.frame_start_s + np.asarray(lines, dtype=np.float64) * self.row_time_s
         return self.wave.gains(np.asarray(start_s), self.exposure_s)
 
