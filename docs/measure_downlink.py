@@ -3,7 +3,9 @@
     python docs/measure_downlink.py [SECTION ...]
 
 Sections: `waves` (integrals of the waves against numerical ones), `codes` (parts of codes that are found twice),
-`flicker` (modulation against IEEE 1789), `burst_cost` (time of a further frame of a burst).
+`flicker` (modulation against IEEE 1789), `burst_cost` (time of a further frame of a burst),
+`motion` (positions by a rolling shutter in motion), `striped` (centres of striped LED images), `tones` (frequencies of
+LED images), `photograph` (a real one; its path is given by --photograph).
 """
 
 import argparse
@@ -13,6 +15,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import perf_counter
 
+import measure_motion
+import measure_striped
 import numpy as np
 from measure import Measurement, heading, number, row
 from numpy.typing import NDArray
@@ -53,6 +57,7 @@ class Chosen:
     """What the command line asks for."""
 
     measurement: Measurement
+    photographs: Sequence[Path] = ()
 
 
 def waves(chosen: Chosen) -> None:
@@ -147,8 +152,29 @@ def burst_cost(chosen: Chosen) -> None:
         row(name, BURSTS, *own, f"{np.median(ratios):.2f} ({ratios.min():.2f} to {ratios.max():.2f})")
 
 
+def motion(chosen: Chosen) -> None:
+    """Rolling shutter of 10 us a row in motion: ignored, with a gyroscope of 0.3 deg/s, and with the rate estimated."""
+    measure_motion.projected()
+    measure_motion.rendered(chosen.measurement)
+
+
+def striped(chosen: Chosen) -> None:
+    """Centres of striped LED images, px: by edges, by a plain centroid, and of the same images without stripes."""
+    measure_striped.print_centres(chosen.measurement)
+
+
+def tones(chosen: Chosen) -> None:
+    """Frequencies of tones in an LED image."""
+    measure_striped.print_tones()
+
+
+def photograph(chosen: Chosen) -> None:
+    """A real photograph of five modulated LEDs (Luxapose), as given by --photograph; and refusals."""
+    measure_striped.print_photograph(chosen.photographs, chosen.measurement.out)
+
+
 SECTIONS: dict[str, Callable[[Chosen], None]] = {
-    section.__name__: section for section in (waves, codes, flicker, burst_cost)
+    section.__name__: section for section in (waves, codes, flicker, burst_cost, motion, striped, tones, photograph)
 }
 
 
@@ -158,12 +184,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("sections", nargs="*", metavar="SECTION", help=f"of {', '.join(SECTIONS)}; default: all")
     parser.add_argument("--out", type=Path, default=Path("out/measure"), help="folder of the datasets")
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--photograph", type=Path, action="append", default=[], help="may be repeated")
     asked = parser.parse_args(arguments)
     unknown = [name for name in asked.sections if name not in SECTIONS]
     if unknown:
         parser.error(f"SECTION {unknown[0]}: unknown; allowed: {', '.join(SECTIONS)}")
     asked.out.mkdir(parents=True, exist_ok=True)
-    chosen = Chosen(Measurement(asked.out, asked.workers))
+    chosen = Chosen(Measurement(asked.out, asked.workers), asked.photograph)
     for name in asked.sections or SECTIONS:
         print(f"\n## {name}: {SECTIONS[name].__doc__}", flush=True)
         SECTIONS[name](chosen)

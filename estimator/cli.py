@@ -1,4 +1,4 @@
-"""Command line `estimator variants | run | score | compare | report | levels`, a thin client of the package.
+"""Command line `estimator variants | run | score | compare | report | levels | photo`, a thin client of the package.
 
 Errors are one line on stderr and exit code 2. A command loads the modules that it needs when it runs, so that
 `estimator --help` loads neither OpenCV nor SciPy.
@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from io import TextIOWrapper
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, CycloptsError, Parameter
 
@@ -217,6 +217,101 @@ def levels(*datasets: Annotated[Path, Parameter(required=True)], out: Path) -> N
     print(out)
 
 
+@app.command
+def photo(
+    *images: Annotated[Path, Parameter(required=True)],
+    leds: Path,
+    camera: Path | None = None,
+    units: Literal["m", "cm", "mm", "in", "ft"] | None = None,
+    mirror: Literal["auto", "x", "y", "none"] = "auto",
+    exposure: str | None = None,
+    focal_px: float | None = None,
+    tone: Literal["srgb", "linear", "gamma"] = "srgb",
+    orientation: Literal["stored", "upright"] = "stored",
+    readout: Literal["auto", "rows", "columns"] = "auto",
+    line_rate: float | None = None,
+    spots: Path | None = None,
+    gravity: Annotated[str | None, Parameter(allow_leading_hyphen=True)] = None,
+    tilt: Annotated[str | None, Parameter(allow_leading_hyphen=True)] = None,
+    level: float | None = None,
+    attitude_sigma: float | None = None,
+    centroid_sigma: float | None = None,
+    truth: Annotated[str | None, Parameter(allow_leading_hyphen=True)] = None,
+    overlay: Path | None = None,
+    save: Path | None = None,
+) -> None:
+    """Locate the camera of photographs of modulated LEDs, and draw what was found.
+
+    Parameters
+    ----------
+    images
+        Pictures: JPEG, PNG, TIFF, or DNG (with rawpy).
+    leds
+        LED map, CSV or JSON: x, y, z of each LED, and if known id, frequency_hz, radius or side.
+    camera
+        Calibration: YAML by OpenCV, ROS (camera_info) or Kalibr, or a NumPy .npz. Without one, --focal-px or EXIF.
+    units
+        Unit of the map; overrides the file's. Default: the file's, or m.
+    mirror
+        Axis of the map to reverse where its axes are left-handed; auto finds out.
+    exposure
+        Exposure time: seconds, 1/8000, 60us or 0.06ms. Default: EXIF's.
+    focal_px
+        Focal length in pixels of the picture, in place of a calibration.
+    tone
+        Curve by which the file stores light; gamma is 2.2.
+    orientation
+        Pixels as stored, or turned upright by EXIF's orientation. A calibration is of stored pixels.
+    readout
+        What the lines of the rolling shutter are; auto finds out.
+    line_rate
+        Lines that the sensor reads a second: identities come from the LEDs' tones.
+    spots
+        Identities by hand, CSV or JSON: led, u_px, v_px of each, near the lamp.
+    gravity
+        x,y,z: direction up in the picture's axes (right, down, forward), as an accelerometer reads it.
+    tilt
+        tilt_x,tilt_y of the camera, degrees.
+    level
+        The camera looked straight up, with this standard deviation of each tilt, degrees.
+    attitude_sigma
+        Standard deviation of each tilt with --gravity or --tilt, degrees. Default: 1.
+    centroid_sigma
+        Standard deviation of each coordinate of a centroid beside its noise, pixels. Default: by the residuals.
+    truth
+        x,y,z: true position in the map's units, to print the errors.
+    overlay
+        The overlay to write, PNG, or a folder for several pictures. Default: IMAGE_spots.png in the current folder.
+    save
+        Folder of a dataset to write (datasets/FORMAT.md).
+    """
+    from estimator.photo.session import PhotoRequest, run_photo
+
+    request = PhotoRequest(
+        images=images,
+        leds=leds,
+        camera=camera,
+        units=units,
+        mirror=mirror,
+        exposure=exposure,
+        focal_px=focal_px,
+        tone=tone,
+        orientation=orientation,
+        readout=readout,
+        line_rate=line_rate,
+        spots=spots,
+        gravity=gravity,
+        tilt=tilt,
+        level=level,
+        attitude_sigma=attitude_sigma,
+        centroid_sigma=centroid_sigma,
+        truth=truth,
+        overlay=overlay,
+        save=save,
+    )
+    run_photo(request, print, _print_table)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code; an error is one line on stderr, without a traceback."""
     for stream in (sys.stdout, sys.stderr):
@@ -279,6 +374,8 @@ def _print_scores(scores: Scores) -> None:
         tables.append((title, cells.LIMIT_HEADERS, cells.limit_cells, cells.LIMIT_NOTE))
     if any(map(cells.has_groups, variants)):
         tables.append(("by device and map", cells.GROUP_HEADERS, cells.group_cells, cells.GROUP_NOTE))
+    if any(of_variant.downlink for of_variant in variants):
+        tables.append(("identities", cells.IDENTITY_HEADERS, cells.identity_cells, cells.IDENTITY_NOTE))
     if any(of_variant.failed for of_variant in variants):
         tables.append(("failed frames by good LEDs", cells.LOST_HEADERS, cells.lost_cells, cells.LOST_NOTE))
     for title, headers, of_variant, note in tables:

@@ -129,7 +129,7 @@ def write_exr(path: Path, image_dn: NDArray[np.uint32]) -> str:
 
 
 SPOT = pa.struct([("led", pa.int64()), ("u_px", pa.float64()), ("v_px", pa.float64())])
-TRUTH_LED = pa.struct([*SPOT, pa.field("visible_fraction", pa.float64())])
+TRUTH_LED = pa.struct([*SPOT, pa.field("visible_fraction", pa.float64()), pa.field("bits", pa.string())])
 FRAMES_SCHEMA = pa.schema(
     [
         ("frame", pa.int64()),
@@ -143,6 +143,9 @@ FRAMES_SCHEMA = pa.schema(
         ("accelerometer_m_s2", pa.list_(pa.float64(), 3)),
         ("spots", pa.list_(SPOT)),
         ("device", pa.int64()),
+        ("burst", pa.int64()),
+        ("start_s", pa.float64()),
+        ("gyro_rad_s", pa.list_(pa.float64(), 3)),
     ]
 )
 TRUTH_SCHEMA = pa.schema(
@@ -199,6 +202,8 @@ def write_dataset(
                 "accelerometer_m_s2": view.gravity_m_s2.tolist(),
                 "spots": [{"led": 10 + k, "u_px": rough[k, 0], "v_px": rough[k, 1]} for k in seen],
                 "device": 0,
+                "burst": index,
+                "start_s": 0.0,
             }
         )
         truth.append(
@@ -249,6 +254,7 @@ def description(view: View, frame_count: int, leds_m: Array, radius_m: float) ->
                 "R_cam_rig": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
                 "offset_m": [0.0, 0.0, 0.0],
                 "uncertainty": None,
+                "shutter": {"kind": "global"},
             }
         },
         "sensor": {
@@ -260,6 +266,8 @@ def description(view: View, frame_count: int, leds_m: Array, radius_m: float) ->
         "accelerometer": {"kind": "tilt-error", "error_deg": 0.0, "device_error_deg": None, "shot_error_deg": None},
         "luminaires": [],
         "map_datum": None,
+        "gyroscope": None,
+        "downlink": None,
         "led_map": [
             {
                 **{"id": 10 + k, "position_m": led.tolist(), "radius_m": radius_m, "shape": "disc"},

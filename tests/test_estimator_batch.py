@@ -10,7 +10,7 @@ import pytest
 from estimator_synthetic import small_dataset
 
 from estimator.errors import EstimationFailure
-from estimator.evaluate.batch import Observed, estimate_dataset, estimate_device, estimate_frame, estimate_shot, shots
+from estimator.evaluate.batch import Observed, estimate_burst, estimate_dataset, estimate_device, estimate_frame, shots
 from estimator.io.dataset import Dataset, read_dataset, read_frame
 from estimator.io.device import DeviceFrame
 from estimator.io.estimates import EstimateRow
@@ -27,7 +27,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     table = pq.read_table(folder / "frames.parquet")
     rows = table.to_pylist()
     for row, shot in zip(rows, (0, 0, 1), strict=True):
-        row["shot"] = shot
+        row["shot"] = row["burst"] = shot
     pq.write_table(table.from_pylist(rows, table.schema), folder / "frames.parquet")
     return folder
 
@@ -128,7 +128,7 @@ def test_a_frame_that_cannot_be_read_fails_and_is_no_other_camera(dataset: Datas
         others.append(len(frame.other_cameras))
         return Estimate(HERE)
 
-    rows = estimate_shot(dataset, (dataset.frames[0], lost), [Variant("a", "", counts)]).rows["a"]
+    rows = estimate_burst(dataset, (dataset.frames[0], lost), [Variant("a", "", counts)]).rows["a"]
     assert [row.status for row in rows] == ["ok", "failed"]
     assert rows[1].reason.startswith("read: frames/none.exr: ")
     assert rows[1].time_s == 0

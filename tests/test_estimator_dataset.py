@@ -21,6 +21,7 @@ from hypothesis import strategies as st
 
 from estimator.errors import InputError
 from estimator.io.dataset import FrameRecord, read_dataset, read_frame
+from estimator.io.device import Identity
 from estimator.io.estimates import EstimateRow, LedRange, estimates_path, read_estimates, write_estimates
 
 Rows = list[dict[str, Any]]
@@ -106,7 +107,10 @@ def test_only_the_scorer_knows_of_the_truth() -> None:
     ] == ["evaluate/score.py"]
 
 
-JSON_KEYS = ["format", "version", "name", "frame_count", "cameras", "sensor", "accelerometer", "led_map", "room_m"]
+JSON_KEYS = [
+    *("format", "version", "name", "frame_count", "cameras", "sensor", "accelerometer", "led_map", "room_m"),
+    *("gyroscope", "downlink"),
+]
 
 
 @pytest.mark.parametrize("key", JSON_KEYS)
@@ -121,6 +125,7 @@ def test_a_missing_key_is_named(folder: Path, key: str) -> None:
         ("luminaires", lambda c: c),
         ("map_datum", lambda c: c),
         ("cameras.main.uncertainty", lambda c: c["cameras"]["main"]),
+        ("cameras.main.shutter", lambda c: c["cameras"]["main"]),
         ("sensor.crosstalk", lambda c: c["sensor"]),
         ("accelerometer.device_error_deg", lambda c: c["accelerometer"]),
         ("led_map.3.radius_sigma_m", lambda c: c["led_map"][3]),
@@ -133,6 +138,34 @@ def test_what_a_device_does_not_state_is_null_and_not_missing(
     """Keys that `estimator.frame` may lack; every key of dataset.json is always present."""
     change_json(folder, lambda c: place(c).pop(key.rpartition(".")[2]))
     assert refused(folder).endswith(f"dataset.json: {key}: Field required")
+
+
+CODES: dict[str, Any] = {
+    **{"send": "code", "chip_us": 25.0, "depth": 1.0, "clock_error": 1e-4},
+    **{"leds": [10, 11], "codes": ["0011", "0101"]},
+}
+TONES: dict[str, Any] = {
+    **{"send": "tone", "duty": 0.5, "depth": 1.0, "clock_error": 0.0},
+    **{"leds": [12, 13], "frequencies_hz": [1500.0, 1500.0]},
+}
+PACKETS: dict[str, Any] = {
+    **{"send": "packet", "chip_us": 50.0, "depth": 0.5, "clock_error": 1e-4, "preamble": "00011011000111"},
+    **{"polynomial": 15717, "coordinate_bits": 13, "coordinate_unit_m": 0.001},
+    **{"delays_chips": [5, 0], "offsets_m": [[-0.07, 0.0], [0.07, 0.0]], "led": {"shape": "disc", "radius_m": 0.01}},
+}
+
+
+def sending(*transmitters: dict[str, Any], demodulation: str = "given") -> dict[str, Any]:
+    return {"demodulation": demodulation, "transmitters": copy.deepcopy(list(transmitters))}
+
+
+def rolling(content: dict[str, Any], **changes: Any) -> None:
+    shutter = {"kind": "rolling", "row_time_us": 10.0, "direction": "down", **changes}
+    content["cameras"]["main"]["shutter"] = {key: value for key, value in shutter.items() if value is not None}
+
+
+def without(entry: dict[str, Any], key: str) -> dict[str, Any]:
+    return {name: value for name, value in entry.items() if name != key}
 
 
 LENS = {"k1": -0.05, "k2": 0.0, "k3": 0.0, "p1": 0.0, "p2": 0.0}
@@ -170,6 +203,38 @@ WRONG_VALUES: list[tuple[str, Callable[[dict[str, Any]], object]]] = [
     ("led_map.2.position_m", lambda c: c["led_map"][2].update(position_m=[1, 2])),
     ("led_map.0.radius_m", lambda c: c["led_map"][0].update(radius_m=float("inf"))),
     ("room_m", lambda c: c.update(room_m=[1, 2, -3])),
+    ("cameras.main.shutter.kind", lambda c: c["cameras"]["main"].update(shutter={"kind": "leaf"})),
+    ("cameras.main.shutter.row_time_us: Field required", lambda c: rolling(c, row_time_us=None)),
+    ("cameras.main.shutter: Value error, row_time_us has to be more than 0", lambda c: rolling(c, row_time_us=0)),
+    ("cameras.main.shutter.direction", lambda c: rolling(c, direction="diagonal")),
+    ("gyroscope.bias_rad_s", lambda c: c.update(gyroscope={"noise_rad_s": 0.01, "bias_rad_s": -1.0})),
+    ("downlink.demodulation", lambda c: c.update(downlink=sending(CODES, demodulation="guessed"))),
+    ("downlink.transmitters", lambda c: c.update(downlink=sending())),
+    ("downlink.transmitters.0", lambda c: c.update(downlink=sending({**CODES, "send": "morse"}))),
+    ("downlink.transmitters.0.chip_us", lambda c: c.update(downlink=sending({**CODES, "chip_us": 0}))),
+    ("downlink.transmitters.0.depth", lambda c: c.update(downlink=sending({**CODES, "depth": 1.5}))),
+    ("downlink.transmitters.0.codes", lambda c: c.update(downlink=sending(without(CODES, "codes")))),
+    ("downlink.transmitters.0.codes.1", lambda c: c.update(downlink=sending({**CODES, "codes": ["01", "02"]}))),
+    ("codes have to be of one length", lambda c: c.update(downlink=sending({**CODES, "codes": ["01", "011"]}))),
+    ("a code needs chips of both kinds", lambda c: c.update(downlink=sending({**CODES, "codes": ["01", "11"]}))),
+    ("codes: needed one for each of leds", lambda c: c.update(downlink=sending({**CODES, "codes": ["01"]}))),
+    ("downlink: names LED 99, which is not in", lambda c: c.update(downlink=sending({**CODES, "leds": [10, 99]}))),
+    ("an LED is in leds twice", lambda c: c.update(downlink=sending(CODES, {**TONES, "leds": [11, 12]}))),
+    ("downlink.transmitters.0.duty", lambda c: c.update(downlink=sending({**TONES, "duty": 1.0}))),
+    ("frequencies_hz: needed one", lambda c: c.update(downlink=sending({**TONES, "frequencies_hz": [1.5e3]}))),
+    ("frequencies_hz.1", lambda c: c.update(downlink=sending({**TONES, "frequencies_hz": [1500.0, 0.0]}))),
+    ("transmitters.0.polynomial", lambda c: c.update(downlink=sending({**PACKETS, "polynomial": 65536}))),
+    ("transmitters.0.preamble", lambda c: c.update(downlink=sending({**PACKETS, "preamble": "0012"}))),
+    ("transmitters.0.coordinate_bits", lambda c: c.update(downlink=sending({**PACKETS, "coordinate_bits": 17}))),
+    ("transmitters.0.delays_chips.0", lambda c: c.update(downlink=sending({**PACKETS, "delays_chips": [-5, 0]}))),
+    ("offsets_m: needed one for each", lambda c: c.update(downlink=sending({**PACKETS, "offsets_m": [[0, 0]]}))),
+    ("transmitters.0.led.radius_m", lambda c: c.update(downlink=sending({**PACKETS, "led": {"shape": "disc"}}))),
+    ("led_map: null needs a downlink", lambda c: c.update(led_map=None)),
+    ("led_map: null needs a downlink", lambda c: c.update(led_map=None, downlink=sending(PACKETS))),
+    (
+        "names LED 10, but led_map is null",
+        lambda c: c.update(led_map=None, downlink=sending(CODES, PACKETS, demodulation="pixels")),
+    ),
 ]
 
 
@@ -185,6 +250,12 @@ def test_a_wrong_value_is_named(folder: Path, key: str, change: Callable[[dict[s
 def test_all_wrong_types_everywhere_in_the_json_are_input_errors(folder: Path) -> None:
     """Each value of the document replaced by each of a few others: read or refused, never another exception."""
     original = json.loads((folder / "dataset.json").read_text())
+    rolling(original)
+    original.update(
+        gyroscope={"noise_rad_s": 0.01, "bias_rad_s": 0.02},
+        downlink=sending(CODES, TONES, PACKETS),
+        led_map=original["led_map"][:5],
+    )
     places: list[tuple[Any, ...]] = []
 
     def walk(node: Any, path: tuple[Any, ...]) -> None:
@@ -224,6 +295,13 @@ WRONG_ROWS: list[tuple[str, Callable[[Rows], object]]] = [
     ("0.file", lambda rows: rows[0].update(file="../frames/000000.exr")),
     ("0.file", lambda rows: rows[0].update(file="/etc/passwd")),
     ("0.file", lambda rows: rows[0].update(file=None)),
+    ("burst 3", lambda rows: rows[1].update(burst=3)),
+    ("its shot 1 is of burst 1", lambda rows: rows[2].update(shot=1)),
+    ("burst 0 is of device 0", lambda rows: rows[1].update(burst=0, device=1)),
+    ("start_s 0.0; has to be later", lambda rows: rows[1].update(burst=0)),
+    ("0.start_s", lambda rows: rows[0].update(start_s=float("nan"))),
+    ("0.gyro_rad_s", lambda rows: rows[0].update(gyro_rad_s=[0.0, 0.0, float("inf")])),
+    ("gyro_rad_s is given, but gyroscope is null", lambda rows: rows[0].update(gyro_rad_s=[0.0, 0.0, 0.1])),
 ]
 
 
@@ -240,12 +318,48 @@ def test_a_wrong_row_is_named(folder: Path, words: str, change: Callable[[Rows],
 
 def test_a_missing_or_retyped_column_is_named(folder: Path) -> None:
     table = pq.read_table(folder / "frames.parquet")
-    for column in ("exposure_s", "device"):
+    for column in ("exposure_s", "device", "burst", "start_s", "gyro_rad_s"):
         pq.write_table(table.drop_columns([column]), folder / "frames.parquet")
         assert f"column '{column}'" in refused(folder)
     numbers = table.set_column(0, "frame", table["frame"].cast(pa.float64()))
     pq.write_table(numbers, folder / "frames.parquet")
     assert "column 'frame' has type double, needed int64" in refused(folder)
+
+
+def test_what_the_leds_send_is_read_as_written(folder: Path) -> None:
+    """Every field of a downlink, the readings of a gyroscope, and two bursts of which the first has two shots."""
+    pixels = sending(CODES, TONES, PACKETS, demodulation="pixels")
+
+    def modulated(content: dict[str, Any]) -> None:
+        rolling(content, direction="left", row_time_us=12.5)
+        content.update(gyroscope={"noise_rad_s": 0.01, "bias_rad_s": 0.02}, downlink=pixels)
+
+    change_json(folder, modulated)
+    message = refused(folder)
+    assert "frame 0: 20 spots, but they have to be empty" in message
+    times = [(0, 1.5), (0, 1.75), (1, 0.25)]
+    change_rows(
+        folder,
+        lambda rows: [
+            row.update(spots=[], burst=burst, start_s=start_s, gyro_rad_s=[0.1, 0.2, float(burst)])
+            for row, (burst, start_s) in zip(rows, times, strict=True)
+        ],
+    )
+    frame = read_frame(read_dataset(folder), 1)
+    assert (frame.burst, frame.start_s, frame.gyro_rad_s) == (0, 1.75, (0.1, 0.2, 0.0))
+    assert frame.gyroscope is not None
+    assert frame.downlink is not None
+    assert (frame.gyroscope.noise_rad_s, frame.gyroscope.bias_rad_s) == (0.01, 0.02)
+    # Through JSON, in which arrays are lists.
+    assert json.loads(frame.downlink.model_dump_json()) == pixels
+    assert frame.camera.shutter.model_dump() == {"kind": "rolling", "row_time_us": 12.5, "direction": "left"}
+
+
+def test_a_map_may_be_left_to_the_packets(folder: Path) -> None:
+    downlink = sending(PACKETS, demodulation="pixels")
+    change_json(folder, lambda c: c.update(led_map=None, downlink=downlink))
+    change_rows(folder, lambda rows: [row.update(spots=[]) for row in rows])
+    assert read_frame(read_dataset(folder), 0).leds == {}
 
 
 def test_lists_of_any_length_type_are_read(folder: Path) -> None:
@@ -381,6 +495,10 @@ ROWS = (
         position_m=None,
         ranges=(LedRange(led=10, range_m=3.5),),
         time_s=0.2,
+        identities=(
+            Identity(led=10, u_px=1.5, v_px=2.5, correlation=0.99, bits="01-1", position_m=(1.0, 2.0, 3.5)),
+            Identity(led=None, u_px=7.0, v_px=8.0, correlation=0.5),
+        ),
     ),
 )
 
@@ -399,6 +517,8 @@ def test_estimates_come_back_as_written_in_the_formats_types(folder: Path) -> No
         "ambiguous": "bool",
         "ranges": "list<element: struct<led: int64, range_m: double>>",
         "time_s": "double",
+        "identities": "list<element: struct<led: int64, u_px: double, v_px: double, correlation: double, "
+        "bits: string, position_m: list<element: double>>>",
     }
     assert [entry.name for entry in path.parent.iterdir()] == ["some.parquet"]
 
@@ -427,8 +547,8 @@ def test_a_frame_is_read_with_those_of_the_rig_s_other_cameras(folder: Path) -> 
     change_json(folder, lambda c: c["cameras"].update(right=c["cameras"]["main"]))
     records = pq.read_table(folder / "frames.parquet")
     rows = records.to_pylist()
-    rows[1].update(shot=0, camera="right")
-    rows[2].update(shot=1)
+    rows[1].update(shot=0, burst=0, camera="right")
+    rows[2].update(shot=1, burst=1)
     pq.write_table(pa.Table.from_pylist(rows, records.schema), folder / "frames.parquet")
     dataset = read_dataset(folder)
     first, second = (read_frame(dataset, number) for number in (0, 1))
@@ -450,7 +570,9 @@ def test_each_frame_of_a_shot_has_all_the_others_and_itself_not(folder: Path) ->
         }
 
     change_json(folder, mounted)
-    change_rows(folder, lambda rows: [row.update(shot=0, camera=n) for row, n in zip(rows, focal_px, strict=True)])
+    change_rows(
+        folder, lambda rows: [row.update(shot=0, burst=0, camera=n) for row, n in zip(rows, focal_px, strict=True)]
+    )
     dataset = read_dataset(folder)
     for number, own in enumerate(focal_px.values()):
         frame = read_frame(dataset, number)

@@ -14,6 +14,7 @@ from estimator.io.device import (
     MapDatum,
     Part,
     Sensor,
+    Shutter,
     SquareLed,
     depth_problem,
     region_of,
@@ -185,3 +186,17 @@ def test_sigmas_are_in_metres_radians_and_parts() -> None:
     assert luminaire.sigmas() == pytest.approx([1e-3, 2e-3, 3e-3, np.pi / 10, np.pi / 5, np.pi / 2])
     datum = MapDatum(sigma_m=(1e-3, 2e-3, 3e-3), scale_sigma_ppm=20.0)
     assert datum.sigmas() == pytest.approx([1e-3, 2e-3, 3e-3, 2e-5])
+
+
+@pytest.mark.parametrize(
+    ("direction", "line", "time_us"),
+    [("down", 6.5, 25.0), ("up", 1.5, -25.0), ("right", 2.25, -27.5), ("left", 7.75, 27.5)],
+)
+def test_the_line_and_the_time_of_a_pixel_by_hand(direction: str, line: float, time_us: float) -> None:
+    """Pixel (2.25, 6.5) of a sensor of 10 columns and 8 rows, 10 us a line: relative to the middle, line 4 or 5."""
+    shutter = Shutter.model_validate({"kind": "rolling", "row_time_us": 10.0, "direction": direction})
+    camera = CAMERA.model_copy(update={"shutter": shutter})
+    u_px, v_px = np.array([2.25]), np.array([6.5])
+    assert camera.line_of(u_px, v_px) == pytest.approx([line])
+    assert camera.times_s(u_px, v_px) == pytest.approx([time_us * 1e-6])
+    assert CAMERA.times_s(u_px, v_px) == [0.0]

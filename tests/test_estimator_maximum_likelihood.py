@@ -17,7 +17,9 @@ from estimator.errors import EstimationFailure
 from estimator.io.device import Accelerometer, Camera, DecodedSpot, DeviceFrame, DiscLed, Part, Sensor
 from estimator.methods import maximum_likelihood
 from estimator.methods.gravity_fit import gravity_fit
-from estimator.methods.maximum_likelihood import Maximum, Start, gravity_of, maximize, ml, start_at_spots
+from estimator.methods.maximum_likelihood import Maximum, maximize, ml
+from estimator.pixels import search
+from estimator.pixels.initial import Start, gravity_of, start_at_spots
 from estimator.pixels.led_model import ImageState
 from estimator.pixels.led_pixels import gather_led_pixels, leds_in_view
 from estimator.pixels.nuisances import NO_COMPONENTS, SIZE, Gravity, Nuisances, Priors
@@ -276,10 +278,8 @@ def test_the_covariance_is_that_of_small_changes_of_the_answer(monkeypatch: pyte
     start, gravity = Pose(np.array(view.position_m), view.R_cam_world), gravity_of(frame)
     state = ImageState.as_told(start, frame.camera, 2)
     view_of_leds = leds_in_view(frame, state, SURE, np.zeros(2), np.zeros(2, dtype=bool))
-    pixels = gather_led_pixels(
-        frame, view_of_leds, maximum_likelihood._parameters(Priors.of(frame, tuple(leds.values())))
-    )
-    monkeypatch.setattr(maximum_likelihood, "CONVERGED_STEP2", 1e-10)
+    pixels = gather_led_pixels(frame, view_of_leds, search.image_parameters(Priors.of(frame, tuple(leds.values()))))
+    monkeypatch.setattr(search, "CONVERGED_STEP2", 1e-10)
 
     def answer_m(electrons: Floats, gravity: Gravity = gravity) -> Floats:
         changed = replace(pixels, electrons=electrons)

@@ -11,12 +11,8 @@ from estimator_synthetic import Array, View, grid, view_of
 from estimator.camera.pose import Pose
 from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame, Distortion
-from estimator.solvers.reprojection import (
-    centroid_images,
-    corrected_for_eccentricity,
-    fit,
-    observe,
-)
+from estimator.solvers.observations import centroid_images, corrected_for_eccentricity, observe
+from estimator.solvers.reprojection import fit
 from estimator.spots.identify import Correspondence
 
 RADIUS_M = 0.03

@@ -12,7 +12,8 @@ from estimator.camera.pose import Pose, rotation
 from estimator.errors import EstimationFailure
 from estimator.methods.gravity_fit import _from_triples as from_triples
 from estimator.methods.gravity_fit import agreement, ambiguous
-from estimator.solvers.reprojection import Fit, Observations, observe
+from estimator.solvers.observations import Observations, observe
+from estimator.solvers.reprojection import Fit
 from estimator.solvers.robust_fit import Consensus, consensus, minima
 from estimator.solvers.robust_fit import _snooped as data_snooping
 

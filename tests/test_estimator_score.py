@@ -11,17 +11,24 @@ from conftest import copy_of
 
 from estimator.errors import InputError
 from estimator.evaluate.score import Scores, read_or_score, score, score_variant
-from estimator.io.device import DiscLed
 from estimator.io.estimates import EstimateRow, LedRange, write_estimates
 from estimator.io.truth import TrueLed, TruthRow
 
-LEDS = {10: DiscLed(id=10, position_m=(1.0, 2.0, 3.5), radius_m=0.01)}
+LEDS = {10: (1.0, 2.0, 3.5)}
 TRUTH = (1.0, 2.0, 0.5)
 
 
 def truths(count: int, bound_m2: tuple[float, ...] | None = None) -> list[TruthRow]:
     return [
-        TruthRow(frame=frame, position_m=TRUTH, bound_m2=bound_m2, bound_exact_m2=bound_m2, map=0, leds=())
+        TruthRow(
+            frame=frame,
+            position_m=TRUTH,
+            bound_m2=bound_m2,
+            bound_exact_m2=bound_m2,
+            map=0,
+            R_cam_world=(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0),
+            leds=(),
+        )
         for frame in range(count)
     ]
 
@@ -261,7 +268,10 @@ def test_scores_by_device_map_and_good_leds_by_hand() -> None:
         one.model_copy(
             update={
                 "map": of_map,
-                "leds": tuple(TrueLed(led=k, visible_fraction=share) for k, share in enumerate(of_frame)),
+                "leds": tuple(
+                    TrueLed(led=k, u_px=0.0, v_px=0.0, bits=None, visible_fraction=share)
+                    for k, share in enumerate(of_frame)
+                ),
             }
         )
         for one, of_map, of_frame in zip(truths(5), (1, 0, 1, 1, 0), shares, strict=True)

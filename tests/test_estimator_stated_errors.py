@@ -21,8 +21,8 @@ from estimator.io.device import (
 )
 from estimator.methods import gravity_fit, pnp, up2p
 from estimator.methods.variant import Estimate
+from estimator.solvers.observations import observe
 from estimator.solvers.ordinary_covariance import ordinary_covariance
-from estimator.solvers.reprojection import observe
 from estimator.spots.identify import Correspondence
 
 TARGET = (3.0, 2.0, 3.0)

@@ -12,8 +12,8 @@ from estimator.camera.pose import rotation
 from estimator.errors import EstimationFailure
 from estimator.methods.pnp import position_from_pixels
 from estimator.methods.up2p import fit_correspondences, upright_pose
+from estimator.solvers.observations import observe
 from estimator.solvers.ranging import law_of_sines, led_ranges
-from estimator.solvers.reprojection import observe
 from estimator.solvers.trilateration import position_from_ranges
 
 poselib = pytest.importorskip("poselib")

@@ -14,12 +14,14 @@ MIN_ELEVATION_SINE = 1e-3
 MIN_TILT_SIGMA_DEG = 1e-6
 
 
-def tilt_from_gravity(accelerometer_m_s2: tuple[float, float, float]) -> tuple[float, float]:
+def tilt_from_gravity(accelerometer_m_s2: tuple[float, float, float] | None) -> tuple[float, float]:
     """Tilts (tilt_x, tilt_y), radians, from an accelerometer reading (x, y, z) in camera axes.
 
     At rest the reading is `Rx(tilt_x) Ry(tilt_y) (0, 0, +9.80665)`; it does not depend on yaw. Raises
-    EstimationFailure for a reading of zero.
+    EstimationFailure for a reading of zero, and without one.
     """
+    if accelerometer_m_s2 is None:
+        raise EstimationFailure("leveling", "the device has no accelerometer")
     x, y, z = accelerometer_m_s2
     magnitude = float(np.linalg.norm(accelerometer_m_s2))
     if magnitude == 0:

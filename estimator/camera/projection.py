@@ -163,13 +163,15 @@ class ProjectedPoints:
     """Images of n points: `pixels` (n, 2), NaN outside the lens's valid range; `slopes` (n, 2, 6) by the pose.
 
     `p_cam` (n, 3) are the points in camera axes, metres. `relative_illumination` (n,) is the irradiance of the sensor
-    there by a surface of uniform luminance, up to a factor common to the whole sensor.
+    there by a surface of uniform luminance, up to a factor common to the whole sensor. `motion_slopes` (n, 2, 6) are
+    the derivatives by the velocity of a camera with a rolling shutter; None without.
     """
 
     pixels: Floats
     slopes: Floats
     p_cam: Floats
     relative_illumination: Floats
+    motion_slopes: Floats | None = None
 
 
 def project(points_m: Floats, pose: Pose, camera: Camera) -> ProjectedPoints:
@@ -181,10 +183,10 @@ def project(points_m: Floats, pose: Pose, camera: Camera) -> ProjectedPoints:
     slopes = np.empty((len(points_m), 2, POSE_PARAMETERS))
     slopes[:, :, :3] = (to_pixels.reshape(-1, 3) @ -pose.R_cam_world).reshape(-1, 2, 3)
     offset = points_m - pose.position_m
-    for column, rotation_slope in enumerate(_rotation_slopes(pose, camera), start=3):
+    for column, rotation_slope in enumerate(rotation_slopes(pose, camera), start=3):
         rotated = offset @ rotation_slope.T
         slopes[:, :, column] = (to_pixels * rotated[:, None]).sum(axis=2)
-    return ProjectedPoints(camera.to_pixels(image), slopes, p_cam, _relative_illumination(p_cam, jacobian))
+    return ProjectedPoints(camera.to_pixels(image), slopes, p_cam, relative_illumination_of(p_cam, jacobian))
 
 
 def relative_illumination(pixels: Floats, camera: Camera) -> Floats:
@@ -194,10 +196,10 @@ def relative_illumination(pixels: Floats, camera: Camera) -> Floats:
     """
     projection = projection_of(camera)
     rays = projection.unproject(camera.normalized(pixels))
-    return _relative_illumination(rays, projection.project(rays)[1])
+    return relative_illumination_of(rays, projection.project(rays)[1])
 
 
-def _relative_illumination(p_cam: Floats, jacobian: Floats) -> Floats:
+def relative_illumination_of(p_cam: Floats, jacobian: Floats) -> Floats:
     """cos(theta), by which the pupil is foreshortened, times the solid angle that an area of the sensor subtends.
 
     With the rows m1, m2 of the Jacobian, an area across the ray is magnified by (m1 x m2) . p / |p|, and a solid angle
@@ -209,7 +211,7 @@ def _relative_illumination(p_cam: Floats, jacobian: Floats) -> Floats:
         return np.asarray(np.maximum(p_cam[:, 2], 0.0) / distance / area)
 
 
-def _rotation_slopes(pose: Pose, camera: Camera) -> tuple[Floats, Floats, Floats]:
+def rotation_slopes(pose: Pose, camera: Camera) -> tuple[Floats, Floats, Floats]:
     """Derivatives of `R_cam_world = R_cam_rig Rx Ry Rz` by tilt_x, tilt_y and yaw, each (3, 3)."""
     about_x = np.array([[0.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     about_y = np.array([[0.0, 0, -1], [0, 0, 0], [1, 0, 0]])

@@ -1,23 +1,26 @@
-"""Batch estimation: variants over the frames of a dataset, shot by shot and then device by device, timed.
+"""Batch estimation: variants over the frames of a dataset, burst by burst and then device by device, timed.
 
-Every frame gets a row.
+Every frame gets a row. Where identities are not given, the frames of a burst are received together first.
 """
 
 import operator
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import groupby
 
 import numpy as np
 
 from estimator.errors import EstimationFailure, InputError
 from estimator.io.dataset import Dataset, FrameRecord, read_frame
-from estimator.io.device import DeviceFrame, Led
+from estimator.io.device import DeviceFrame, Identity, Led
 from estimator.io.estimates import EstimateRow, LedRange
 from estimator.io.records import MAX_NUMBER, is_covariance
 from estimator.methods.variant import DeviceMethod, Estimate, Variant
+from estimator.receiver.receive import receive_frames
 
+ReadFrame = tuple[FrameRecord, DeviceFrame | EstimationFailure]
+"""A record, and its frame or why it cannot be used."""
 Rows = dict[str, list[EstimateRow]]
 """Rows by variant name, one a frame."""
 
@@ -30,6 +33,9 @@ class Observed:
     device: int
     value: object | EstimationFailure
     time_s: float
+    identities: tuple[Identity, ...] | None = None
+    told: Mapping[int, Led] = field(default_factory=dict)
+    """LEDs that packets told, where the dataset has no map."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +55,8 @@ def estimate_dataset(
     all images. A frame whose image cannot be read fails for every variant, with the reason `read: ...`.
     """
     results = []
-    for records in shots(dataset):
-        results.append(estimate_shot(dataset, records, variants))
+    for records in bursts(dataset):
+        results.append(estimate_burst(dataset, records, variants))
         for _ in records:
             on_frame()
     solved = []
@@ -69,6 +75,18 @@ def steps(variants: Iterable[Variant]) -> int:
 def shots(dataset: Dataset) -> list[tuple[FrameRecord, ...]]:
     """Frames of each shot, in order; they were exposed at once and are estimated together."""
     return [tuple(records) for _, records in groupby(dataset.frames, lambda record: record.shot)]
+
+
+def bursts(dataset: Dataset) -> list[tuple[FrameRecord, ...]]:
+    """Frames that are estimated together, in order: those of a burst if they have to be received, else of a shot."""
+    if not receives(dataset):
+        return shots(dataset)
+    return [tuple(records) for _, records in groupby(dataset.frames, lambda record: record.burst)]
+
+
+def receives(dataset: Dataset) -> bool:
+    """Whether a receiver has to decode the identities of a dataset."""
+    return dataset.downlink is not None and dataset.downlink.demodulation == "pixels"
 
 
 def devices(results: Iterable[ShotResult]) -> list[dict[str, list[Observed]]]:
@@ -92,26 +110,67 @@ def in_order(
     return {name: tuple(by_frame[record.frame] for record in dataset.frames) for name, by_frame in rows.items()}
 
 
-def estimate_shot(dataset: Dataset, records: Sequence[FrameRecord], variants: Sequence[Variant]) -> ShotResult:
-    """Rows for the frames of one shot, and the frames observed for variants that use all frames of a device."""
+def estimate_burst(dataset: Dataset, records: Sequence[FrameRecord], variants: Sequence[Variant]) -> ShotResult:
+    """Rows for the frames of one burst, or shot, and the frames observed for variants that use all of a device.
+
+    Where identities are not given, the frames of each camera are received together, and a frame's share of that time
+    counts as its own.
+    """
+    read = [(record, _read(dataset, record)) for record in records]
+    time_s = 0.0
+    if receives(dataset):
+        start = time.perf_counter()
+        read = _received(read)
+        time_s = (time.perf_counter() - start) / len(read)
     result = ShotResult({}, {})
-    shot = [(record, _read(dataset, record)) for record in records]
+    for _, shot in groupby(read, lambda one: one[0].shot):
+        _estimate_shot(result, tuple(shot), variants, dataset.leds, time_s)
+    return result
+
+
+def _received(read: Sequence[ReadFrame]) -> list[ReadFrame]:
+    """Frames of a burst with what the receiver decoded of those of each camera."""
+    found = {record.frame: frame for record, frame in read}
+    for camera in {record.camera: None for record, _ in read}:
+        frames = {
+            record.frame: frame for record, frame in read if record.camera == camera and isinstance(frame, DeviceFrame)
+        }
+        try:
+            found |= zip(frames, receive_frames(list(frames.values())), strict=True)
+        except EstimationFailure as failure:
+            found |= dict.fromkeys(frames, failure)
+        except Exception as error:
+            found |= dict.fromkeys(frames, EstimationFailure("receive", f"crashed ({type(error).__name__})"))
+    return [(record, found[record.frame]) for record, _ in read]
+
+
+def _estimate_shot(
+    result: ShotResult,
+    shot: Sequence[ReadFrame],
+    variants: Sequence[Variant],
+    leds: Mapping[int, Led],
+    received_s: float,
+) -> None:
+    """Add the rows and observed frames of one shot; `received_s` is the time that each frame's reception took."""
     for record, frame in shot:
         whole = frame
+        identities = frame.identities if isinstance(frame, DeviceFrame) else None
         if isinstance(frame, DeviceFrame):
             others = tuple(other for _, other in shot if isinstance(other, DeviceFrame) and other is not frame)
             whole = replace(frame, other_cameras=others)
         for variant in variants:
             if variant.of_device is not None:
+                told = frame.leds if isinstance(frame, DeviceFrame) and not leds else {}
                 observed = _observed(variant.of_device, whole, record)
+                observed = replace(observed, time_s=observed.time_s + received_s, identities=identities, told=told)
                 result.observed.setdefault(variant.name, []).append(observed)
                 continue
             if isinstance(whole, EstimationFailure):
-                row = _failed(record.frame, whole, dataset.leds, time_s=0.0)
+                row = _failed(record.frame, whole, leds, time_s=0.0)
             else:
                 row = estimate_frame(variant, whole, record.frame)
+            row = row.model_copy(update={"time_s": row.time_s + received_s, "identities": identities})
             result.rows.setdefault(variant.name, []).append(row)
-    return result
 
 
 def estimate_device(dataset: Dataset, observed: Mapping[str, Sequence[Observed]], variants: Sequence[Variant]) -> Rows:
@@ -142,6 +201,7 @@ def _observed(method: DeviceMethod, frame: DeviceFrame | EstimationFailure, reco
 def _solved(method: DeviceMethod, observed: Sequence[Observed], leds: Mapping[int, Led]) -> list[EstimateRow]:
     usable = [one for one in observed if not isinstance(one.value, EstimationFailure)]
     results: dict[int, object] = {one.frame: one.value for one in observed}
+    known = leds or {led: entry for one in observed for led, entry in one.told.items()}
     start = time.perf_counter()
     try:
         found = list(method.solve([one.value for one in usable])) if usable else []
@@ -159,11 +219,12 @@ def _solved(method: DeviceMethod, observed: Sequence[Observed], leds: Mapping[in
         try:
             if isinstance(result, EstimationFailure):
                 raise result
-            rows.append(_ok(one.frame, result, leds, time_s))
+            row = _ok(one.frame, result, known, time_s)
         except EstimationFailure as failure:
-            rows.append(_failed(one.frame, failure, leds, time_s))
+            row = _failed(one.frame, failure, known, time_s)
         except (Exception, SystemExit) as error:
-            rows.append(_failed(one.frame, _crash(error), leds, time_s))
+            row = _failed(one.frame, _crash(error), known, time_s)
+        rows.append(row.model_copy(update={"identities": one.identities}))
     return rows
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from estimator.errors import InputError
+from estimator.evaluate.identities import IdentityScore, score_identities
 from estimator.evaluate.statistics import (
     AgainstBound,
     DeviceScore,
@@ -31,15 +32,16 @@ from estimator.evaluate.statistics import (
 )
 from estimator.io.atomic import write_atomically
 from estimator.io.dataset import Dataset, read_dataset
-from estimator.io.device import AnyLed, Led, LedId
+from estimator.io.device import AnyLed
 from estimator.io.estimates import EstimateRow, read_estimates
-from estimator.io.records import Number, Positive, Row, Size, Triple, first_problem
-from estimator.io.truth import TruthRow, read_truth
+from estimator.io.records import LedId, Number, Positive, Row, Size, Triple, first_problem
+from estimator.io.truth import TruthRow, read_true_map, read_truth
 
 if TYPE_CHECKING:
     import pandas as pd
 
 VERSION = 4
+Position = tuple[float, float, float]
 # Enough for a position without gravity: frames with more are counted with these.
 ENOUGH_LEDS = 4
 
@@ -116,6 +118,7 @@ class VariantScore(Row):
     by_device: tuple[DeviceScore, ...]
     by_map: tuple[MapScore, ...]
     by_good_leds: tuple[GoodLeds, ...]
+    downlink: IdentityScore | None
     median_time_s: Size | None
     rows: tuple[FrameScore, ...]
 
@@ -126,7 +129,7 @@ class Scores(Row):
     format: Literal["estimator-scores"] = "estimator-scores"
     version: Literal[4] = 4
     dataset: str
-    room_m: tuple[Positive, Positive, Positive]
+    room_m: tuple[Positive, Positive, Positive] | None
     led_map: tuple[AnyLed, ...]
     variants: tuple[VariantScore, ...]
 
@@ -144,7 +147,7 @@ class Scores(Row):
         -------
         pandas.DataFrame
             One row a variant. The columns are the keys of a variant in scores.json (datasets/FORMAT.md) without the
-            lists (`failures`, `by_device`, `by_map`, `by_good_leds`, `rows`); a summary gives a column for each of its
+            lists (`failures`, `by_...`, `rows`); a summary gives a column for each of its
             keys, `error_3d_median_m`, `nees_mean` and so on. Units stand in the names. Missing values are NaN, and
             infinite ones of `of_all` infinity.
 
@@ -198,12 +201,13 @@ SUMMARIES: dict[str, type[Row]] = {
     "against_exact_bound": AgainstBound,
     "nees": Nees,
     "nees_by_map": Nees,
+    "downlink": IdentityScore,
 }
 """Keys of a variant that hold several values."""
 
 
-LISTS = ("failures", "by_device", "by_map", "by_good_leds", "rows")
-"""Keys of a variant that hold any number of values, which have no place in a row."""
+LISTS = ("failures", "by_device", "by_map", "by_good_leds", "rows", "by_rows", "by_distance", "by_tilt")
+"""Keys of a variant, or of its `downlink`, that hold any number of values, which have no place in a row."""
 
 
 def _summary_row(score: VariantScore | None) -> dict[str, object]:
@@ -216,7 +220,7 @@ def _summary_row(score: VariantScore | None) -> dict[str, object]:
         if field not in SUMMARIES:
             row[field] = value
             continue
-        for part in SUMMARIES[field].model_fields:
+        for part in (key for key in SUMMARIES[field].model_fields if key not in LISTS):
             entry = None if value is None else getattr(value, part)
             infinite = field == "of_all" and value is not None and entry is None
             row[f"{field}_{part}"] = float("inf") if infinite else entry
@@ -249,13 +253,17 @@ def score_variant(
     variant: str,
     estimates: Sequence[EstimateRow],
     truth: Sequence[TruthRow],
-    leds: Mapping[int, Led],
+    leds_m: Mapping[int, Position],
     devices: Sequence[int] | None = None,
+    downlink: IdentityScore | None = None,
 ) -> VariantScore:
-    """Score of one variant's rows by the truth of the same frames; all are of one device if `devices` is None."""
+    """Score of one variant's rows by the truth of the same frames; all are of one device if `devices` is None.
+
+    `downlink` is the score of its identities.
+    """
     of_frame = [0] * len(estimates) if devices is None else devices
     rows = tuple(
-        score_frame(row, true, leds, device) for row, true, device in zip(estimates, truth, of_frame, strict=True)
+        score_frame(row, true, leds_m, device) for row, true, device in zip(estimates, truth, of_frame, strict=True)
     )
     good = [row for row in rows if row.status == "ok"]
     sure = [row for row in good if row.nees is not None]
@@ -289,6 +297,7 @@ def score_variant(
         by_device=_by_device(rows),
         by_map=_by_map(rows),
         by_good_leds=_by_good_leds(rows),
+        downlink=downlink,
         median_time_s=float(np.median([row.time_s for row in good])) if good else None,
         rows=rows,
     )
@@ -346,8 +355,8 @@ def _by_good_leds(rows: Sequence[FrameScore]) -> tuple[GoodLeds, ...]:
     return tuple(found)
 
 
-def score_frame(estimate: EstimateRow, truth: TruthRow, leds: Mapping[int, Led], device: int = 0) -> FrameScore:
-    """Score of one frame: position errors if it has a position, range errors for its ranges."""
+def score_frame(estimate: EstimateRow, truth: TruthRow, leds_m: Mapping[int, Position], device: int = 0) -> FrameScore:
+    """Score of one frame: position errors if it has a position, range errors for its ranges to LEDs at `leds_m`."""
     true_m = np.array(truth.position_m)
     error = horizontal = vertical = squares = None
     if estimate.position_m is not None:
@@ -357,7 +366,7 @@ def score_frame(estimate: EstimateRow, truth: TruthRow, leds: Mapping[int, Led],
         if estimate.covariance_m2 is not None:
             squares = squared_in_sigmas(difference_m, estimate.covariance_m2)
     range_errors = tuple(
-        RangeError(led=r.led, error_m=r.range_m - float(np.linalg.norm(np.array(leds[r.led].position_m) - true_m)))
+        RangeError(led=r.led, error_m=r.range_m - float(np.linalg.norm(np.array(leds_m[r.led]) - true_m)))
         for r in estimate.ranges
     )
     return FrameScore(
@@ -410,13 +419,17 @@ def score(directory: str | Path) -> Scores:
         raise InputError(f"{folder / 'estimates'}: no estimates to score; make them with `estimator run {folder}`")
     truth = read_truth(folder / "truth.parquet", len(dataset.frames))
     devices = [record.device for record in dataset.frames]
+    true_map = () if dataset.leds or not dataset.frames else read_true_map(folder / "truth_map.parquet")
+    variants = []
+    for path in paths:
+        rows, leds_m = _read_known(path, dataset)
+        downlink = score_identities(rows, truth, dataset, true_map)
+        variants.append(score_variant(path.stem, rows, truth, leds_m, devices, downlink))
     scores = Scores(
         dataset=dataset.name,
         room_m=dataset.room_m,
         led_map=tuple(dataset.leds.values()),
-        variants=tuple(
-            score_variant(path.stem, _read_known(path, dataset), truth, dataset.leds, devices) for path in paths
-        ),
+        variants=tuple(variants),
     )
     write_atomically(folder / "scores.json", scores.model_dump_json(indent=1).encode() + b"\n")
     return scores
@@ -455,11 +468,18 @@ def _estimate_paths(folder: Path) -> list[Path]:
     return paths
 
 
-def _read_known(path: Path, dataset: Dataset) -> tuple[EstimateRow, ...]:
-    """Estimates of a file; raises InputError for a range to an LED that is not in the map."""
+def _read_known(path: Path, dataset: Dataset) -> tuple[tuple[EstimateRow, ...], dict[int, Position]]:
+    """Estimates of a file, and positions of LEDs by id: those of the map, or those that packets told.
+
+    Raises InputError for a range to an LED that is in neither.
+    """
     rows = read_estimates(path, len(dataset.frames))
+    leds_m = {led.id: led.position_m for led in dataset.leds.values()}
+    if not leds_m:
+        told = [one for row in rows for one in row.identities or ()]
+        leds_m = {one.led: one.position_m for one in told if one.led is not None and one.position_m is not None}
     for row in rows:
         for led_range in row.ranges:
-            if led_range.led not in dataset.leds:
+            if led_range.led not in leds_m:
                 raise InputError(f"{path}: frame {row.frame}: a range to LED {led_range.led}, which is not in led_map")
-    return rows
+    return rows, leds_m

@@ -40,6 +40,13 @@ GROUP_NOTE = (
     "of devices and maps. By device: smallest to largest of the devices; by map: the mean, and its interval with the "
     "maps as samples."
 )
+IDENTITY_HEADERS = (
+    *("LED images", "right", "wrong", "rejected", "missed", "wrong elsewhere", "bit errors", "of bits"),
+)
+IDENTITY_NOTE = (
+    "LED images that are whole on the sensor, by what the receiver said; wrong elsewhere: wrong identities of other "
+    "images. Bits are the chips of the images that were identified, as their lines show them."
+)
 LOST_HEADERS = ("no good LED", "1", "2", "3", "4 or more")
 LOST_NOTE = "Failed frames of all frames, by the number of LEDs whose whole image is on the sensor."
 PAIR_HEADERS = ("both", "only A", "only B", "neither", "A nearer", "median A − B", "95 % interval", "Wilcoxon p")
@@ -118,6 +125,18 @@ def group_cells(score: VariantScore) -> tuple[str, ...]:
         f"{min(squares):.3g} to {max(squares):.3g}" if squares else "–",
         "–" if by_map is None else nees_text(by_map),
         "–" if by_map is None else nees_interval_text(by_map),
+    )
+
+
+def identity_cells(score: VariantScore) -> tuple[str, ...]:
+    """Row of a variant, by IDENTITY_HEADERS."""
+    found = score.downlink
+    if found is None:
+        return ("–",) * len(IDENTITY_HEADERS)
+    right = f"{found.right} ({share_text(found.right, found.leds)})"
+    return (
+        *(str(found.leds), right, str(found.wrong), str(found.rejected), str(found.missed)),
+        *(str(found.wrong_elsewhere), str(found.bit_errors), str(found.bits)),
     )
 
 

@@ -16,12 +16,12 @@ from estimator.evaluate.batch import (
     Observed,
     Rows,
     ShotResult,
+    bursts,
     devices,
+    estimate_burst,
     estimate_dataset,
     estimate_device,
-    estimate_shot,
     in_order,
-    shots,
 )
 from estimator.io.dataset import Dataset, FrameRecord
 from estimator.io.estimates import EstimateRow
@@ -38,7 +38,7 @@ def estimate_with_workers(
     """
     registry = Registry.read()
     variants = [registry.named(name) for name in names]
-    todo = shots(dataset)
+    todo = bursts(dataset)
     workers = min(workers, len(todo))
     if workers <= 1:
         return estimate_dataset(dataset, variants, on_frame)
@@ -116,7 +116,7 @@ def _exit_with_parent() -> None:
 
 def _work(records: tuple[FrameRecord, ...]) -> ShotResult:
     dataset, variants = _worker_state
-    return estimate_shot(dataset, records, variants)
+    return estimate_burst(dataset, records, variants)
 
 
 def _solve(observed: dict[str, list[Observed]]) -> Rows:

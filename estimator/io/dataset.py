@@ -14,7 +14,6 @@ from pydantic import Field, Strict, ValidationError, field_validator, model_vali
 
 from estimator.errors import InputError
 from estimator.io.device import (
-    INT64_MAX,
     Accelerometer,
     AnyLed,
     Camera,
@@ -27,11 +26,25 @@ from estimator.io.device import (
     Sensor,
     decoding_problem,
     depth_problem,
+    gravity_problem,
+    gyro_problem,
     leds_by_id,
     luminaires_by_id,
     regions_problem,
 )
-from estimator.io.records import Positive, Row, Triple, first_line, first_problem, missing_key, read_rows
+from estimator.io.downlink import Downlink, downlink_problem, spots_problem
+from estimator.io.records import (
+    INT64_MAX,
+    Number,
+    Positive,
+    Row,
+    Triple,
+    first_line,
+    first_problem,
+    missing_key,
+    read_rows,
+)
+from estimator.io.shutter import Gyroscope
 
 FORMAT_VERSION = 4
 SPOT_TYPE = pa.struct([("led", pa.int64()), ("u_px", pa.float64()), ("v_px", pa.float64())])
@@ -47,6 +60,9 @@ FRAME_COLUMNS = {
     "accelerometer_m_s2": pa.list_(pa.float64()),
     "spots": pa.list_(SPOT_TYPE),
     "device": pa.int64(),
+    "burst": pa.int64(),
+    "start_s": pa.float64(),
+    "gyro_rad_s": pa.list_(pa.float64()),
 }
 
 
@@ -61,9 +77,12 @@ class FrameRecord(Row):
     camera: str
     exposure_s: Positive
     capturable: bool
-    accelerometer_m_s2: Triple
+    accelerometer_m_s2: Triple | None
     spots: Annotated[tuple[DecodedSpot, ...], Strict(False)]
     device: DeviceNumber
+    burst: int = Field(ge=0, le=INT64_MAX)
+    start_s: Number
+    gyro_rad_s: Triple | None
 
     @field_validator("file")
     @classmethod
@@ -91,21 +110,26 @@ class _Description(Row):
     frame_count: int = Field(ge=0, le=INT64_MAX)
     cameras: dict[str, Camera]
     sensor: Sensor
-    accelerometer: Accelerometer
-    led_map: tuple[AnyLed, ...]
-    room_m: tuple[Positive, Positive, Positive]
+    accelerometer: Accelerometer | None
+    led_map: tuple[AnyLed, ...] | None
+    room_m: tuple[Positive, Positive, Positive] | None
     luminaires: tuple[Luminaire, ...]
     map_datum: MapDatum | None
+    gyroscope: Gyroscope | None
+    downlink: Downlink | None
 
     @field_validator("led_map")
     @classmethod
-    def _unique(cls, leds: tuple[AnyLed, ...]) -> tuple[AnyLed, ...]:
-        leds_by_id(leds)
+    def _unique(cls, leds: tuple[AnyLed, ...] | None) -> tuple[AnyLed, ...] | None:
+        leds_by_id(leds or ())
         return leds
 
     @model_validator(mode="after")
-    def _luminaires_of_leds(self) -> Self:
-        luminaires_by_id(self.luminaires, self.led_map)
+    def _parts_agree(self) -> Self:
+        luminaires_by_id(self.luminaires, self.led_map or ())
+        known = None if self.led_map is None else {led.id for led in self.led_map}
+        if problem := downlink_problem(self.downlink, known):
+            raise ValueError(problem)
         return self
 
 
@@ -113,19 +137,22 @@ class _Description(Row):
 class Dataset:
     """Device knowledge of a dataset, and its frame records; `read_frame` reads the images, a frame at a time.
 
-    `cameras` are by name, `leds` and `luminaires` by id; `room_m` is the room's extent along x, y and z, metres.
+    `cameras` are by name, `leds` and `luminaires` by id; `room_m` is the room's extent along x, y and z, metres, None
+    where it is not known. `leds` is empty where the map is null: a receiver then makes it of the packets that the LEDs send.
     """
 
     folder: Path
     name: str
     cameras: dict[str, Camera]
     sensor: Sensor
-    accelerometer: Accelerometer
+    accelerometer: Accelerometer | None
     leds: dict[int, AnyLed]
-    room_m: tuple[float, float, float]
+    room_m: tuple[float, float, float] | None
     frames: tuple[FrameRecord, ...]
     luminaires: dict[int, Luminaire]
     map_datum: MapDatum | None
+    gyroscope: Gyroscope | None = None
+    downlink: Downlink | None = None
 
 
 def read_dataset(path: str | Path) -> Dataset:
@@ -171,11 +198,13 @@ def read_dataset(path: str | Path) -> Dataset:
         cameras=description.cameras,
         sensor=description.sensor,
         accelerometer=description.accelerometer,
-        leds=leds_by_id(description.led_map),
+        leds=leds_by_id(description.led_map or ()),
         room_m=description.room_m,
         frames=read_rows(folder / "frames.parquet", FRAME_COLUMNS, FrameRecord),
-        luminaires=luminaires_by_id(description.luminaires, description.led_map),
+        luminaires=luminaires_by_id(description.luminaires, description.led_map or ()),
         map_datum=description.map_datum,
+        gyroscope=description.gyroscope,
+        downlink=description.downlink,
     )
     _check_frames(folder / "frames.parquet", dataset, description.frame_count)
     return dataset
@@ -195,8 +224,30 @@ def _check_frames(path: Path, dataset: Dataset, frame_count: int) -> None:
         if record.camera not in dataset.cameras:
             known = ", ".join(dataset.cameras) or "none"
             raise InputError(f"{path}: frame {index}: unknown camera {record.camera!r}; cameras: {known}")
-        if problem := decoding_problem(record.spots, dataset.leds):
+        problem = spots_problem(dataset.downlink, record.spots) or decoding_problem(record.spots, dataset.leds)
+        problem = problem or gravity_problem(record.accelerometer_m_s2, dataset.accelerometer)
+        if problem := problem or gyro_problem(record.gyro_rad_s, dataset.gyroscope):
             raise InputError(f"{path}: frame {index}: {problem}")
+    _check_bursts(path, dataset.frames)
+
+
+def _check_bursts(path: Path, frames: tuple[FrameRecord, ...]) -> None:
+    """Refuse bursts that are not runs of shots of one device, each later than the one before."""
+    burst = -1
+    for before, record in zip((None, *frames), frames, strict=False):
+        where = f"{path}: frame {record.frame}"
+        if record.burst not in (max(burst, 0), burst + 1):
+            raise InputError(f"{where}: burst {record.burst}; bursts have to be 0, 1, 2, ... in order")
+        same = before is not None and record.burst == burst
+        burst = record.burst
+        if before is None:
+            continue
+        if record.shot == before.shot and not same:
+            raise InputError(f"{where}: burst {burst}, but its shot {record.shot} is of burst {before.burst}")
+        if same and record.device != before.device:
+            raise InputError(f"{where}: device {record.device}, but its burst {burst} is of device {before.device}")
+        if same and record.shot != before.shot and record.start_s <= before.start_s:
+            raise InputError(f"{where}: start_s {record.start_s}; has to be later than the shot before in its burst")
 
 
 def read_frame(dataset: Dataset, frame: FrameRecord | int, *, with_other_cameras: bool = True) -> DeviceFrame:
@@ -243,6 +294,11 @@ def read_frame(dataset: Dataset, frame: FrameRecord | int, *, with_other_cameras
         luminaires=dataset.luminaires,
         map_datum=dataset.map_datum,
         device=record.device,
+        burst=record.burst,
+        start_s=record.start_s,
+        gyro_rad_s=record.gyro_rad_s,
+        gyroscope=dataset.gyroscope,
+        downlink=dataset.downlink,
     )
     if not with_other_cameras:
         return made
@@ -316,3 +372,11 @@ def _check_headers(record: FrameRecord, headers: list[dict[str, object]], camera
     if problem := regions_problem(boxes, camera):
         raise InputError(f"{record.file}: {problem}")
     return boxes
+
+
+def write_image(path: Path, image_dn: NDArray[np.uint32], exposure_s: float) -> str:
+    """Write a full frame's digital numbers (rows, columns) as frames/*.exr; returns the file's sha256."""
+    header = {"compression": OpenEXR.PIZ_COMPRESSION, "type": OpenEXR.scanlineimage, "expTime": exposure_s}
+    with OpenEXR.File(header, {"Y": np.ascontiguousarray(image_dn)}) as file:
+        file.write(str(path))
+    return hashlib.sha256(path.read_bytes()).hexdigest()

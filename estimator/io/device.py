@@ -4,23 +4,33 @@ import json
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, Strict, ValidationError, field_validator, model_validator
 
 from estimator.errors import InputError
-from estimator.io.records import NotNegative, NotNegativeTriple, Number, Positive, Row, Triple, first_problem
+from estimator.io.downlink import Downlink, downlink_problem, spots_problem
+from estimator.io.records import (
+    INT64_MAX,
+    LedId,
+    NotNegative,
+    NotNegativeTriple,
+    Number,
+    Positive,
+    Row,
+    Triple,
+    first_problem,
+)
+from estimator.io.shutter import GLOBAL, Gyroscope, Shutter
 
 Floats = NDArray[np.float64]
 
-INT64_MAX = 2**63 - 1
 MAX_SENSOR_AREAS = 16
 """Upper limit of the pixels in all regions of a frame, in sensor areas; regions may extend beyond the sensor."""
 # Pixels within this many standard deviations of the full well count as possibly full.
 FULL_SIGMA = 4.0
-LedId = Annotated[int, Field(ge=0, le=INT64_MAX)]
 DeviceNumber = Annotated[int, Field(ge=0, le=INT64_MAX)]
 # Within 1000 km of the origin: any range to an LED, even a wrong one, can then be written.
 Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
@@ -123,6 +133,7 @@ class Camera(Row):
     R_cam_rig: tuple[Triple, Triple, Triple]
     offset_m: Triple
     uncertainty: CameraUncertainty | None = None
+    shutter: Shutter = GLOBAL
 
     @field_validator("K")
     @classmethod
@@ -158,6 +169,19 @@ class Camera(Row):
         """Angle of one pixel on the optical axis, 1 / fx, radians."""
         return 1 / self.K[0][0]
 
+    @property
+    def line_count(self) -> int:
+        """Lines that the shutter reads: rows of the sensor, or columns."""
+        return self.shutter.line_count(self.width_px, self.height_px)
+
+    def line_of(self, u_px: Floats, v_px: Floats) -> Floats:
+        """Continuous line coordinates, in readout order, of pixels (u, v) of any shape: line i is from i to i + 1."""
+        return self.shutter.line_of(u_px, v_px, self.width_px, self.height_px)
+
+    def times_s(self, u_px: Floats, v_px: Floats) -> Floats:
+        """Middle of the exposure of pixels (u, v) of any shape, relative to the frame's middle line, seconds."""
+        return (self.line_of(u_px, v_px) - self.line_count / 2) * self.shutter.row_time_s
+
     def R_cam_rig_array(self) -> Floats:
         """`R_cam_rig` as a (3, 3) array."""
         return np.array(self.R_cam_rig, dtype=np.float64)
@@ -166,13 +190,13 @@ class Camera(Row):
 class Sensor(Row):
     """Sensor of a device; keys as in dataset.json: `dn = round(min(e, full_well_e) / gain_e_per_dn) + black_level_dn`.
 
-    Noise other than shot noise is given by standard deviations, as in a data sheet. `crosstalk` is the share of a
+    A photograph says neither gain nor full well: both are None, and electrons are then digital numbers. Noise other than shot noise is given by standard deviations, as in a data sheet. `crosstalk` is the share of a
     pixel's electrons that its four neighbours collect, a quarter each.
     """
 
     bits: int = Field(ge=1, le=32)
-    gain_e_per_dn: Positive
-    full_well_e: Positive
+    gain_e_per_dn: Positive | None
+    full_well_e: Positive | None
     black_level_dn: float = Field(ge=0, le=2**32)
     noise: Literal["shot", "none", "full"]
     crosstalk: float = Field(default=0.0, ge=0, le=1)
@@ -185,9 +209,19 @@ class Sensor(Row):
     column_offset_e: NotNegative
     mosaic: str
 
+    @property
+    def gain(self) -> float:
+        """Electrons a digital number; 1 where the device does not state them."""
+        return 1.0 if self.gain_e_per_dn is None else self.gain_e_per_dn
+
+    def _well_dn(self) -> float:
+        """Digital number at the full well, infinite where the device does not state it."""
+        full_e = np.inf if self.full_well_e is None else self.full_well_e
+        return float(np.rint(full_e / self.gain)) + self.black_level_dn
+
     def saturation_dn(self) -> float:
         """Digital number of a saturated pixel: at the full well, or the ADC's last code if that is lower."""
-        return min(2.0**self.bits - 1, float(np.rint(self.full_well_e / self.gain_e_per_dn)) + self.black_level_dn)
+        return min(2.0**self.bits - 1, self._well_dn())
 
     def clipping_dn(self) -> float:
         """Lowest digital number that a saturated pixel may have.
@@ -196,21 +230,20 @@ class Sensor(Row):
         last code needs no such margin: a pixel that reads less has not reached it.
         """
         added_e = float(np.hypot(self.read_noise_e, np.hypot(self.row_offset_e, self.column_offset_e)))
-        spread_dn = float(np.hypot(added_e / self.gain_e_per_dn, self.adc_noise_dn))
-        well_dn = float(np.rint(self.full_well_e / self.gain_e_per_dn)) + self.black_level_dn
-        return min(2.0**self.bits - 1, well_dn - FULL_SIGMA * spread_dn)
+        spread_dn = float(np.hypot(added_e / self.gain, self.adc_noise_dn))
+        return min(2.0**self.bits - 1, self._well_dn() - FULL_SIGMA * spread_dn)
 
     def floor_e2(self) -> float:
         """Signal-independent variance of a pixel, electrons squared.
 
         Offsets of whole rows and columns are left out: subtracting a spot's local background removes most of them.
         """
-        added = self.dsnu_e**2 + self.read_noise_e**2 + (self.adc_noise_dn * self.gain_e_per_dn) ** 2
+        added = self.dsnu_e**2 + self.read_noise_e**2 + (self.adc_noise_dn * self.gain) ** 2
         return added + self.rounding_e2()
 
     def rounding_e2(self) -> float:
         """Variance of the ADC's rounding, electrons squared; 0 where whole electrons are counted."""
-        return self.gain_e_per_dn**2 / 12 if self.noise == "full" or self.gain_e_per_dn != 1 else 0.0
+        return self.gain**2 / 12 if self.noise == "full" or self.gain != 1 else 0.0
 
 
 class Luminaire(Row):
@@ -257,9 +290,14 @@ class Led(Row):
     gradient_sigma: NotNegative | None = None
 
     @property
+    def has_size(self) -> bool:
+        """Whether the map says how large the LED is."""
+        return True
+
+    @property
     @abstractmethod
     def half_width_m(self) -> float:
-        """Radius of a disc, half the side of a square, metres."""
+        """Radius of a disc, half the side of a square, metres; NaN where the map does not say it."""
 
     @property
     @abstractmethod
@@ -269,12 +307,15 @@ class Led(Row):
     @property
     @abstractmethod
     def mean_square_extent_m2(self) -> float:
-        """Mean of x^2 over the face, x measured from the centre along any direction of the face, m^2."""
+        """Mean of x^2 over the face, x measured from the centre along any direction of the face, m^2.
+
+        0, that of a point, where the map does not say the size.
+        """
 
     @property
     def shift_by_gradient_m(self) -> float:
         """Shift s^2 / r of the centre of the light by a gradient of 1, with the mean square extent s^2, metres."""
-        return self.mean_square_extent_m2 / self.half_width_m
+        return self.mean_square_extent_m2 / self.half_width_m if self.has_size else 0.0
 
     def sigmas(self) -> Floats:
         """Standard deviations (6,) of the position along x, y, z and of the half width, metres, and of gx and gy.
@@ -294,10 +335,10 @@ class Led(Row):
 
 
 class DiscLed(Led):
-    """Disc of radius `radius_m`, of standard deviation `radius_sigma_m`."""
+    """Disc of radius `radius_m`, of standard deviation `radius_sigma_m`; None where the map does not say the radius."""
 
     shape: Literal["disc"] = "disc"
-    radius_m: Positive
+    radius_m: Positive | None
     radius_sigma_m: NotNegative | None = None
 
     @model_validator(mode="before")
@@ -311,14 +352,19 @@ class DiscLed(Led):
         return self.radius_sigma_m
 
     @property
+    def has_size(self) -> bool:
+        """Whether the radius is known."""
+        return self.radius_m is not None
+
+    @property
     def half_width_m(self) -> float:
-        """The radius, metres."""
-        return self.radius_m
+        """The radius, metres; NaN where it is not known."""
+        return np.nan if self.radius_m is None else self.radius_m
 
     @property
     def mean_square_extent_m2(self) -> float:
-        """A quarter of the radius squared, m^2."""
-        return self.radius_m**2 / 4
+        """A quarter of the radius squared, m^2; 0 where it is not known."""
+        return 0.0 if self.radius_m is None else self.radius_m**2 / 4
 
 
 class SquareLed(Led):
@@ -401,6 +447,35 @@ def decoding_problem(spots: Sequence[DecodedSpot], leds: Mapping[int, Led]) -> s
     return None
 
 
+class Identity(Row):
+    """What a receiver decoded of an LED image: the LED, None if none was accepted, and the image's centre.
+
+    `correlation` is that of the image's lines with the decoded wave, `bits` the chips of one period as the lines show
+    them ("-" where not seen), and `position_m` the LED's, where a packet told it and the map is null.
+    """
+
+    led: LedId | None
+    u_px: Number
+    v_px: Number
+    correlation: float = Field(ge=-1.001, le=1.001)
+    bits: str | None = None
+    position_m: Triple | None = None
+
+
+def gyro_problem(reading_rad_s: Sequence[float] | None, gyroscope: Gyroscope | None) -> str | None:
+    """What is wrong with a frame's reading of the gyroscope, None if nothing: a reading without a gyroscope."""
+    return "gyro_rad_s is given, but gyroscope is null" if reading_rad_s is not None and gyroscope is None else None
+
+
+def gravity_problem(reading_m_s2: Sequence[float] | None, accelerometer: "Accelerometer | None") -> str | None:
+    """What is wrong with a frame's reading of the accelerometer, None if nothing: one of the two without the other."""
+    if reading_m_s2 is not None and accelerometer is None:
+        return "accelerometer_m_s2 is given, but accelerometer is null"
+    if reading_m_s2 is None and accelerometer is not None:
+        return "accelerometer_m_s2 is null, but accelerometer is given"
+    return None
+
+
 class Accelerometer(Row):
     """Error of the accelerometer as the device knows it, degrees, one standard deviation.
 
@@ -427,19 +502,27 @@ class Part:
     image_dn: NDArray[np.uint32]
 
 
+class LineGains(Protocol):
+    """Gain of an LED at each line of the sensor: the mean of its wave, of mean 1, over the line's exposure."""
+
+    def __call__(self, lines: Floats) -> Floats:
+        """Gains (n,) at lines (n,), counted in readout order from 0 on; between two whole lines too."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class DeviceFrame:
     """A frame as the device has it: the regions read out (one for a full frame), and all that the device knows.
 
-    `accelerometer_m_s2` is the reading in the axes of this frame's camera; `spots` are decoded identities; `leds` is
+    `accelerometer_m_s2` is the reading in the axes of this frame's camera, None without an accelerometer; `spots` are decoded identities; `leds` is
     the LED map by id.
     """
 
     parts: tuple[Part, ...]
     camera: Camera
     sensor: Sensor
-    accelerometer_m_s2: tuple[float, float, float]
-    accelerometer: Accelerometer
+    accelerometer_m_s2: tuple[float, float, float] | None
+    accelerometer: Accelerometer | None
     exposure_s: float
     spots: tuple[DecodedSpot, ...]
     leds: Mapping[int, Led]
@@ -451,14 +534,28 @@ class DeviceFrame:
     """Accuracy of the map's origin and scale; None where the device does not state it."""
     device: int = 0
     """Number of the device in its dataset: frames of one device share the errors of its camera and accelerometer."""
+    burst: int = 0
+    """Number of the burst: frames of a burst are taken one after another by a device that hardly moves."""
+    start_s: float = 0.0
+    """Start of the exposure of the first line that is read, seconds on the rig's clock."""
+    gyro_rad_s: tuple[float, float, float] | None = None
+    """Angular velocity as the gyroscope reads it, camera axes, mean over the readout; None without a reading."""
+    gyroscope: Gyroscope | None = None
+    """Errors of the gyroscope; None without one."""
+    downlink: Downlink | None = None
+    """What the LEDs send; None where the device cannot receive."""
+    identities: tuple[Identity, ...] | None = None
+    """What a receiver decoded; None where it has not been asked."""
+    gains: Mapping[int, LineGains] = field(default_factory=dict)
+    """Gain of an LED, by id, at each line, as its signal was decoded; without an entry an LED counts as steady."""
 
     def electrons(self, part: Part) -> NDArray[np.float32]:
         """Electrons above the black level of a part, (rows, columns)."""
         image = part.image_dn.astype(np.float32)
         if self.sensor.black_level_dn != 0:
             image -= np.float32(self.sensor.black_level_dn)
-        if self.sensor.gain_e_per_dn != 1:
-            image *= np.float32(self.sensor.gain_e_per_dn)
+        if self.sensor.gain != 1:
+            image *= np.float32(self.sensor.gain)
         return image
 
     def clipped(self, part: Part) -> NDArray[np.bool_]:
@@ -472,14 +569,19 @@ class _Record(Row):
 
     camera: Camera
     sensor: Sensor
-    accelerometer: Accelerometer
-    led_map: tuple[AnyLed, ...]
+    accelerometer: Accelerometer | None
+    led_map: tuple[AnyLed, ...] | None
     exposure_s: Positive
-    accelerometer_m_s2: Triple
+    accelerometer_m_s2: Triple | None
     spots: tuple[DecodedSpot, ...]
     luminaires: tuple[Luminaire, ...] = ()
     map_datum: MapDatum | None = None
     device: DeviceNumber = 0
+    burst: int = Field(default=0, ge=0, le=INT64_MAX)
+    start_s: Number = 0.0
+    gyro_rad_s: Triple | None = None
+    gyroscope: Gyroscope | None = None
+    downlink: Downlink | None = None
 
 
 class _Origin(Row):
@@ -499,9 +601,9 @@ def frame(record: Mapping[str, Any]) -> DeviceFrame:
         (x, y, z in camera axes, m/s^2) and `spots` (`{led, u_px, v_px}`) as in frames.parquet; and `parts`, a sequence
         of `{"row": int, "column": int, "image_dn": array}`, where `image_dn` (rows, columns) uint32 holds digital
         numbers and its first pixel is pixel (row, column) of the sensor. NumPy arrays and scalars may stand for lists
-        and numbers. What the device does not state may be missing: `luminaires`, `map_datum`, `device` (0), in
-        `camera`, `accelerometer` and `led_map` the keys of standard deviations, and in `sensor` `crosstalk` (0). Other
-        keys are ignored.
+        and numbers. What the device does not state may be missing: `luminaires`, `map_datum`, `device` (0), `burst`
+        (0), `start_s` (0), `gyro_rad_s`, `gyroscope`, `downlink`, in `camera`, `accelerometer` and `led_map` the keys
+        of standard deviations, in `camera` `shutter` (global), and in `sensor` `crosstalk` (0). Other keys are ignored.
 
     Returns
     -------
@@ -518,13 +620,16 @@ def frame(record: Mapping[str, Any]) -> DeviceFrame:
     try:
         text = json.dumps({key: record[key] for key in _Record.model_fields if key in record}, default=_plain)
         known = _Record.model_validate_json(text)
-        leds = leds_by_id(known.led_map)
-        luminaires = luminaires_by_id(known.luminaires, known.led_map)
+        leds = leds_by_id(known.led_map or ())
+        luminaires = luminaires_by_id(known.luminaires, leds.values())
     except ValidationError as error:
         raise InputError(f"record: {first_problem(error)}") from None
     except (TypeError, ValueError) as error:
         raise InputError(f"record: {error}") from None
-    if problem := decoding_problem(known.spots, leds):
+    problem = downlink_problem(known.downlink, None if known.led_map is None else leds.keys())
+    problem = problem or gyro_problem(known.gyro_rad_s, known.gyroscope)
+    problem = problem or gravity_problem(known.accelerometer_m_s2, known.accelerometer)
+    if problem := problem or spots_problem(known.downlink, known.spots) or decoding_problem(known.spots, leds):
         raise InputError(f"record: {problem}")
     return DeviceFrame(
         parts=_parts(record, known.camera, known.sensor),
@@ -538,6 +643,11 @@ def frame(record: Mapping[str, Any]) -> DeviceFrame:
         luminaires=luminaires,
         map_datum=known.map_datum,
         device=known.device,
+        burst=known.burst,
+        start_s=known.start_s,
+        gyro_rad_s=known.gyro_rad_s,
+        gyroscope=known.gyroscope,
+        downlink=known.downlink,
     )
 
 

@@ -12,8 +12,8 @@ from pydantic import Field, Strict, model_validator
 
 from estimator.errors import InputError
 from estimator.io.atomic import write_atomically
-from estimator.io.device import LedId
-from estimator.io.records import Covariance, Number, Row, Triple, read_rows
+from estimator.io.device import Identity
+from estimator.io.records import Covariance, LedId, Number, Row, Triple, read_rows
 
 COLUMNS = {
     "frame": pa.int64(),
@@ -24,6 +24,18 @@ COLUMNS = {
     "ambiguous": pa.bool_(),
     "ranges": pa.list_(pa.struct([("led", pa.int64()), ("range_m", pa.float64())])),
     "time_s": pa.float64(),
+    "identities": pa.list_(
+        pa.struct(
+            [
+                ("led", pa.int64()),
+                ("u_px", pa.float64()),
+                ("v_px", pa.float64()),
+                ("correlation", pa.float64()),
+                ("bits", pa.string()),
+                ("position_m", pa.list_(pa.float64())),
+            ]
+        )
+    ),
 }
 
 # Most file systems allow names of 255 bytes; the name of the temporary file is longer than the variant's.
@@ -41,7 +53,8 @@ class LedRange(Row):
 class EstimateRow(Row):
     """Estimate of one frame: a world position in metres, or `failed` and a reason `stage: what went wrong`.
 
-    `covariance_m2` is the covariance of the position, row by row, if the variant reports one.
+    `covariance_m2` is the covariance of the position, row by row, if the variant reports one. `identities` are the LED
+    images that the receiver found, decoded or not; None where identities are given.
     """
 
     frame: int = Field(ge=0)
@@ -52,6 +65,7 @@ class EstimateRow(Row):
     time_s: float = Field(ge=0, le=1e9)
     covariance_m2: Covariance | None = None
     ambiguous: bool = False
+    identities: Annotated[tuple[Identity, ...], Strict(False)] | None = None
 
     @model_validator(mode="after")
     def _status_fits(self) -> "EstimateRow":

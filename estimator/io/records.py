@@ -18,6 +18,8 @@ class Row(BaseModel):
     model_config = ConfigDict(strict=True, frozen=True, allow_inf_nan=False, extra="ignore")
 
 
+INT64_MAX = 2**63 - 1
+LedId = Annotated[int, Field(ge=0, le=INT64_MAX)]
 # The square of a number must not overflow.
 MAX_NUMBER = 1e100
 Number = Annotated[float, Field(ge=-MAX_NUMBER, le=MAX_NUMBER)]
@@ -59,7 +61,7 @@ Covariance = Annotated[
     tuple[Number, ...], Strict(False), Field(min_length=9, max_length=9), AfterValidator(_check_covariance)
 ]
 
-UNION_TAGS = ("disc", "square")
+UNION_TAGS = ("disc", "square", "code", "tone", "packet")
 
 RowT = TypeVar("RowT", bound=Row)
 

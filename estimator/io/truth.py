@@ -1,4 +1,4 @@
-"""True positions of the frames. This is the only module that opens truth.parquet; only the scorer imports it."""
+"""True positions of the frames and LEDs. Only the scorer imports this module, which alone opens the truth's files."""
 
 from pathlib import Path
 from typing import Annotated
@@ -7,8 +7,7 @@ import pyarrow as pa
 from pydantic import Field, Strict
 
 from estimator.errors import InputError
-from estimator.io.device import LedId
-from estimator.io.records import Covariance, Row, Size, Triple, read_rows
+from estimator.io.records import Covariance, LedId, Number, Positive, Row, Size, Triple, read_rows
 
 COLUMNS = {
     "frame": pa.int64(),
@@ -16,7 +15,18 @@ COLUMNS = {
     "bound_m2": pa.list_(pa.float64()),
     "bound_exact_m2": pa.list_(pa.float64()),
     "map": pa.int64(),
-    "leds": pa.list_(pa.struct([("led", pa.int64()), ("visible_fraction", pa.float64())])),
+    "R_cam_world": pa.list_(pa.float64()),
+    "leds": pa.list_(
+        pa.struct(
+            [
+                *(("led", pa.int64()), ("u_px", pa.float64()), ("v_px", pa.float64())),
+                *(("visible_fraction", pa.float64()), ("bits", pa.string())),
+            ]
+        )
+    ),
+}
+MAP_COLUMNS = {
+    **{"map": pa.int64(), "led": pa.int64(), "position_m": pa.list_(pa.float64()), "size_m": pa.float64()},
 }
 
 # An LED whose image is on the sensor but for rounding.
@@ -24,10 +34,16 @@ WHOLE = 1 - 1e-6
 
 
 class TrueLed(Row):
-    """An LED that lights pixels of a frame, and the share of its image on the sensor."""
+    """An LED that lights pixels of a frame: its centre's pixel, and the share of its image on the sensor.
+
+    `bits` are the chips of one period that it sends; None without chips.
+    """
 
     led: LedId
+    u_px: Number
+    v_px: Number
     visible_fraction: Size
+    bits: str | None
 
 
 class TruthRow(Row):
@@ -43,12 +59,27 @@ class TruthRow(Row):
     bound_m2: Covariance | None
     bound_exact_m2: Covariance | None
     map: int = Field(ge=0)
+    R_cam_world: Annotated[tuple[Number, ...], Strict(False), Field(min_length=9, max_length=9)]
     leds: Annotated[tuple[TrueLed, ...], Strict(False)]
 
     @property
     def good_leds(self) -> int:
         """Number of LEDs whose whole image is on the sensor."""
         return sum(led.visible_fraction >= WHOLE for led in self.leds)
+
+
+class TrueMapLed(Row):
+    """An LED of a building as built: its centre, world metres, and its radius or side."""
+
+    map: int = Field(ge=0)
+    led: LedId
+    position_m: Triple
+    size_m: Positive
+
+
+def read_true_map(path: Path) -> tuple[TrueMapLed, ...]:
+    """Read truth_map.parquet; raises InputError if it is missing or damaged."""
+    return read_rows(path, MAP_COLUMNS, TrueMapLed)
 
 
 def read_truth(path: Path, frame_count: int) -> tuple[TruthRow, ...]:

@@ -4,9 +4,10 @@ Spots are weighted by the covariance of their centroids and of the errors of cam
 (`estimator.solvers.uncertainty`), the accelerometer's reading by its standard deviation on each tilt axis. Where the
 device states no errors and the residuals reveal none, camera and map are taken as exact; `estimator.solvers.robust_fit`
 says what is assumed otherwise. The model includes the eccentricity of discs and squares
-(`estimator.solvers.reprojection`). LEDs in a plane have two poses of nearly equal reprojection error, LEDs close to one
+(`estimator.solvers.observations`). LEDs in a plane have two poses of nearly equal reprojection error, LEDs close to one
 line a continuum of them; both poses are initial values, and gravity decides. Wrong identities are excluded by
-consensus.
+consensus. With a rolling shutter the velocity of the camera is fitted as well, with the gyroscope's reading or a hand's
+motion as a prior (`estimator.solvers.shutter_motion`).
 """
 
 from collections.abc import Sequence
@@ -23,7 +24,7 @@ from estimator.methods.centroid_sigma import with_centroid_sigma
 from estimator.methods.pnp import candidates, in_a_plane
 from estimator.methods.up2p import upright_pairs, upright_pose
 from estimator.methods.variant import Estimate, Variant
-from estimator.solvers.reprojection import Observations, centroid_images, observe
+from estimator.solvers.observations import Observations, centroid_images, observe
 from estimator.solvers.robust_fit import Consensus, consensus
 from estimator.solvers.trilateration import determine_orientation
 from estimator.spots.correspondences import find_correspondences
@@ -64,7 +65,7 @@ def agreement(observations: Observations) -> Consensus:
         return [*upright_pairs(observations), *_from_triples(observations)]
 
     gravity_optional = determine_orientation(observations.leds_m)
-    return consensus(observations, _starts(observations), more_starts, gravity_optional)
+    return consensus(observations, initial_poses(observations), more_starts, gravity_optional)
 
 
 def ambiguous(agreed: Consensus) -> bool:
@@ -72,13 +73,16 @@ def ambiguous(agreed: Consensus) -> bool:
     return any(other.cost - agreed.best.cost < AMBIGUOUS_CHI2 for other in agreed.others)
 
 
-def _starts(observations: Observations) -> list[Pose]:
+def initial_poses(observations: Observations) -> list[Pose]:
     """Initial poses: the upright one by gravity, and without gravity IPPE's two, or SQPNP's for LEDs in no plane."""
     starts = [pose for pose in [upright_pose(observations)] if pose is not None]
     if len(observations.leds_m) >= MIN_FOR_IPPE:
         centre = observations.leds_m.mean(axis=0)
         method = cv2.SOLVEPNP_IPPE if in_a_plane(observations.leds_m) else cv2.SOLVEPNP_SQPNP
-        model, image = np.ascontiguousarray(observations.leds_m - centre), np.ascontiguousarray(observations.image)
+        model, image = (
+            np.ascontiguousarray(observations.leds_m - centre),
+            np.ascontiguousarray(observations.still_image),
+        )
         found = candidates(model, image, method, refined=False)
         starts += [Pose(centre - R_cam_world.T @ shift, R_cam_world) for R_cam_world, shift in found]
     return starts
@@ -91,20 +95,23 @@ def _from_triples(observations: Observations) -> list[Pose]:
     if len(triples) > MAX_TRIPLES:
         generator = np.random.Generator(np.random.Philox(key=count))
         triples = [triples[k] for k in generator.choice(len(triples), MAX_TRIPLES, replace=False)]
-    gate2 = (TRIPLE_PX * observations.camera.pixel_angle_rad) ** 2
+    gate = TRIPLE_PX * observations.camera.pixel_angle_rad
+    if observations.motion is not None and (upright := upright_pose(observations)) is not None:
+        gate += float(np.sqrt(np.diag(observations.motion.covariance(observations.leds_m, upright)).max()))
+    gate2, image = gate**2, observations.still_image
     ranked: list[tuple[float, int, Pose]] = []
     for triple in triples:
         chosen = list(triple)
         try:
             _, vectors, shifts = cv2.solveP3P(
-                observations.leds_m[chosen], observations.image[chosen], np.eye(3), None, flags=cv2.SOLVEPNP_P3P
+                observations.leds_m[chosen], image[chosen], np.eye(3), None, flags=cv2.SOLVEPNP_P3P
             )
         except cv2.error:
             continue
         for vector, shift in zip(vectors, shifts, strict=True):
             R_cam_world = np.asarray(Rotation.from_rotvec(vector.ravel()).as_matrix())
             pose = Pose(-R_cam_world.T @ shift.ravel(), R_cam_world)
-            offset = centroid_images(pose, observations.leds_m, observations.lift_m2)[0] - observations.image
+            offset = centroid_images(pose, observations.leds_m, observations.lift_m2)[0] - image
             error = float(np.minimum((offset**2).sum(axis=1), gate2).sum())
             # Of three LEDs on one line the solver may return NaN, which has no place in an order.
             if np.isfinite(error):

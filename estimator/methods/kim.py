@@ -41,7 +41,7 @@ def kim(frame: DeviceFrame) -> Estimate:
         raise EstimationFailure(failure.stage, failure.why, ranges_m) from None
 
 
-def _check_level(accelerometer_m_s2: tuple[float, float, float]) -> None:
+def _check_level(accelerometer_m_s2: tuple[float, float, float] | None) -> None:
     if np.degrees(np.abs(tilt_from_gravity(accelerometer_m_s2)).max()) > MAX_TILT_DEG:
         why = "the camera is tilted, and the method assumes it parallel to the ceiling"
         raise EstimationFailure("leveling", why)

@@ -1,8 +1,9 @@
 """Perspective-n-point: position from LEDs and their pixels alone, without gravity. Baseline: OpenCV defaults.
 
 Centroids stand for the images of the LEDs' centres, from which they differ slightly
-(`estimator.solvers.reprojection`), and all have equal weight. The covariance is that of such a fit
-(`estimator.solvers.ordinary_covariance`).
+(`estimator.solvers.observations`), and all have equal weight. The covariance is that of such a fit
+(`estimator.solvers.ordinary_covariance`). With a rolling shutter the turns that the gyroscope says are undone first;
+the rest of the motion is not fitted, but its prior counts in the covariance (`estimator.solvers.shutter_motion`).
 """
 
 from collections.abc import Sequence
@@ -12,14 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from estimator.camera.motion import turned_back
 from estimator.camera.pose import Pose
 from estimator.camera.undistort import pinhole_pixels
 from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame, normalized
 from estimator.io.records import is_covariance
 from estimator.methods.variant import Estimate, Variant
+from estimator.solvers.observations import observe
 from estimator.solvers.ordinary_covariance import ordinary_covariance
-from estimator.solvers.reprojection import observe
+from estimator.solvers.shutter_motion import motion_prior
 from estimator.solvers.trilateration import check_pattern
 from estimator.spots.correspondences import centroids_px, find_correspondences, led_positions_m
 from estimator.spots.identify import Correspondence
@@ -29,6 +32,8 @@ Floats = NDArray[np.float64]
 # Depth over length of the LEDs' pattern, from which on the planar solver is no use. Its poses are initial values, so
 # that errors of the map, and luminaires that hang a little askew, may lift LEDs out of the plane.
 MAX_PLANE_DEPTH = 0.02
+IPPE_ONLY = (cv2.SOLVEPNP_IPPE,)
+SQPNP_ONLY = (cv2.SOLVEPNP_SQPNP,)
 
 
 def pnp(frame: DeviceFrame) -> Estimate:
@@ -38,12 +43,12 @@ def pnp(frame: DeviceFrame) -> Estimate:
 
 def ippe(frame: DeviceFrame) -> Estimate:
     """Infinitesimal plane-based pose estimation (Collins & Bartoli 2014): the better of its two poses."""
-    return _estimate(frame, (cv2.SOLVEPNP_IPPE,))
+    return _estimate(frame, IPPE_ONLY)
 
 
 def sqpnp(frame: DeviceFrame) -> Estimate:
     """PnP as a quadratically constrained quadratic program (Terzakis & Lourakis 2020)."""
-    return _estimate(frame, (cv2.SOLVEPNP_SQPNP,))
+    return _estimate(frame, SQPNP_ONLY)
 
 
 def _estimate(frame: DeviceFrame, methods: Sequence[int]) -> Estimate:
@@ -57,6 +62,9 @@ def fit_correspondences(
 ) -> Estimate:
     """The estimate from identified spots by OpenCV `methods`; of the frame, the camera is used."""
     pixels = pinhole_pixels(centroids_px(correspondences), frame.camera)
+    if (prior := motion_prior(frame)) is not None:
+        times_s = frame.camera.times_s(*centroids_px(correspondences).T)
+        pixels = frame.camera.to_pixels(turned_back(frame.camera.normalized(pixels), prior.velocity, times_s))
     pose = pose_from_pixels(led_positions_m(correspondences), pixels, frame.camera.matrix(), methods)
     covariance_m2 = ordinary_covariance(observe(frame, correspondences), pose)
     return Estimate(

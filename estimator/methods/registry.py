@@ -18,6 +18,7 @@ from estimator.io.estimates import NAME
 from estimator.io.records import first_line
 from estimator.methods.catalogue import VARIANTS, variant_named
 from estimator.methods.variant import Estimate, Variant
+from estimator.receiver.receive import with_identities
 
 logger = logging.getLogger(__name__)
 
@@ -119,7 +120,7 @@ def estimate(frame: DeviceFrame, variant: str | Variant = "ml") -> Estimate:
         There is no variant of that name.
     """
     chosen = Registry.read().named(variant) if isinstance(variant, str) else variant
-    return chosen.estimate(frame)
+    return chosen.estimate(with_identities(frame))
 
 
 def estimate_device(
@@ -153,6 +154,7 @@ def estimate_device(
     for index, one in enumerate(frames):
         numbers.add(one.device)
         try:
+            one = with_identities(one)
             if method is None:
                 results[index] = chosen.estimate(one)
             else:

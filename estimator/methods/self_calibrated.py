@@ -5,8 +5,8 @@ frames of the device are then fitted together (`estimator.solvers.self_calibrati
 standard deviation for is corrected. Estimates use other frames of the same device, never the truth.
 
 A frame keeps its own estimate where the others cannot improve it: its errors are not those stated (the map's are not
-stated, and its spots show some), or too few of its spots agree with the device's other frames; the latter is reported
-as ambiguous.
+stated, and its spots show some), its camera has a rolling shutter, whose motion the common fit does not know, or too
+few of its spots agree with the device's other frames; the last is reported as ambiguous.
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame
 from estimator.methods.gravity_fit import agreement, ambiguous
 from estimator.methods.variant import DeviceMethod, Estimate, Variant
-from estimator.solvers.reprojection import MIN_CENTROID_SIGMA_PX, observe
+from estimator.solvers.observations import MIN_CENTROID_SIGMA_PX, observe
 from estimator.solvers.robust_fit import Consensus
 from estimator.solvers.self_calibration import DeviceView, adjust
 from estimator.spots.correspondences import centroids_px, find_correspondences
@@ -32,7 +32,7 @@ class FittedFrame:
     """A frame fitted by itself: its `estimate`, and its `view` for the common fit.
 
     `scale` is the factor of the stated standard deviations that its spots show; `view` is None where they show errors
-    that the device does not state.
+    that the device does not state, and with a rolling shutter.
     """
 
     estimate: Estimate
@@ -50,20 +50,24 @@ def fit_correspondences(frame: DeviceFrame, correspondences: Sequence[Correspond
     usable = has_pinhole_image(centroids_px(correspondences), frame.camera)
     if usable.any():
         correspondences = [one for one, use in zip(correspondences, usable, strict=True) if use]
-    agreed = agreement(observe(frame, correspondences))
+    observations = observe(frame, correspondences)
+    agreed = agreement(observations)
     estimate = Estimate(agreed.best.pose.position_m, covariance_m2=agreed.covariance_m2, ambiguous=ambiguous(agreed))
     model = agreed.model
     # The second: a focal length that nothing vouches for counts in the covariance of the frame alone.
-    if (model is not None and model.added_sigma_px > 0) or agreed.unchecked_m2.any():
+    unshared = observations.motion is not None or agreed.unchecked_m2.any()
+    if (model is not None and model.added_sigma_px > 0) or unshared:
         return FittedFrame(estimate, None, 1.0)
     return FittedFrame(estimate, _view(frame, correspondences, agreed), 1.0 if model is None else float(model.scale))
 
 
 def _view(frame: DeviceFrame, correspondences: Sequence[Correspondence], agreed: Consensus) -> DeviceView:
     inliers = [one for one, use in zip(correspondences, agreed.inliers, strict=True) if use]
+    stated = frame.accelerometer
+    if stated is None or frame.accelerometer_m_s2 is None:
+        raise EstimationFailure("leveling", "the device has no accelerometer")
     x, y, z = (frame.camera.R_cam_rig_array().T @ frame.accelerometer_m_s2).tolist()
     tilt = tilt_from_gravity((x, y, z))
-    stated = frame.accelerometer
     total_rad = np.radians(max(stated.error_deg, MIN_TILT_SIGMA_DEG))
     lever = tilt_sigmas(stated, tilt[1]) / total_rad
     shot_deg = stated.error_deg if stated.shot_error_deg is None else stated.shot_error_deg

@@ -6,6 +6,10 @@ displaces the other spots under the pose of a pair; the gate for inliers include
 errors of camera and map that the device states. The refinement then fits position and orientation to the inliers
 without gravity. If the inliers do not determine the orientation (fewer than four, or on one line), or the device states
 errors of camera or map, beside which gravity counts, gravity is used as a prior.
+
+With a rolling shutter the pairs are solved with the turns undone that the gyroscope says, the gate includes the
+displacement by the prior of the motion, and the refinement fits the velocity with the pose, as `gravity-fit` does, with
+gravity as a prior.
 """
 
 from collections.abc import Sequence
@@ -20,7 +24,7 @@ from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame
 from estimator.methods.centroid_sigma import with_centroid_sigma
 from estimator.methods.variant import Estimate, Variant
-from estimator.solvers.reprojection import Observations, centroid_images, observe
+from estimator.solvers.observations import Observations, centroid_images, observe
 from estimator.solvers.robust_fit import consensus
 from estimator.solvers.trilateration import determine_orientation
 from estimator.spots.correspondences import find_correspondences
@@ -57,9 +61,11 @@ def fit_correspondences(
     frame: DeviceFrame, correspondences: Sequence[Correspondence], centroid_sigma_px: float = 0.0
 ) -> Estimate:
     """The estimate from identified spots; of the frame, camera, accelerometer and map are used."""
+    if frame.accelerometer is None:
+        raise EstimationFailure("leveling", "the device has no accelerometer")
     observations = observe(frame, correspondences, centroid_sigma_px)
     starts = _from_pairs(observations)
-    if determine_orientation(observations.leds_m) and not observations.correlated:
+    if determine_orientation(observations.leds_m) and not observations.displaced:
         observations = observations.without_gravity()
     agreed = consensus(observations, starts[:1], lambda: [*starts[1:], *upright_pairs(observations)])
     return Estimate(agreed.best.pose.position_m, covariance_m2=agreed.covariance_m2)
@@ -75,8 +81,8 @@ def _from_pairs(observations: Observations) -> list[Pose]:
         generator = np.random.Generator(np.random.Philox(key=len(pairs)))
         pairs = [pairs[k] for k in generator.choice(len(pairs), MAX_PAIRS, replace=False)]
     gate = GATE_SIGMA * float(observations.tilt_sigma_rad.max()) + GATE_PX * observations.camera.pixel_angle_rad
-    if observations.correlated and (pose := upright_pose(observations)) is not None:
-        gate += GATE_SIGMA * float(np.sqrt(np.diag(observations.covariance(pose)).max()))
+    if observations.displaced and (pose := upright_pose(observations)) is not None:
+        gate += GATE_SIGMA * float(np.sqrt(np.diag(observations.total_covariance(pose)).max()))
     ranked: list[tuple[float, int, Pose]] = []
     for pair in pairs:
         found = poselib.up2p(level[list(pair)] @ Y_UP.T, observations.leds_m[list(pair)] @ Y_UP.T)
@@ -84,7 +90,7 @@ def _from_pairs(observations: Observations) -> list[Pose]:
             yaw = Y_UP.T @ upright.R @ Y_UP
             pose = Pose(Y_UP.T @ upright.center(), tilt @ yaw)
             image, depth = centroid_images(pose, observations.leds_m, observations.lift_m2)
-            error2 = np.where(depth > 0, ((image - observations.image) ** 2).sum(axis=1), np.inf)
+            error2 = np.where(depth > 0, ((image - observations.still_image) ** 2).sum(axis=1), np.inf)
             ranked.append((float(np.minimum(error2, gate**2).sum()), len(ranked), pose))
     return [pose for *_, pose in sorted(ranked, key=lambda one: one[:2])[:MAX_PAIR_STARTS]]
 
@@ -144,8 +150,8 @@ def _leveled(observations: Observations) -> tuple[Floats, NDArray[np.bool_]]:
 
 
 def _rays(observations: Observations) -> Floats:
-    """Vectors (n, 3) to the spots at unit depth, camera axes."""
-    return np.column_stack([observations.image, np.ones(len(observations.image))])
+    """Vectors (n, 3) to the spots at unit depth, camera axes, with the turns undone that the gyroscope says."""
+    return np.column_stack([observations.still_image, np.ones(len(observations.image))])
 
 
 def up2p_with(name: str) -> Variant:

@@ -19,8 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.camera.intrinsics import CAMERA_PARAMETERS, intrinsic_slopes_px
+from estimator.camera.motion import MOTION_PARAMETERS
 from estimator.camera.pose import POSE_PARAMETERS, Pose
 from estimator.camera.projection import ProjectedPoints, project, projection_of, relative_illumination
+from estimator.camera.rolling_projection import project_rolling
 from estimator.io.device import Camera, Led
 from estimator.pixels.polygon_raster import MAX_EDGE_PX, EdgePieces, Outlines, RoiStack, cover
 from estimator.pixels.psf import LensBlur
@@ -46,6 +48,9 @@ SIZE_PARAMETER = IMAGE_PARAMETERS - FACE_PARAMETERS
 TILT_PARAMETERS = (SIZE_PARAMETER + 1, SIZE_PARAMETER + 2)
 PROFILE_PARAMETERS = 3
 """Coefficients of an LED's luminance over its face: of a, b and a^2 + b^2 - 1/2, see `LedPixels`."""
+LOCAL_PARAMETERS = IMAGE_PARAMETERS + PROFILE_PARAMETERS
+"""Parameters that the readings of one LED depend on. Those of the camera's motion, if any, follow them."""
+MOTION_COLUMNS = LOCAL_PARAMETERS + np.arange(MOTION_PARAMETERS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +58,9 @@ class ImageState:
     """What determines the images of n LEDs: a pose, a camera, and how the LEDs differ from the map.
 
     `shifts_m` (n, 3) is added to the LEDs' positions, world metres; `sizes` (n,) multiplies their sizes. `tilts` (n, 2)
-    are tangents: at (x, y) from its centre a face is tilts[:, 0] x + tilts[:, 1] y higher than a level one.
+    are tangents: at (x, y) from its centre a face is tilts[:, 0] x + tilts[:, 1] y higher than a level one. `velocity`
+    (6,) is that of a camera with a rolling shutter (`estimator.camera.motion`), whose pose is that at mid-readout; None
+    for a global shutter.
     """
 
     pose: Pose
@@ -61,6 +68,7 @@ class ImageState:
     shifts_m: Floats
     sizes: Floats
     tilts: Floats
+    velocity: Floats | None = None
 
     @staticmethod
     def as_told(pose: Pose, camera: Camera, leds: int) -> "ImageState":
@@ -69,7 +77,14 @@ class ImageState:
 
     def of(self, chosen: NDArray[np.bool_] | Ints) -> "ImageState":
         """The state of the chosen LEDs."""
-        return ImageState(self.pose, self.camera, self.shifts_m[chosen], self.sizes[chosen], self.tilts[chosen])
+        of_leds = self.shifts_m[chosen], self.sizes[chosen], self.tilts[chosen]
+        return ImageState(self.pose, self.camera, *of_leds, self.velocity)
+
+    def project(self, points_m: Floats) -> ProjectedPoints:
+        """Images of world points (n, 3), and their derivatives."""
+        if self.velocity is None:
+            return project(points_m, self.pose, self.camera)
+        return project_rolling(points_m, self.pose, self.camera, self.velocity)
 
     def rims_m(self, level_m: Floats) -> Floats:
         """Points of the faces relative to their centres, (n, k, 3), from those of level faces by the map."""
@@ -110,14 +125,14 @@ def led_footprints(leds: Sequence[Led], state: ImageState) -> LedFootprints:
     pose, camera = state.pose, state.camera
     centres_m = np.array([led.position_m for led in leds]) + state.shifts_m
     rims_m = state.rims_m(np.stack([rim(led, COARSE_POINTS) for led in leds])) + centres_m[:, None]
-    projected = project(rims_m.reshape(-1, 3), pose, camera)
+    projected = state.project(rims_m.reshape(-1, 3))
     pixels = projected.pixels.reshape(len(leds), COARSE_POINTS, 2)
     from_above = centres_m[:, 2] <= pose.position_m[2]
     pixels[from_above] = np.nan
     centre = pixels.mean(axis=1)
     half_widths_m = np.array([led.half_width_m for led in leds])
     # Along x and y an LED moves its image as much as the camera moves it by the opposite way.
-    across = project(centres_m, pose, camera).slopes[:, :, :2] * -half_widths_m[:, None, None]
+    across = state.project(centres_m).slopes[:, :, :2] * -half_widths_m[:, None, None]
     with np.errstate(all="ignore"):
         whole = np.isfinite(pixels).all(axis=(1, 2)) & (np.abs(np.linalg.det(across)) > 0)
     to_face = np.full((len(leds), 2, 2), np.nan)
@@ -252,11 +267,11 @@ class LedImageModel:
     def render(self, state: ImageState, parameters: Ints = POSE_ALONE) -> RenderedLeds:
         """Images of all LEDs under a state, each alone in its region.
 
-        `parameters` are those of the IMAGE_PARAMETERS that derivatives are by.
+        `parameters` are those of the IMAGE_PARAMETERS and MOTION_COLUMNS that derivatives are by.
         """
         lens, factors = self._lens, self._lens.factors[self._led, None]
         offsets_m = state.of(self._led).rims_m(self._rims_m[:, None])[:, 0]
-        rims = project(self._centres_m[self._led] + state.shifts_m[self._led] + offsets_m, state.pose, state.camera)
+        rims = state.project(self._centres_m[self._led] + state.shifts_m[self._led] + offsets_m)
         slopes = _slopes(rims, offsets_m, state.camera)[:, :, parameters]
         outlines = Outlines(rims.pixels * factors, self._following, self._led, slopes * factors[:, None])
         covered, pieces = cover(self._fine, outlines)
@@ -268,7 +283,10 @@ class LedImageModel:
 
 
 def _slopes(rims: ProjectedPoints, offsets_m: Floats, camera: Camera) -> Floats:
-    """Derivatives (n, 2, p) of points of rims by the IMAGE_PARAMETERS; `offsets_m` (n, 3) are from their centres."""
+    """Derivatives (n, 2, p) of points of rims by the IMAGE_PARAMETERS; `offsets_m` (n, 3) are from their centres.
+
+    With a rolling shutter the MOTION_COLUMNS follow, behind empty ones of the profile.
+    """
     slopes = np.zeros((len(offsets_m), 2, IMAGE_PARAMETERS))
     slopes[:, :, :POSE_PARAMETERS] = rims.slopes
     slopes[:, :, POSE_PARAMETERS:-FACE_PARAMETERS] = intrinsic_slopes_px(
@@ -277,7 +295,9 @@ def _slopes(rims: ProjectedPoints, offsets_m: Floats, camera: Camera) -> Floats:
     # A point of the face moves its image as much as the camera moves it by the opposite way.
     slopes[:, :, -FACE_PARAMETERS] = -np.einsum("nij,nj->ni", rims.slopes[:, :, :3], offsets_m)
     slopes[:, :, -FACE_PARAMETERS + 1 :] = -rims.slopes[:, :, 2:3] * offsets_m[:, None, :2]
-    return slopes
+    if rims.motion_slopes is None:
+        return slopes
+    return np.concatenate([slopes, np.zeros((len(slopes), 2, PROFILE_PARAMETERS)), rims.motion_slopes], axis=2)
 
 
 def _blurred(image: Floats, fine: RoiStack, rois: RoiStack, lens: LensBlur, kernels: Sequence[Floats]) -> Floats:

@@ -2,17 +2,20 @@
 
 The sum of Poisson variables is a sufficient statistic of a common mean, so the uniform pixels of an LED's face need not
 be read one by one: each block of them is one reading. Its expectation is exact, a sum over its pixels.
+
+An LED that sends is brighter in some lines of a rolling shutter than in others: its light in a pixel is multiplied by
+the gain of the pixel's line, as decoded (`DeviceFrame.gains`). Its blocks are of one line each.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.camera.projection import project
 from estimator.errors import EstimationFailure
-from estimator.io.device import DeviceFrame, Led, Part
+from estimator.io.device import DeviceFrame, Led, LineGains, Part
 from estimator.pixels.led_model import (
     POSE_ALONE,
     ImageState,
@@ -42,6 +45,8 @@ MAX_IMAGE_SIGMA_PX = 0.5
 # Share of the pixels inside an LED image that have to be known: read out and not saturated.
 MIN_KNOWN_SHARE = 0.5
 NONE_IN_VIEW = "no LED of the map is in view from the pose that the spots give"
+# Step of the phase, in lines, for derivatives of gains.
+PHASE_STEP = 0.25
 # Extent of an LED image in half widths: 1.4 for a square's vertex, and the scale of a tilted view varies over a face.
 MAX_EXTENT = 3.0
 
@@ -61,9 +66,10 @@ class LedPixels:
     With the coordinates (a, b) of a pixel on the face, in half widths from its centre: `background` (m, 4) is the
     lens's fall-off times 1, a, b and a^2 + b^2; `face` (m, 3) is the mean of a, b and a^2 + b^2 - 1/2 over a reading.
     `uniform_light` (m,) is the light inside the LED image summed over the pixels of a reading, 0 for edge pixels, whose
-    light depends on the state. `radius_px` (n,) is half the larger side of an LED image's bounding box. Images may move
-    by `max_move_px` before their pixels have to be sorted anew. `more` says whether other LEDs of the map may be in
-    view, whose images the state does not determine well enough.
+    light depends on the state. `gains` are those of the readings where an LED sends, None where all are steady.
+    `radius_px` (n,) is half the larger side of an LED image's bounding box. Images may move by `max_move_px` before
+    their pixels have to be sorted anew. `more` says whether other LEDs of the map may be in view, whose images the
+    state does not determine well enough.
     """
 
     leds: tuple[Led, ...]
@@ -83,6 +89,7 @@ class LedPixels:
     radius_px: Floats
     max_move_px: float
     more: bool
+    gains: "ReadingGains | None" = None
 
     @property
     def group(self) -> Ints:
@@ -101,8 +108,32 @@ class LedPixels:
 
 
 @dataclass(frozen=True, eq=False)
+class ReadingGains:
+    """Gains of m readings by their `lines` (m,).
+
+    `of_group` are those of the LED of each of g groups, None for a steady one, whose gain is 1. The readings of a group
+    follow each other, from `starts[k]` to `starts[k + 1]`, (g + 1,).
+    """
+
+    of_group: tuple[LineGains | None, ...]
+    lines: Floats
+    starts: Ints
+
+    def at(self, phase_lines: Floats) -> tuple[Floats, Floats]:
+        """Gains (m,) of waves that are `phase_lines` (g,) lines further, and their derivatives by these."""
+        gain, by_phase = np.ones(len(self.lines)), np.zeros(len(self.lines))
+        for k, gains in enumerate(self.of_group):
+            if gains is not None:
+                readings = slice(self.starts[k], self.starts[k + 1])
+                lines = self.lines[readings] + phase_lines[k]
+                gain[readings] = gains(lines)
+                by_phase[readings] = (gains(lines + PHASE_STEP) - gains(lines - PHASE_STEP)) / (2 * PHASE_STEP)
+        return gain, by_phase
+
+
+@dataclass(frozen=True, eq=False)
 class _Readings:
-    """Readings of one group; see `LedPixels`."""
+    """Readings of one group; see `LedPixels`. `lines` are those of the readings of an LED that sends, else None."""
 
     cells: Ints
     pixel_counts: Floats
@@ -110,6 +141,7 @@ class _Readings:
     background: Floats
     face: Floats
     uniform_light: Floats
+    lines: Ints | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,6 +191,7 @@ def gather_led_pixels(frame: DeviceFrame, view: LedsInView, parameters: Ints = P
         (au, av), (bu, bv) = footprints.to_face[k].tolist()
         u, v = footprints.centre[k].tolist()
         du, dv = columns + 0.5 - u, rows + 0.5 - v
+        lines = _lines(frame, leds[k], rows, columns)
         position = _FacePixels(au * du + av * dv, bu * du + bv * dv, fall_offs[k])
         for of_colour in _colours(frame, rows, columns):
             row, column = np.nonzero(known & of_colour & masks[k].edge & masks[k].near)
@@ -166,7 +199,7 @@ def gather_led_pixels(frame: DeviceFrame, view: LedsInView, parameters: Ints = P
                 continue
             cells = rois.cell(np.full(len(row), k), row + rois.rows[k], column + rois.columns[k])
             row_in, column_in = np.nonzero(known & of_colour & ~masks[k].edge & (shares[k] > 0.5))
-            groups.append(_group(position, electrons, cells, (row, column), (row_in, column_in)))
+            groups.append(_group(position, electrons, cells, (row, column), (row_in, column_in), lines))
             led_of_group.append(k)
     if not groups:
         raise EstimationFailure("fit", "no pixel of the LEDs in view is usable: all are saturated or overlap others")
@@ -195,7 +228,24 @@ def gather_led_pixels(frame: DeviceFrame, view: LedsInView, parameters: Ints = P
         radius_px=(footprints.high - footprints.low).max(axis=1) / 2,
         max_move_px=EDGE_PX - 1,
         more=view.more,
+        gains=_gains(frame, [leds[k] for k in led_of_group], groups, starts),
     )
+
+
+def _lines(frame: DeviceFrame, led: Led, rows: Ints, columns: Ints) -> Ints | None:
+    """Lines of a region's pixels, (rows, columns), of an LED that sends; None for a steady one."""
+    if led.id not in frame.gains:
+        return None
+    u, v = np.broadcast_arrays(columns + 0.5, rows + 0.5)
+    return np.floor(frame.camera.line_of(u, v)).astype(np.int64)
+
+
+def _gains(frame: DeviceFrame, leds: Sequence[Led], groups: Sequence[_Readings], starts: Ints) -> ReadingGains | None:
+    """Gains of the readings of groups, whose LEDs are `leds`; None where all are steady."""
+    if all(group.lines is None for group in groups):
+        return None
+    lines = [np.zeros(len(group.electrons)) if group.lines is None else group.lines for group in groups]
+    return ReadingGains(tuple(frame.gains.get(led.id) for led in leds), np.concatenate(lines).astype(float), starts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,9 +258,17 @@ class _FacePixels:
 
 
 def _group(
-    pixels: _FacePixels, electrons: Floats, cells: Ints, edge: tuple[Ints, Ints], inside: tuple[Ints, Ints]
+    pixels: _FacePixels,
+    electrons: Floats,
+    cells: Ints,
+    edge: tuple[Ints, Ints],
+    inside: tuple[Ints, Ints],
+    lines: Ints | None,
 ) -> _Readings:
-    """Readings of the edge pixels and of blocks of the pixels inside the face, both given by (row, column)."""
+    """Readings of the edge pixels and of blocks of the pixels inside the face, both given by (row, column).
+
+    `lines` (rows, columns) are those of the pixels where the LED sends.
+    """
     a, b, fall_off = pixels.a[edge], pixels.b[edge], pixels.fall_off[edge]
     r2 = a * a + b * b
     background = np.stack([fall_off * basis for basis in (np.ones(len(a)), a, b, r2)], axis=1)
@@ -221,7 +279,9 @@ def _group(
     r2 = a * a + b * b
     tile = np.clip(np.floor((a + 1) * BLOCKS / 2), 0, BLOCKS - 1) * BLOCKS
     tile += np.clip(np.floor((b + 1) * BLOCKS / 2), 0, BLOCKS - 1)
-    _, block = np.unique(tile, return_inverse=True)
+    if lines is not None:
+        tile += BLOCKS**2 * lines[inside]
+    first, block = np.unique(tile, return_inverse=True)
     blocks = int(block.max()) + 1 if len(block) else 0
 
     def summed(values: Floats) -> Floats:
@@ -236,6 +296,7 @@ def _group(
         background=np.concatenate([background, sums]),
         face=np.concatenate([face, mean - [0.0, 0.0, 0.5]]),
         uniform_light=np.concatenate([light, sums[:, 0]]),
+        lines=None if lines is None else np.concatenate([lines[edge], (first // BLOCKS**2).astype(np.int64)]),
     )
 
 
@@ -244,14 +305,14 @@ def leds_in_view(
 ) -> LedsInView:
     """LEDs of the map, n in all, that are in view under a state of them.
 
-    Left out are LEDs whose image is not determined to MAX_IMAGE_SIGMA_PX by the pose, of covariance (6, 6), and by
-    their own position, of standard deviation `sigma_m` (n,), but for those whose image is `located` (n,). Raises
-    EstimationFailure if none is left.
+    Left out are LEDs whose image is not determined to MAX_IMAGE_SIGMA_PX by the pose, of covariance (6, 6), or (12, 12)
+    with that of the velocity for a rolling shutter, and by their own position, of standard deviation `sigma_m` (n,),
+    but for those whose image is `located` (n,). Raises EstimationFailure if none is left.
     """
     low, high = _read_out(frame)
     leds = tuple(frame.leds.values())
     centres_m = np.array([led.position_m for led in leds]) + state.shifts_m
-    centres = project(centres_m, state.pose, state.camera)
+    centres = state.project(centres_m)
     half_widths_m = np.array([led.half_width_m for led in leds])
     with np.errstate(invalid="ignore"):
         # The image moves with the camera as much as a point of the face moves it from its centre.
@@ -263,6 +324,8 @@ def leds_in_view(
         raise EstimationFailure("fit", NONE_IN_VIEW)
     footprints = led_footprints([leds[k] for k in candidates], state.of(candidates))
     slopes = centres.slopes[candidates]
+    if centres.motion_slopes is not None:
+        slopes = np.concatenate([slopes, centres.motion_slopes[candidates]], axis=2)
     with np.errstate(invalid="ignore"):
         in_view = footprints.whole & (footprints.high > low).all(axis=1) & (footprints.low < high).all(axis=1)
         variance_px2 = ((slopes @ covariance) * slopes).sum(axis=(1, 2)) + (sigma_m * scale)[candidates] ** 2

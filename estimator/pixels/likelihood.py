@@ -8,6 +8,10 @@ each LED (of each colour, if the sensor has a mosaic) are unknown. Given the ima
 weighted by 1 / variance under the model; that the background changes by more than its own level is improbable a priori.
 The part of a change of the image that they could explain is subtracted from the information: the Schur complement.
 
+The light of an LED that sends is multiplied by the gain of each line (`LedPixels.gains`), whose phase is known about as
+well as a receiver decodes it. A small error of the phase changes the light linearly: its product with the amplitude is
+one more coefficient of the linear fit, about the phase of the fit before.
+
 With `sensor.noise` "full" the variance is shot noise plus the data sheet's dark noise, PRNU and rounding
 (quasi-likelihood). Offsets of whole rows and columns are approximated by independent noise of the pixels. With noise
 "none" shot noise is assumed.
@@ -18,8 +22,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.camera.motion import MOTION_PARAMETERS
 from estimator.io.device import DeviceFrame
-from estimator.pixels.led_model import IMAGE_PARAMETERS, PROFILE_PARAMETERS, RenderedLeds
+from estimator.pixels.led_model import IMAGE_PARAMETERS, LOCAL_PARAMETERS, PROFILE_PARAMETERS, RenderedLeds
 from estimator.pixels.led_pixels import LedPixels
 
 Floats = NDArray[np.float64]
@@ -32,6 +37,13 @@ SATURATION_MARGIN_SIGMA = 5.0
 MIN_VARIANCE_E2 = 1e-3
 # Background coefficients and amplitude of a group.
 COEFFICIENTS = 5
+AMPLITUDE = COEFFICIENTS - 1
+# Standard deviation of the phase of an LED's wave as decoded, in lines: ours, half a line, which the image of any LED
+# that was decoded improves on.
+PHASE_SIGMA_LINES = 0.5
+# Largest change of the phase in one fit, and in all, lines.
+MAX_PHASE_STEP = 0.5
+MAX_PHASE = 2.0
 # Relative determinant below which readings do not determine amplitude and background; they are then not used.
 MIN_DETERMINANT = 1e-9
 # Standard deviations a priori of the background's slopes by a and b, its curvature: relative to
@@ -57,7 +69,7 @@ class Noise:
         """Noise of a frame's sensor."""
         sensor = frame.sensor
         dark_e2 = sensor.floor_e2() + sensor.row_offset_e**2 + sensor.column_offset_e**2
-        saturation_e = (sensor.clipping_dn() - sensor.black_level_dn) * sensor.gain_e_per_dn
+        saturation_e = (sensor.clipping_dn() - sensor.black_level_dn) * sensor.gain
         return Noise(dark_e2, sensor.prnu**2, saturation_e)
 
 
@@ -65,11 +77,13 @@ class Noise:
 class PhotometricFit:
     """Amplitudes and backgrounds of g groups given the image, and the m readings expected by them.
 
-    `basis` (m, 5) are the derivatives of the readings by a group's four background coefficients and its amplitude;
+    `basis` (m, c) are the derivatives of the readings by a group's c = 5 coefficients, four of the background and its
+    amplitude, and where LEDs send by a sixth, the amplitude times a change of the phase;
     `amplitude`, `background` (by the face) and `signal_to_noise` are (g,); `expected` (m,) are electrons; `weight` (m,)
-    is 1 / variance, 0 for readings not used; `covariance` (g, 5, 5) is that of the coefficients, 0 if the readings do
+    is 1 / variance, 0 for readings not used; `covariance` (g, c, c) is that of the coefficients, 0 if the readings do
     not determine them; `level` (g,) is the scale of the background's prior; `deviance` is the mean over the readings of
-    twice the log likelihood ratio of a saturated model, expected to be near 1.
+    twice the log likelihood ratio of a saturated model, expected to be near 1. Where LEDs send, `phase` (g,) are the
+    errors of their waves' phases, in lines, and `gain` (m,) the gains by which the light of the readings is multiplied.
     """
 
     basis: Floats
@@ -81,6 +95,8 @@ class PhotometricFit:
     covariance: Floats
     level: Floats
     deviance: float
+    phase: Floats | None = None
+    gain: Floats | None = None
 
 
 def fit_photometry(
@@ -100,25 +116,40 @@ def fit_photometry(
     light = pixels.light(rendered)
     if profile is not None:
         light = light * (1 + np.einsum("mi,mi->m", pixels.face, profile[pixels.led][group]))
-    basis = np.column_stack([pixels.background, light])
+    phase = gain = None
+    if pixels.gains is not None:
+        phase = np.zeros(len(pixels.led)) if before is None or before.phase is None else before.phase
     of_used_led = used[pixels.led][group]
     weight = of_used_led / n if before is None else before.weight
     level = np.maximum.reduceat(y / n, pixels.starts[:-1]) if before is None else before.level
-    pairs = [(i, j) for i in range(COEFFICIENTS) for j in range(i, COEFFICIENTS)]
-    products = np.stack([basis[:, i] * basis[:, j] for i, j in pairs] + [basis[:, i] * y for i in range(COEFFICIENTS)])
-    normal = np.zeros((len(pixels.led), COEFFICIENTS, COEFFICIENTS))
+    count = COEFFICIENTS if phase is None else COEFFICIENTS + 1
+    pairs = [(i, j) for i in range(count) for j in range(i, count)]
+    normal = np.zeros((len(pixels.led), count, count))
+    basis = np.column_stack([pixels.background, light])
+    products = _products(basis, y, pairs) if phase is None else np.zeros((0, 0))
     # Without variances of a previous fit, iterate: the first weights are a guess.
     for _ in range(3 if before is None else 1):
+        if pixels.gains is not None and phase is not None:
+            gain, by_phase = pixels.gains.at(phase)
+            basis = np.column_stack([pixels.background, light * gain, light * by_phase])
+            products = _products(basis, y, pairs)
         sums = pixels.sum_by_group(products * weight)
         for (i, j), values in zip(pairs, sums, strict=False):
             normal[:, i, j] = normal[:, j, i] = values
-        determinant = normal[:, 0, 0] * normal[:, -1, -1] - normal[:, 0, -1] ** 2
-        determined = determinant > MIN_DETERMINANT * normal[:, 0, 0] * normal[:, -1, -1]
+        of_background, of_light = normal[:, 0, 0], normal[:, AMPLITUDE, AMPLITUDE]
+        determinant = of_background * of_light - normal[:, 0, AMPLITUDE] ** 2
+        determined = determinant > MIN_DETERMINANT * of_background * of_light
         prior = np.maximum(np.outer(level, BACKGROUND_SIGMAS), MIN_VARIANCE_E2) ** -2.0
         total = normal.copy()
-        slopes = range(1, COEFFICIENTS - 1)
+        slopes = range(1, AMPLITUDE)
         total[:, slopes, slopes] += prior
-        total[~determined] = np.eye(COEFFICIENTS)
+        if phase is not None:
+            # The prior is that of the phase, of which the coefficient changes `phase` by its ratio to the amplitude.
+            bright = np.maximum(level if before is None else before.amplitude, MIN_VARIANCE_E2)
+            of_phase = (PHASE_SIGMA_LINES * bright) ** -2.0
+            total[:, -1, -1] += of_phase
+            sums[len(pairs) + count - 1] -= of_phase * bright * phase
+        total[~determined] = np.eye(count)
         covariance = _inverse(total) * determined[:, None, None]
         coefficients = np.einsum("gij,jg->gi", covariance, sums[len(pairs) :])
         expected = np.einsum("mi,mi->m", basis, coefficients[group])
@@ -126,14 +157,33 @@ def fit_photometry(
         variance = np.maximum(per_pixel + noise.dark_e2 + noise.prnu2 * per_pixel**2, MIN_VARIANCE_E2)
         unsaturated = per_pixel + SATURATION_MARGIN_SIGMA * np.sqrt(variance) < noise.saturation_e
         weight = np.where(of_used_led & unsaturated & determined[group], 1 / (variance * n), 0.0)
-        level = np.maximum(coefficients[:, 0], 0.0) + HALO_SHARE * np.maximum(coefficients[:, -1], 0.0)
-    amplitude = coefficients[:, -1]
-    sigma = np.sqrt(covariance[:, -1, -1])
+        if phase is not None:
+            bright = coefficients[:, AMPLITUDE]
+            change = np.divide(coefficients[:, -1], bright, out=np.zeros_like(bright), where=bright > 0)
+            phase = np.clip(phase + np.clip(change, -MAX_PHASE_STEP, MAX_PHASE_STEP), -MAX_PHASE, MAX_PHASE)
+        level = np.maximum(coefficients[:, 0], 0.0) + HALO_SHARE * np.maximum(coefficients[:, AMPLITUDE], 0.0)
+    amplitude = coefficients[:, AMPLITUDE]
+    sigma = np.sqrt(covariance[:, AMPLITUDE, AMPLITUDE])
     signal_to_noise = np.divide(amplitude, sigma, out=np.zeros_like(sigma), where=sigma > 0)
     deviance = _mean_deviance(y[weight > 0], expected[weight > 0], n[weight > 0] * noise.dark_e2)
     return PhotometricFit(
-        basis, amplitude, coefficients[:, 0], signal_to_noise, expected, weight, covariance, level, deviance
+        basis,
+        amplitude,
+        coefficients[:, 0],
+        signal_to_noise,
+        expected,
+        weight,
+        covariance,
+        level,
+        deviance,
+        phase,
+        gain,
     )
+
+
+def _products(basis: Floats, y: Floats, pairs: list[tuple[int, int]]) -> Floats:
+    """Products (p + c, m) of pairs of the c columns of a basis (m, c), and of each column with y (m,)."""
+    return np.stack([basis[:, i] * basis[:, j] for i, j in pairs] + [column * y for column in basis.T])
 
 
 def _inverse(matrices: Floats) -> Floats:
@@ -155,19 +205,26 @@ def score(
 ) -> tuple[Floats, Floats]:
     """Information (n, p, p) and gradient (n, p) of the log likelihood by the LOCAL_PARAMETERS of each of n LEDs.
 
+    Those of the motion follow where `rendered` has derivatives by them.
+
     Amplitudes and backgrounds are eliminated. Parameters that `rendered` has no derivatives by have no information; so
     has the profile if `profile` (n, 3) is None.
     """
     slopes = rendered.slopes(pixels.cells) * photometry.amplitude[pixels.group[pixels.edges]][:, None]
+    if photometry.gain is not None:
+        slopes *= photometry.gain[pixels.edges][:, None]
     if profile is not None:
         factor = 1 + np.einsum("mi,mi->m", pixels.face, profile[pixels.led][pixels.group])
         slopes *= factor[pixels.edges][:, None]
-        of_profile = pixels.face * (pixels.light(rendered) * photometry.amplitude[pixels.group])[:, None]
+        light = pixels.light(rendered) if photometry.gain is None else pixels.light(rendered) * photometry.gain
+        of_profile = pixels.face * (light * photometry.amplitude[pixels.group])[:, None]
     residual = photometry.weight * (pixels.electrons - photometry.expected)
     columns = rendered.parameters
+    in_motion = bool((columns >= LOCAL_PARAMETERS).any())
     if profile is not None:
         columns = np.concatenate([columns, IMAGE_PARAMETERS + np.arange(PROFILE_PARAMETERS)])
-    count, all_of_them = len(columns), IMAGE_PARAMETERS + PROFILE_PARAMETERS
+    count = len(columns)
+    all_of_them = LOCAL_PARAMETERS + (MOTION_PARAMETERS if in_motion else 0)
     information = np.zeros((len(pixels.leds), all_of_them, all_of_them))
     gradient = np.zeros((len(pixels.leds), all_of_them))
     first_edge = np.searchsorted(pixels.edges, pixels.starts)
@@ -190,10 +247,12 @@ def excess_chi2(pixels: LedPixels, rendered: RenderedLeds, photometry: Photometr
     """Excess of each group's chi-square, (g,), over its limit: positive for an LED that the model does not explain."""
     weight, edges = photometry.weight, pixels.edges
     chi2 = pixels.sum_by_group((pixels.electrons - photometry.expected) ** 2 * weight)
-    freedom = np.maximum(pixels.sum_by_group((weight > 0).astype(float)) - COEFFICIENTS, 0.0)
+    freedom = np.maximum(pixels.sum_by_group((weight > 0).astype(float)) - photometry.basis.shape[1], 0.0)
     # The model error is largest at the edge: 4 share (1 - share) is 1 at half coverage and 0 on uniform pixels.
     share = np.zeros(len(weight))
     share[edges] = rendered.light[pixels.cells] / pixels.background[edges, 0]
     model_error_e = MODEL_ERROR_SHARE * photometry.amplitude[pixels.group] * 4 * share * (1 - share)
+    if photometry.gain is not None:
+        model_error_e *= photometry.gain
     model_chi2 = pixels.sum_by_group(model_error_e**2 * weight)
     return np.asarray(chi2 - freedom - CHI2_SIGMA * np.sqrt(2 * freedom) - model_chi2)

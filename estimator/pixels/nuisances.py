@@ -10,7 +10,7 @@ all that the fit needs. Orthogonal elimination (QR) removes first what is an LED
 normal equations would lose the digits of what a loose prior leaves of a precise measurement.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,12 +19,12 @@ from estimator.camera.intrinsics import CAMERA_PARAMETERS, with_errors
 from estimator.camera.pose import POSE_PARAMETERS, Pose
 from estimator.errors import EstimationFailure
 from estimator.io.device import Camera, DeviceFrame, Led
-from estimator.pixels.led_model import FACE_PARAMETERS, IMAGE_PARAMETERS, PROFILE_PARAMETERS, ImageState
+from estimator.pixels.led_model import FACE_PARAMETERS, LOCAL_PARAMETERS, PROFILE_PARAMETERS, ImageState
+from estimator.solvers.shutter_motion import motion_prior
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-LOCAL_PARAMETERS = IMAGE_PARAMETERS + PROFILE_PARAMETERS
 LED_PARAMETERS = 3 + FACE_PARAMETERS + PROFILE_PARAMETERS
 """An LED's own: shift along x, y and z of the world, size, two tilts of the face, profile."""
 SIZE, TILTS, PROFILE = 3, slice(4, 6), slice(6, LED_PARAMETERS)
@@ -34,6 +34,7 @@ LUMINAIRE_PARAMETERS = 6
 DATUM_PARAMETERS = 4
 """The map's: shift along x, y and z, scale."""
 COMMON_PARAMETERS = DATUM_PARAMETERS + CAMERA_PARAMETERS + POSE_PARAMETERS
+"""Those of the map's datum, the camera and the pose. The camera's motion, if any, follows them."""
 
 # A map that errs does not say how level the LEDs hang: standard deviation of a face's tangents, next to no knowledge.
 # Luminaires hang by some 0.1 to 1 deg, and real rims are not perfectly round. Taken as level, a face would tell the
@@ -50,7 +51,8 @@ class Priors:
     `camera` (7,) in the units of `with_errors`; `datum` (4,) metres and relative scale; `luminaires` (l, 6) metres and
     radians; `leds` (n, 9): metres, relative size, tilts, profile coefficients. `positions_m` (n, 3) are the LEDs'
     positions by the map, `centres_m` (l, 3) the points that luminaires turn about, `luminaire` (n,) each LED's, -1 for
-    none.
+    none. `motion` (6,) are those of the velocity of a camera with a rolling shutter, `velocity` (6,) is its expectation
+    (`estimator.solvers.shutter_motion`); both are (0,) for a global shutter.
     """
 
     camera: Floats
@@ -60,6 +62,8 @@ class Priors:
     positions_m: Floats
     centres_m: Floats
     luminaire: Ints
+    motion: Floats = field(default_factory=lambda: np.zeros(0))
+    velocity: Floats = field(default_factory=lambda: np.zeros(0))
 
     @staticmethod
     def of(frame: DeviceFrame, leds: tuple[Led, ...]) -> "Priors":
@@ -78,6 +82,7 @@ class Priors:
             own[k, :3] = sigmas[:3]
             own[k, SIZE] = sigmas[3] / led.half_width_m
             own[k, PROFILE][:2] = sigmas[4:]
+        motion = motion_prior(frame)
         of_luminaire = np.array(rows).reshape(-1, LUMINAIRE_PARAMETERS)
         if own[:, :3].any() or of_luminaire.any():
             own[:, TILTS] = FREE_TILT
@@ -91,12 +96,15 @@ class Priors:
             luminaire=np.array(
                 [-1 if led.luminaire is None else index.get(led.luminaire, -1) for led in leds], dtype=np.int64
             ),
+            motion=np.zeros(0) if motion is None else motion.sigmas,
+            velocity=np.zeros(0) if motion is None else motion.velocity,
         )
 
     @property
     def exact(self) -> bool:
         """Whether nothing is uncertain."""
-        return not (self.camera.any() or self.datum.any() or self.luminaires.any() or self.leds.any())
+        parts = self.camera, self.datum, self.luminaires, self.leds, self.motion
+        return not any(part.any() for part in parts)
 
     def position_sigma_m(self) -> Floats:
         """Standard deviation (n,) of each LED's position along its worst axis, without the datum."""
@@ -195,11 +203,13 @@ class Nuisances:
     datum: Floats
     luminaires: Floats
     leds: Floats
+    motion: Floats = field(default_factory=lambda: np.zeros(0))
 
     @staticmethod
     def zero(priors: Priors) -> "Nuisances":
         """All as the device states."""
-        return Nuisances(*(np.zeros_like(one) for one in (priors.camera, priors.datum, priors.luminaires, priors.leds)))
+        parts = priors.camera, priors.datum, priors.luminaires, priors.leds, priors.motion
+        return Nuisances(*(np.zeros_like(one) for one in parts))
 
     def only(self, leds: Ints) -> "Nuisances":
         """The values of the LEDs with these indices, and all others."""
@@ -217,7 +227,7 @@ class Nuisances:
 
     def standardized(self, priors: Priors) -> "Nuisances":
         """These in standard deviations of their priors; 0 for what is known exactly."""
-        sigmas = (priors.camera, priors.datum, priors.luminaires, priors.leds)
+        sigmas = (priors.camera, priors.datum, priors.luminaires, priors.leds, priors.motion)
         pairs = zip(vars(self).values(), sigmas, strict=True)
         return Nuisances(*(np.divide(v, s, out=np.zeros_like(v), where=s > 0) for v, s in pairs))
 
@@ -239,7 +249,8 @@ class Nuisances:
     def state(self, pose: Pose, camera: Camera, priors: Priors) -> ImageState:
         """State of the LED images under a pose and these nuisances; `camera` is the stated one."""
         sizes, tilts = 1 + self.leds[:, SIZE], self.leds[:, TILTS]
-        return ImageState(pose, with_errors(camera, self.camera), self.shifts_m(priors), sizes, tilts)
+        velocity = priors.velocity + self.motion if len(self.motion) else None
+        return ImageState(pose, with_errors(camera, self.camera), self.shifts_m(priors), sizes, tilts, velocity)
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,19 +275,25 @@ NO_GRAVITY = Gravity(np.zeros(2), np.full(2, np.inf))
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """A step of pose (6,) and nuisances; covariance (6, 6) of the pose, and of each LED's own nuisances.
+    """A step of pose and nuisances; covariance of the view, and of each LED's own nuisances.
 
+    The view is the pose (6,), and the velocity (6,) for a rolling shutter: `view_step` (v,), `covariance` (v, v).
     `redundancy` (n, 9) is the share of its prior that each LED's own nuisance keeps, 1 less its variance in prior
-    units. `step2` is the squared length of the step of the pose in standard deviations, `information` (6, 6) the
-    inverse of the pose's covariance.
+    units. `step2` is the squared length of the step of the view in standard deviations, `information` (v, v) the
+    inverse of the view's covariance.
     """
 
-    pose_step: Floats
+    view_step: Floats
     step: Nuisances
     covariance: Floats
     redundancy: Floats
     step2: float
     information: Floats
+
+    @property
+    def pose_step(self) -> Floats:
+        """The step of the pose, (6,)."""
+        return self.view_step[:POSE_PARAMETERS]
 
 
 def _triangle(matrix: Floats) -> Floats:
@@ -307,20 +324,23 @@ def solve(
 ) -> Solution:
     """Step of pose and nuisances that minimizes the squares of `rows` (n, r, p) x step - `right` (n, r), and priors.
 
-    The columns are the LOCAL_PARAMETERS; `angles` (3,) are the rig's; `damping` (6, 6), if given, is an information
-    that keeps the pose where it is (Levenberg-Marquardt), and is part of `Solution.covariance`. Raises
-    EstimationFailure if the pose is not determined.
+    The columns are the LOCAL_PARAMETERS and those of the motion; `angles` (3,) are the rig's; `damping` (v, v), if
+    given, is an information that keeps the view where it is (Levenberg-Marquardt), and is part of
+    `Solution.covariance`. Raises EstimationFailure if the pose is not determined.
     """
     n = len(rows)
     z = now.standardized(priors)
     of_camera = slice(POSE_PARAMETERS, POSE_PARAMETERS + CAMERA_PARAMETERS)
     shifted = -rows[:, :, :3]  # by a shift of the LED
-    own = np.concatenate([shifted, rows[:, :, POSE_PARAMETERS + CAMERA_PARAMETERS :]], axis=2) * priors.leds[:, None]
+    of_led = slice(POSE_PARAMETERS + CAMERA_PARAMETERS, LOCAL_PARAMETERS)
+    own = np.concatenate([shifted, rows[:, :, of_led]], axis=2) * priors.leds[:, None]
+    common_count = COMMON_PARAMETERS + len(priors.motion)
     common = np.concatenate(
         [
             shifted @ (priors.datum_slopes() * priors.datum),
             rows[:, :, of_camera] * priors.camera,
             rows[:, :, :POSE_PARAMETERS],
+            rows[:, :, LOCAL_PARAMETERS:] * priors.motion,
         ],
         axis=2,
     )
@@ -335,7 +355,7 @@ def solve(
     triangles = _triangle(np.concatenate([prior_rows, system], axis=1))
     led_rows, rest = triangles[:, :LED_PARAMETERS], triangles[:, LED_PARAMETERS:, LED_PARAMETERS:]
 
-    remaining = [rest[priors.luminaire < 0][:, :, LUMINAIRE_PARAMETERS:].reshape(-1, COMMON_PARAMETERS + 1)]
+    remaining = [rest[priors.luminaire < 0][:, :, LUMINAIRE_PARAMETERS:].reshape(-1, common_count + 1)]
     luminaire_rows = {}
     for k in np.unique(priors.luminaire[has]).tolist():
         block = rest[priors.luminaire == k].reshape(-1, rest.shape[2])
@@ -345,23 +365,28 @@ def solve(
         triangle = _triangle(np.concatenate([prior, block]))
         luminaire_rows[k] = triangle[:LUMINAIRE_PARAMETERS]
         remaining.append(triangle[LUMINAIRE_PARAMETERS:, LUMINAIRE_PARAMETERS:])
-    prior = np.zeros((COMMON_PARAMETERS, COMMON_PARAMETERS + 1))
+    prior = np.zeros((common_count, common_count + 1))
     known = DATUM_PARAMETERS + CAMERA_PARAMETERS
     prior[:known, :known] = np.eye(known)
     prior[:known, -1] = -np.concatenate([z.datum, z.camera])
     tilt = [known + 3, known + 4]
     prior[tilt, tilt] = 1 / gravity.sigma
     prior[tilt, -1] = gravity.residual(angles)
+    of_motion = np.arange(COMMON_PARAMETERS, common_count)
+    prior[of_motion, of_motion] = 1.0
+    prior[of_motion, -1] = -z.motion
+    # From the unknowns of the view to their units: those of the motion are in standard deviations.
+    units = np.concatenate([np.ones(POSE_PARAMETERS), priors.motion])
     total = np.concatenate([prior, *remaining])
     if damping is not None:
-        held = np.zeros((POSE_PARAMETERS, COMMON_PARAMETERS + 1))
-        held[:, known:-1] = np.linalg.cholesky(damping).T
+        held = np.zeros((len(units), common_count + 1))
+        held[:, known:-1] = np.linalg.cholesky(damping).T * units
         total = np.concatenate([total, held])
     scale = np.linalg.norm(total[:, :-1], axis=0)
     if not np.isfinite(total).all() or not (scale > 0).all():
         raise EstimationFailure("fit", UNDETERMINED)
     triangle = _triangle(np.column_stack([total[:, :-1] / scale, total[:, -1]]))
-    R, q = triangle[:COMMON_PARAMETERS, :-1], triangle[:COMMON_PARAMETERS, -1]
+    R, q = triangle[:common_count, :-1], triangle[:common_count, -1]
     if not np.abs(np.diag(R)).min() > MIN_DETERMINED:
         raise EstimationFailure("fit", UNDETERMINED)
     inverse = np.linalg.inv(R) / scale[:, None]
@@ -372,8 +397,8 @@ def solve(
     for k, row in luminaire_rows.items():
         rhs = row[:, -1] - row[:, LUMINAIRE_PARAMETERS:-1] @ x
         of_luminaires[k] = np.linalg.solve(row[:, :LUMINAIRE_PARAMETERS], rhs)
-    lead, on_luminaire = led_rows[:, :, :LED_PARAMETERS], led_rows[:, :, LED_PARAMETERS : -COMMON_PARAMETERS - 1]
-    on_common = led_rows[:, :, -COMMON_PARAMETERS - 1 : -1]
+    lead, on_luminaire = led_rows[:, :, :LED_PARAMETERS], led_rows[:, :, LED_PARAMETERS : -common_count - 1]
+    on_common = led_rows[:, :, -common_count - 1 : -1]
     rhs = led_rows[:, :, -1] - on_common @ x
     rhs[has] -= np.einsum("nij,nj->ni", on_luminaire[has], of_luminaires[priors.luminaire[has]])
     of_leds = np.linalg.solve(lead, rhs[:, :, None])[:, :, 0]
@@ -381,19 +406,20 @@ def solve(
     # Of what is common, the luminaires' uncertainty is left out.
     through = inverse_lead @ on_common @ inverse
     redundancy = 1 - (inverse_lead**2).sum(axis=2) - (through**2).sum(axis=2)
-    pose_step, pose_covariance = x[known:], covariance[known:, known:]
-    root = R[known:, known:] * scale[known:]
+    view_step, view_covariance = x[known:] * units, covariance[known:, known:] * np.outer(units, units)
+    root = R[known:, known:] * (scale[known:] / units)
     return Solution(
-        pose_step=pose_step,
+        view_step=view_step,
         step=Nuisances(
             camera=x[DATUM_PARAMETERS:known] * priors.camera,
             datum=x[:DATUM_PARAMETERS] * priors.datum,
             luminaires=of_luminaires * priors.luminaires,
             leds=of_leds * priors.leds,
+            motion=view_step[POSE_PARAMETERS:],
         ),
-        covariance=pose_covariance,
+        covariance=view_covariance,
         redundancy=np.clip(redundancy, 0.0, 1.0),
-        step2=float(((root @ pose_step) ** 2).sum()),
+        step2=float(((root @ view_step) ** 2).sum()),
         information=root.T @ root,
     )
 

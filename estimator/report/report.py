@@ -20,6 +20,8 @@ from estimator.evaluate.score_table import (
     ERROR_NOTE,
     GROUP_HEADERS,
     GROUP_NOTE,
+    IDENTITY_HEADERS,
+    IDENTITY_NOTE,
     LIMIT_HEADERS,
     LIMIT_NOTE,
     LOST_HEADERS,
@@ -29,6 +31,7 @@ from estimator.evaluate.score_table import (
     error_cells,
     group_cells,
     has_groups,
+    identity_cells,
     limit_cells,
     lost_cells,
     pair_cells,
@@ -91,6 +94,7 @@ class Section:
     scores: Table
     limits: Table | None
     groups: Table | None
+    identities: Table | None
     lost: Table | None
     pairs: Table | None
     best: str
@@ -124,18 +128,19 @@ def page(datasets: Sequence[tuple[Path, Scores]]) -> str:
 
 def _section(folder: Path, scores: Scores) -> Section:
     variants = scores.variants
-    x, y, z = scores.room_m
+    room_m = scores.room_m
     leds_m = [led.position_m for led in scores.led_map]
     previews = sorted((folder / "previews").glob("*.png"))
     return Section(
         name=scores.dataset,
         frames=variants[0].frames if variants else 0,
         leds=len(leds_m),
-        room=f"{x:g} × {y:g} × {z:g}",
+        room="unknown" if room_m is None else " × ".join(f"{side:g}" for side in room_m),
         variants=variants,
         scores=_table(ERROR_HEADERS, [(index, error_cells(v)) for index, v in enumerate(variants)], ERROR_NOTE),
         limits=_limit_table(variants),
         groups=_group_table(variants),
+        identities=_identity_table(variants),
         lost=_lost_table(variants),
         pairs=_pair_table(variants),
         best=best(variants).variant if variants else "",
@@ -145,8 +150,9 @@ def _section(folder: Path, scores: Scores) -> Section:
         distribution_plot=Markup(distribution_plot(variants)),
         device_plots=[Markup(device_plot(variants, nees)) for nees in (False, True) if any(map(has_groups, variants))],
         plans=[
-            (Markup(floor_plan(scores.room_m, leds_m, v, index)), estimates_outside(scores.room_m, v))
+            (Markup(floor_plan(room_m, leds_m, v, index)), estimates_outside(room_m, v))
             for index, v in enumerate(variants)
+            if room_m is not None
         ],
         previews=_selected(previews),
         preview_count=len(previews),
@@ -165,6 +171,14 @@ def _group_table(variants: Sequence[VariantScore]) -> Table | None:
     if not any(map(has_groups, variants)):
         return None
     return _table(GROUP_HEADERS, [(index, group_cells(variant)) for index, variant in enumerate(variants)], GROUP_NOTE)
+
+
+def _identity_table(variants: Sequence[VariantScore]) -> Table | None:
+    """Table of identities that a receiver decoded; None where they were given."""
+    if not any(variant.downlink for variant in variants):
+        return None
+    cells = [(index, identity_cells(variant)) for index, variant in enumerate(variants)]
+    return _table(IDENTITY_HEADERS, cells, IDENTITY_NOTE)
 
 
 def _lost_table(variants: Sequence[VariantScore]) -> Table | None:

@@ -22,10 +22,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2, f
 
+from estimator.camera.motion import MOTION_PARAMETERS
 from estimator.camera.pose import Pose
 from estimator.camera.projection import projection_of
 from estimator.errors import EstimationFailure
-from estimator.solvers.reprojection import Fit, Observations, centroid_images, corrected_for_eccentricity, fit
+from estimator.solvers.camera_check import contradicts_camera, unchecked_focal_m2
+from estimator.solvers.observations import Observations, centroid_images, corrected_for_eccentricity
+from estimator.solvers.reprojection import Fit, fit
 
 Floats = NDArray[np.float64]
 
@@ -57,12 +60,6 @@ MIN_SURE_INLIERS = 8
 MIN_SURE_SHARE = 2 / 3
 # An exact camera has to be a hundred times as likely as one as sold, where it states nothing and errors are revealed.
 CAUTION_CHI2 = 2 * np.log(100)
-# Standard deviations of an error of the camera's intrinsics, one of seven, beyond which the residuals reveal it: by
-# chance in one of 2000 frames.
-MAX_CAMERA_SIGMA = 4.0
-# Relative error of an unstated focal length that the residuals have to be able to reveal for it to be taken as exact:
-# half the smallest that is said of real cameras, 0.1 %, so that one of 0.1 % is missed in one of 30 000 frames at most.
-CHECKED_FOCAL = 5e-4
 # Largest error of a centroid that is taken as one of map or camera, 3 cm at 3 m, and largest factor of stated errors:
 # larger ones are no explanation.
 MAX_ADDED_RAD = 0.01
@@ -146,7 +143,7 @@ def _consensus(
     if fits and _explains_all(fits[0], observations):
         agreed = Consensus(fits[0], fits[1:], everything, _uses_gravity(observations))
         if _plausible(agreed, observations):
-            return replace(agreed, unchecked_m2=_unchecked_focal_m2(observations, fits[0]))
+            return replace(agreed, unchecked_m2=unchecked_focal_m2(observations, fits[0]))
         rough = [one.pose for one in fits]
     else:
         rough = [*(one.pose for one in fits), *starts, *more_starts()]
@@ -160,7 +157,7 @@ def _consensus(
     fits = minima(best.of_inliers(), [best.best.pose, *starts])
     if fits:
         best = replace(best, best=fits[0], others=fits[1:])
-    return replace(best, unchecked_m2=_unchecked_focal_m2(best.of_inliers(), best.best))
+    return replace(best, unchecked_m2=unchecked_focal_m2(best.of_inliers(), best.best))
 
 
 def _explanations(
@@ -191,51 +188,12 @@ def _explanations(
 
 
 def _plausible(agreed: Consensus, observations: Observations) -> bool:
-    """Whether chi-square of inliers and gravity is as the errors say, and the spots do not contradict the camera.
-
-    The camera is contradicted where one of the errors that are assumed of a camera as sold would explain the residuals
-    better by MAX_CAMERA_SIGMA standard deviations.
-    """
+    """Whether chi-square of inliers and gravity is as the errors say, and the spots do not contradict the camera."""
     chosen, best = observations.only(agreed.inliers), agreed.best
     freedom = _freedom(chosen)
     if best.tilt_chi2 > chi2.isf(OUTLIER_PROBABILITY, 2) or best.chi2 > chi2.isf(OUTLIER_PROBABILITY, max(freedom, 1)):
         return False
-    if chosen.correlated or chosen.camera.uncertainty is not None:
-        return True
-    found, errors, priors, _ = _camera_errors(chosen, best)
-    visible = errors < priors
-    return bool((np.abs(found) <= MAX_CAMERA_SIGMA * errors)[visible].all())
-
-
-def _camera_errors(observations: Observations, best: Fit) -> tuple[Floats, Floats, Floats, Floats]:
-    """Errors of the intrinsics (k,) that each by itself explain the residuals of a fit best.
-
-    Also their standard deviations by the residuals, (k,), and as assumed of a camera as sold, (k,), and the derivatives
-    (3, k) of the fitted position by them. The first is the focal length's.
-    """
-    assumed = observations.with_assumed_camera().uncertainty
-    count = len(assumed.intrinsics)
-    slopes = observations.from_pixels @ assumed.slopes_px(best.pose)[:, :, :count]
-    # Residuals are those of the model minus the image: an error of the camera adds its slopes to them.
-    left_open, moved = best.response(slopes)
-    size2 = np.maximum((left_open**2).sum(axis=0), np.finfo(float).tiny)
-    return -(left_open.T @ best.residuals) / size2, 1 / np.sqrt(size2), assumed.sigmas[:count], moved
-
-
-def _unchecked_focal_m2(observations: Observations, best: Fit) -> Floats:
-    """Covariance (3, 3) of the position by the focal length of a camera that states nothing, where it is not checked.
-
-    Residuals that would reveal an error of CHECKED_FOCAL check it, and it is taken as exact: zero. Otherwise it has the
-    mean square error that residuals leave and the camera as sold has.
-    """
-    if observations.correlated or observations.camera.uncertainty is not None:
-        return np.zeros((3, 3))
-    found, errors, priors, moved = _camera_errors(observations, best)
-    if MAX_CAMERA_SIGMA * errors[0] <= CHECKED_FOCAL:
-        return np.zeros((3, 3))
-    weight = priors[0] ** 2 / (priors[0] ** 2 + errors[0] ** 2)
-    mean_square = weight * errors[0] ** 2 + (weight * found[0]) ** 2
-    return np.asarray(mean_square * np.outer(moved[:, 0], moved[:, 0]))
+    return chosen.correlated or chosen.camera.uncertainty is not None or not contradicts_camera(chosen, best)
 
 
 def _enough(inliers: NDArray[np.bool_]) -> bool:
@@ -285,8 +243,8 @@ def _ranked(observations: Observations, poses: Sequence[Pose]) -> list[tuple[Pos
     """
     half = len(observations.leds_m) // 2 + 1
 
-    def judged(pose: Pose) -> tuple[float, Pose, Floats]:
-        distance_px = _distance_px(observations, pose)
+    def judged(pose: Pose, velocity: Floats | None = None) -> tuple[float, Pose, Floats]:
+        distance_px = _distance_px(observations, pose, velocity)
         return float((np.sort(distance_px)[:half] ** 2).sum()), pose, distance_px
 
     ranked = sorted((judged(pose) for pose in poses), key=lambda one: one[0])
@@ -301,13 +259,13 @@ def _ranked(observations: Observations, poses: Sequence[Pose]) -> list[tuple[Pos
         except EstimationFailure:
             continue
         if found.pose.position_m[2] < observations.leds_m[:, 2].min():
-            refitted.append(judged(found.pose))
+            refitted.append(judged(found.pose, found.velocity))
     both = sorted([*refitted, *ranked], key=lambda one: one[0])
     return [(pose, distance_px) for cost, pose, distance_px in both if np.isfinite(cost)]
 
 
-def _distance_px(observations: Observations, pose: Pose) -> Floats:
-    image, depth_m = centroid_images(pose, observations.leds_m, observations.lift_m2)
+def _distance_px(observations: Observations, pose: Pose, velocity: Floats | None) -> Floats:
+    image, depth_m = observations.images(pose, velocity)
     offset = np.linalg.solve(observations.from_pixels, (observations.image - image)[:, :, None])[:, :, 0]
     return np.asarray(np.where(depth_m > 0, np.linalg.norm(offset, axis=1), np.inf))
 
@@ -321,7 +279,7 @@ def _spread_px(distance_px: Floats) -> float:
 def _gate_px(observations: Observations, pose: Pose) -> Floats:
     """Distances (n,) that errors as stated explain, with an upright pose: START_GATE standard deviations, pixels."""
     count = len(observations.leds_m)
-    blocks = observations.covariance(pose).reshape(count, 2, count, 2)[np.arange(count), :, np.arange(count)]
+    blocks = observations.total_covariance(pose).reshape(count, 2, count, 2)[np.arange(count), :, np.arange(count)]
     of_tilt = observations.tilt_sigma_rad.max() if _uses_gravity(observations) else 0.0
     variance = np.trace(blocks, axis1=1, axis2=2) + of_tilt**2
     return np.asarray(START_GATE * np.sqrt(variance) / observations.camera.pixel_angle_rad)
@@ -458,8 +416,10 @@ def _same_minimum(one: Pose, other: Pose) -> bool:
 
 
 def _explains_all(found: Fit, observations: Observations) -> bool:
-    """Whether a fit explains all spots and gravity."""
+    """Whether a fit explains all spots and gravity, with a motion that its prior allows."""
     if found.tilt_chi2 > chi2.isf(OUTLIER_PROBABILITY, 2):
+        return False
+    if found.motion_chi2 > chi2.isf(OUTLIER_PROBABILITY, MOTION_PARAMETERS):
         return False
     if observations.correlated:
         return found.chi2 <= chi2.isf(OUTLIER_PROBABILITY, max(_freedom(observations), 1)) and bool(
@@ -470,7 +430,7 @@ def _explains_all(found: Fit, observations: Observations) -> bool:
 
 def _explained(found: Fit, observations: Observations) -> NDArray[np.bool_]:
     """Spots, (n,), that a fit explains by their noise and MODEL_ERROR_PX."""
-    offset = centroid_images(found.pose, observations.leds_m, observations.lift_m2)[0] - observations.image
+    offset = observations.images(found.pose, found.velocity)[0] - observations.image
     spread = np.linalg.inv(observations.whitening)
     model_error2 = (MODEL_ERROR_PX * observations.camera.pixel_angle_rad) ** 2
     covariance = spread @ spread.transpose(0, 2, 1) + model_error2 * np.eye(2)

@@ -344,7 +344,7 @@ class _Frame:
 def _centroids_px(positions_m: Floats, extent_m: Floats, pose: Pose, camera: Camera) -> Floats:
     """Centroids (n, 2) of the images of horizontal faces, pixels, by four points of each that have its mean squares.
 
-    Their images are weighted by the irradiance of the lens, z / |X|^4 (`estimator.solvers.reprojection`).
+    Their images are weighted by the irradiance of the lens, z / |X|^4 (`estimator.solvers.observations`).
     """
     points_m = positions_m[:, None] + extent_m[:, None, None] * FACE
     seen = project(points_m.reshape(-1, 3), pose, camera)

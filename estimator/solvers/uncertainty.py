@@ -53,7 +53,7 @@ class Uncertainty:
     `parameters` (k,) are named in the order of `sigmas` (k,), their standard deviations, all positive. The first of
     them are intrinsics: `intrinsics` are their indices in INTRINSICS. The others are of the map: `levers` (n, 3, k_map)
     are the derivatives of the LEDs' world positions by them. A size has no lever; `sizes` (n, k_map) are those of the
-    relative lift (`estimator.solvers.reprojection`), per metre. `leds_m` (n, 3) are the LEDs' centres, `lift_m2` (n,)
+    relative lift (`estimator.solvers.observations`), per metre. `leds_m` (n, 3) are the LEDs' centres, `lift_m2` (n,)
     is 4 s^2 of each, m^2.
     """
 

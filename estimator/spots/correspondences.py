@@ -1,17 +1,23 @@
 """Correspondences: from a frame's images to spots of identified LEDs, the input of methods that work on spots."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame
-from estimator.spots.detect import Readout, detect
+from estimator.spots.detect import Readout, Spot, detect
 from estimator.spots.identify import Correspondence, gate_px, identify
+from estimator.spots.lamps import has_stripes, lamps_of, light_centre_px
 from estimator.spots.sampling import lens_blur
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
+
+# Offset of the plain centroid of a steady LED image from the centre of its outline, as a share of its second moment.
+MAX_STEADY_OFF = 0.2
 
 
 def find_correspondences(
@@ -20,8 +26,28 @@ def find_correspondences(
     """Spots in a frame that are identified as LEDs.
 
     `denoise` maps an image of electrons to a denoised one; each of its pixels depends on a square of
-    2 `denoise_radius_px` + 1. Raises EstimationFailure if no LED is detected or identified.
+    2 `denoise_radius_px` + 1. Under a rolling shutter, spots of LED images with stripes are the centres of their
+    outlines (`estimator.spots.striped`), without denoising, which would mix lines. Raises EstimationFailure if no LED
+    is detected or identified.
     """
+    if has_stripes(frame):
+        return _find_striped(frame)
+    return list(
+        identify(
+            _detected(frame, denoise, denoise_radius_px), frame.spots, frame.leds, _gate_px(frame, denoise_radius_px)
+        )
+    )
+
+
+def _gate_px(frame: DeviceFrame, denoise_radius_px: int) -> float:
+    # A denoiser may move light by its radius: Algorithm 1 as printed does by half of it.
+    return gate_px(frame.camera.width_px) + denoise_radius_px
+
+
+def _detected(
+    frame: DeviceFrame, denoise: Callable[[Image], Image] | None = None, denoise_radius_px: int = 0
+) -> tuple[Spot, ...]:
+    """Spots of LED images without stripes; raises EstimationFailure if there is none."""
     readouts, sensor = [], frame.sensor
     for part in frame.parts:
         raw = frame.electrons(part)
@@ -31,11 +57,29 @@ def find_correspondences(
     decoded_px = np.array([(spot.u_px, spot.v_px) for spot in frame.spots]).reshape(-1, 2)
     any_square = any(frame.leds[spot.led].shape == "square" for spot in frame.spots)
     sensor_px = frame.camera.width_px * frame.camera.height_px
-    # A denoiser may move light by its radius: Algorithm 1 as printed does by half of it.
-    gate = gate_px(frame.camera.width_px) + denoise_radius_px
-    lens = lens_blur(frame.camera)
-    spots = detect(readouts, sensor_px, denoise_radius_px, decoded_px, any_square, gate, lens, sensor.crosstalk)
-    return list(identify(spots, frame.spots, frame.leds, gate))
+    gate, lens = _gate_px(frame, denoise_radius_px), lens_blur(frame.camera)
+    return detect(readouts, sensor_px, denoise_radius_px, decoded_px, any_square, gate, lens, sensor.crosstalk)
+
+
+def _find_striped(frame: DeviceFrame) -> list[Correspondence]:
+    """Spots of a frame with stripes that are identified as LEDs; steady LED images have their plain centroids."""
+    lamps = lamps_of(frame)
+    if not lamps:
+        raise EstimationFailure("detect", "no LED image with stripes or without found")
+    steady = () if all(lamp.striped for lamp in lamps) else _detected(frame)
+    steady_px = np.array([(spot.u_px, spot.v_px) for spot in steady]).reshape(-1, 2)
+    spots = []
+    for lamp in lamps:
+        u_px, v_px = light_centre_px(lamp, frame.camera).tolist()
+        spot = replace(lamp.spot(), u_px=u_px, v_px=v_px)
+        if not lamp.striped and len(steady):
+            off_px = np.abs(steady_px - (lamp.u_px, lamp.v_px))
+            nearest = int(off_px.sum(axis=1).argmin())
+            # A plain centroid and that of the edges differ by less than a tenth of the LED image's size.
+            if (off_px[nearest] ** 2 <= MAX_STEADY_OFF**2 * np.diag(lamp.moments_px2)).all():
+                spot = steady[nearest]
+        spots.append(spot)
+    return list(identify(spots, frame.spots, frame.leds, _gate_px(frame, 0)))
 
 
 def led_positions_m(correspondences: Sequence[Correspondence]) -> Floats:

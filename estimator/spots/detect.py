@@ -160,7 +160,7 @@ def detect(
     size = (SMOOTHING_PX, SMOOTHING_PX)
     smooth = [cv2.blur(readout.image_e, size, borderType=cv2.BORDER_REPLICATE) for readout in readouts]
     whole = sum(image.size for image in smooth) == sensor_px and len(smooth) == 1
-    background_e, threshold_e = _levels(smooth, whole, _brightest(readouts, smooth, decoded_px, near_px))
+    background_e, threshold_e = levels_of(smooth, whole, brightest_of(readouts, smooth, decoded_px, near_px))
     measured: list[_Measured] = []
     found, small, large = 0, 0, 0
     for readout, image in zip(readouts, smooth, strict=True):
@@ -206,7 +206,7 @@ def _with_neighbours(ellipses: Sequence[_Ellipse], denoise_radius_px: int) -> It
         yield ellipse, [ellipses[other] for other in np.flatnonzero(overlaps).tolist()]
 
 
-def _brightest(
+def brightest_of(
     readouts: Sequence[Readout], smooth: Sequence[NDArray[np.float32]], decoded_px: Pixels | None, near_px: float
 ) -> float:
     """Brightness of the LEDs, electrons: median of the maxima near the decoded pixels, or the image's maximum."""
@@ -223,7 +223,7 @@ def _brightest(
     return float(np.median(peaks)) if peaks else max(float(image.max()) for image in smooth)
 
 
-def _levels(smooth: Sequence[NDArray[np.float32]], whole: bool, brightest_e: float) -> tuple[float, float]:
+def levels_of(smooth: Sequence[NDArray[np.float32]], whole: bool, brightest_e: float) -> tuple[float, float]:
     """Background and the threshold for blobs, electrons.
 
     In a full frame most pixels are background, and a subset of them suffices. An LED image may fill most of its region

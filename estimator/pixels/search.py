@@ -1,0 +1,238 @@
+"""Search of the most likely pose and nuisances with given pixel readings: Fisher scoring."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.camera.pose import POSE_PARAMETERS, Pose
+from estimator.errors import EstimationFailure
+from estimator.io.device import DeviceFrame
+from estimator.pixels.initial import CONVERGED_STEP2, tuned
+from estimator.pixels.led_model import (
+    MOTION_COLUMNS,
+    POSE_ALONE,
+    SIZE_PARAMETER,
+    TILT_PARAMETERS,
+    ImageState,
+    RenderedLeds,
+    rim,
+)
+from estimator.pixels.led_pixels import LedPixels
+from estimator.pixels.likelihood import Noise, PhotometricFit, excess_chi2, fit_photometry, score
+from estimator.pixels.nuisances import (
+    PROFILE,
+    SIZE,
+    TILTS,
+    Components,
+    Gravity,
+    Nuisances,
+    Priors,
+    Solution,
+    solve,
+    square_root,
+)
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+MAX_STEPS = 40
+# A search that ends by the number of its steps has converged if they are shorter than a standard deviation, squared.
+MAX_CIRCLE2 = 1.0
+# Points of a rim whose movement is looked at.
+RIM_POINTS = 4
+# With nuisances a step of the pose may be short while LEDs still move in their images: no rim may move by more. Smaller
+# than the shift that `likelihood` tolerates in an LED's chi-square.
+CONVERGED_PX = 0.02
+# A step that multiplies the mean deviance by more was too long. Smaller increases occur when readings near saturation
+# enter or leave.
+MAX_DEVIANCE_RATIO = 1.01
+# A step is shortened so many times at most: where a wrong LED's weights change, the deviance grows without a step.
+MAX_SHORTENED = 3
+# A step that takes back more than this share of the one before overshoots and is halved: where an edge enters a pixel,
+# the likelihood is curved more than the information says, and full steps would go back and forth for ever.
+MAX_RETURN = 0.5
+# Signal-to-noise ratio of an LED's amplitude below which it is not used.
+MIN_SIGNAL_TO_NOISE = 5.0
+# Among LEDs that are not explained, those with at least this share of the largest excess are excluded together.
+MIN_EXCLUDED_SHARE = 0.25
+DAMPING_RATIO = 8.0
+MIN_DAMPING = 1e-3
+DIVERGED = "the likelihood has no maximum near the pose of the spots"
+# An edge is displaced by errors of the background that it does not share with the pixels beyond it: at most this many
+# pixels times the background's share of the LED's luminance, one standard deviation.
+BACKGROUND_EDGE_PX = 0.02
+
+
+def image_parameters(priors: Priors) -> Ints:
+    """The parameters to estimate: pose, intrinsics, tilts and motion with a prior, sizes because of the background."""
+    of_camera = POSE_PARAMETERS + np.flatnonzero(priors.camera)
+    of_face = [SIZE_PARAMETER, *(TILT_PARAMETERS if priors.leds[:, TILTS].any() else ())]
+    return np.concatenate([POSE_ALONE, of_camera, of_face, MOTION_COLUMNS[: len(priors.motion)]])
+
+
+@dataclass(frozen=True, eq=False)
+class ScoringResult:
+    """Result of Fisher scoring.
+
+    `converged` says whether the maximum was reached, and not the limit of validity of the gathered pixels. `used`,
+    `faint` (used, but with a low signal-to-noise ratio) and `excess` (of chi-square over its limit) are by LED, (n,).
+    `moved_px` is the largest movement of an image since its pixels were gathered, `damping` that of the next step.
+    """
+
+    pose: Pose
+    nuisances: Nuisances
+    converged: bool
+    solution: Solution
+    components: Components
+    photometry: PhotometricFit
+    used: Mask
+    faint: Mask
+    excess: Floats
+    moved_px: float
+    damping: float
+
+
+class Search:
+    """Fisher scoring with the readings around LEDs; `priors` are those of the LEDs."""
+
+    def __init__(
+        self,
+        frame: DeviceFrame,
+        pixels: LedPixels,
+        gravity: Gravity,
+        priors: Priors,
+        start_information: Floats,
+        damping: float,
+    ) -> None:
+        """Prepare a search; `start_information` (6, 6) is that of the initial pose, which `damping` times holds it."""
+        self._camera = frame.camera
+        self._pixels = pixels
+        self._gravity = gravity
+        self._priors = priors
+        self._noise = Noise.of(frame)
+        self._start_information = start_information
+        self._first_damping = damping
+        # Of a large LED, a point of the rim moves more than the centre.
+        self._rims_m = np.stack([rim(led, RIM_POINTS) for led in pixels.leds])
+        self._centres_m = np.array([led.position_m for led in pixels.leds])
+        self._origin_px = self._rims_px(pixels.state)
+
+    def run(self, used: Mask, pose: Pose, nuisances: Nuisances, components: Components) -> ScoringResult:
+        """Scoring with the LEDs used, (n,), to convergence or until the images leave the gathered pixels."""
+        pixels, camera = self._pixels, self._camera
+        stated = self._with_edge_errors(used)
+        priors = components.added(stated)
+        photometry: PhotometricFit | None = None
+        factor, accepted, min_deviance = 1.0, (pose, nuisances), np.inf
+        step: Solution | None = None
+        damping, shortened = self._first_damping, 0
+        for _ in range(MAX_STEPS):
+            state = nuisances.state(pose, camera, priors)
+            rendered = self._rendered(state)
+            profile = nuisances.profile() if priors.leds[:, PROFILE].any() else None
+            angles = pose.rig_angles(camera)
+            candidate = fit_photometry(pixels, rendered, used, self._noise, photometry, profile)
+            of_priors = self._gravity.deviance(angles) + nuisances.deviance(priors)
+            deviance = candidate.deviance + of_priors / len(pixels.electrons)
+            too_long = deviance > MAX_DEVIANCE_RATIO * min_deviance  # for the linearization
+            if step is not None and too_long and shortened < MAX_SHORTENED:
+                shortened += 1
+                factor /= 4
+                pose, nuisances = self._moved(accepted, step, factor)
+                continue
+            photometry, accepted, shortened = candidate, (pose, nuisances), 0
+            rows, right = square_root(*score(pixels, rendered, photometry, profile))
+            before = step
+            if damping > 0:
+                held = damping * self._start_information
+                step = solve(rows, right, priors, nuisances, self._gravity, angles, held)
+            else:
+                components, step = tuned(components, stated, used, rows, right, nuisances, self._gravity, angles)
+            priors = components.added(stated)
+            of_priors = self._gravity.deviance(angles) + nuisances.deviance(priors)
+            min_deviance = candidate.deviance + of_priors / len(pixels.electrons)
+            factor = 1.0 if before is None else self._damping(step, before, factor)
+            moved_px = self._movement_px(accepted, step, factor, priors)
+            factor *= min(1.0, pixels.max_move_px / max(moved_px, 1e-12))
+            short = moved_px < pixels.max_move_px
+            converged = step.step2 * factor**2 < CONVERGED_STEP2 and short and damping == 0
+            converged &= priors.exact or moved_px < CONVERGED_PX
+            if damping > 0:
+                damping *= DAMPING_RATIO ** (-1 if short else moved_px > 4 * pixels.max_move_px)
+                damping = damping if damping > MIN_DAMPING else 0.0
+            pose, nuisances = self._moved(accepted, step, factor)
+            off_px = self._rims_px(nuisances.state(pose, camera, priors)) - self._origin_px
+            if converged or not bool((np.linalg.norm(off_px, axis=-1) < pixels.max_move_px).all()):
+                break
+        else:
+            # Wrong LEDs may make the search go round in small circles.
+            converged = damping == 0 and step is not None and step.step2 * factor**2 < MAX_CIRCLE2
+            if not converged:
+                raise EstimationFailure("fit", DIVERGED)
+        assert step is not None
+        assert photometry is not None
+        self._first_damping = damping
+        count = len(pixels.leds)
+        max_signal_to_noise = np.zeros(count)
+        np.maximum.at(max_signal_to_noise, pixels.led, photometry.signal_to_noise)
+        excess: Floats = np.asarray(
+            np.bincount(pixels.led, excess_chi2(pixels, rendered, photometry), count), dtype=np.float64
+        )
+        faint = used & (max_signal_to_noise < MIN_SIGNAL_TO_NOISE)
+        moved = float(np.linalg.norm(off_px, axis=-1).max())
+        return ScoringResult(
+            pose, nuisances, converged, step, components, photometry, used, faint, excess, moved, damping
+        )
+
+    def _damping(self, step: Solution, before: Solution, factor: float) -> float:
+        """Factor of a step: a half where it takes back much of the one before."""
+        inner = step.view_step @ step.information @ before.view_step * factor
+        length2 = before.view_step @ step.information @ before.view_step * factor**2
+        return 0.5 if inner < -MAX_RETURN * length2 else 1.0
+
+    def _with_edge_errors(self, used: Mask) -> Priors:
+        """The priors, with the errors of the sizes that an imperfect background causes."""
+        pixels = self._pixels
+        photometry = fit_photometry(pixels, pixels.rendered, used, self._noise)
+        amplitude, background = np.zeros(len(pixels.leds)), np.zeros(len(pixels.leds))
+        np.maximum.at(amplitude, pixels.led, photometry.amplitude)
+        np.maximum.at(background, pixels.led, photometry.background)
+        share = np.divide(background, amplitude, out=np.zeros_like(amplitude), where=amplitude > 0)
+        size_px = np.linalg.norm(self._origin_px - self._origin_px.mean(axis=1, keepdims=True), axis=-1).mean(axis=1)
+        leds = self._priors.leds.copy()
+        leds[:, SIZE] = np.hypot(leds[:, SIZE], BACKGROUND_EDGE_PX * np.minimum(share, 1.0) / size_px)
+        return replace(self._priors, leds=leds)
+
+    def _rendered(self, state: ImageState) -> RenderedLeds:
+        pixels = self._pixels
+        return pixels.rendered if state is pixels.state else pixels.model.render(state, pixels.rendered.parameters)
+
+    def _moved(self, start: tuple[Pose, Nuisances], step: Solution, factor: float) -> tuple[Pose, Nuisances]:
+        return start[0].moved(factor * step.pose_step, self._camera), start[1].moved(step.step, factor)
+
+    def _movement_px(self, start: tuple[Pose, Nuisances], step: Solution, factor: float, priors: Priors) -> float:
+        """Largest movement of a point of a rim by a step."""
+        before, after = (
+            self._rims_px(nuisances.state(pose, self._camera, priors))
+            for pose, nuisances in (start, self._moved(start, step, factor))
+        )
+        return float(np.nan_to_num(np.linalg.norm(after - before, axis=-1), nan=np.inf).max())
+
+    def _rims_px(self, state: ImageState) -> Floats:
+        """Points of the rims, (n, RIM_POINTS, 2)."""
+        centres_m = self._centres_m + state.shifts_m
+        points_m = centres_m[:, None] + state.rims_m(self._rims_m)
+        return state.project(points_m.reshape(-1, 3)).pixels.reshape(-1, RIM_POINTS, 2)
+
+
+def unexplained(result: ScoringResult) -> Mask:
+    """LEDs used to exclude: the faint ones, or else those with the largest excess of chi-square, if any is positive.
+
+    A wrong LED biases the pose, so that true LEDs near it have an excess too, but a far smaller one.
+    """
+    if result.faint.any():
+        return result.faint
+    excess = np.where(result.used, result.excess, 0.0)
+    return np.asarray((excess > 0) & (excess >= MIN_EXCLUDED_SHARE * excess.max()))

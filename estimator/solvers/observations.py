@@ -1,0 +1,275 @@
+"""Observations of a fit: spots in a pinhole's image plane with their covariances, gravity, and motion.
+
+What the device does not know exactly, but states how well it knows, moves spots together
+(`estimator.solvers.uncertainty`): with S the covariance of those errors and J the slopes of the spots by them, the
+spots have the covariance C = C_centroids + J S J^T, which is not block-diagonal. A camera that moves while its lines
+are exposed one after another displaces spots by its velocity (`estimator.solvers.shutter_motion`).
+
+The centroid of an LED's image differs from the image of the LED's centre; photogrammetry calls the difference
+eccentricity (Lenz & Fritsch 1990). Here it has a closed form. A face of uniform luminance, at X from the camera,
+illuminates the image plane in proportion to z / |X|^4 per unit of its own area: its solid angle, and the lens's cos^4.
+The centroid of its image is then the image of M = mean of X / |X|^4 over the face. With the mean X0, at the distance d,
+the upward normal n, and the mean square extent s^2 along any direction of the face, X / |X|^4 to second order puts M
+along X0 + 4 s^2 (n . X0) / d^2 n: **the image of a point above the LED by 4 s^2 h / d^2**, where h is the LED's height
+above the camera. s^2 is r^2 / 4 for a disc of radius r, and a^2 / 12 for a square of side a. The next order is
+r^4 / h^3, a nanometre.
+
+The closed form holds in a pinhole's image plane. A lens that bends straight lines also bends the image of an LED, and
+the undistorted centroid is then not the centroid of the undistorted image. `corrected_for_eccentricity` subtracts that
+difference once a pose determines the size of the images.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from estimator.camera.leveling import tilt_from_gravity, tilt_sigmas
+from estimator.camera.motion import seen_in_motion
+from estimator.camera.pose import Pose
+from estimator.camera.projection import projection_of
+from estimator.camera.undistort import has_pinhole_image, pinhole_image
+from estimator.io.device import Camera, DeviceFrame
+from estimator.solvers.shutter_motion import ShutterMotion, image_slopes, motion_prior
+from estimator.solvers.uncertainty import Uncertainty, assumed_uncertainty, uncertainty
+from estimator.spots.correspondences import centroids_px, led_positions_m
+from estimator.spots.identify import Correspondence
+
+Floats = NDArray[np.float64]
+
+# Added to every centroid's covariance, so that a spot without noise has a finite weight.
+MIN_CENTROID_SIGMA_PX = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """Input of a fit: centroids in a pinhole's image plane, and a reading of gravity.
+
+    `leds_m` (n, 3) are the centres of the LEDs, world metres; `lift_m2` (n,) is 4 s^2 of each LED, m^2, see the module.
+    `image` (n, 2) are centroids in normalized pinhole coordinates; `whitening` (n, 2, 2) maps an offset in them to one
+    of unit covariance, by the centroids' own errors; `from_pixels` (n, 2, 2) maps an offset in pixels to one in them.
+    `tilt_rad` (2,) is (tilt_x, tilt_y) by the accelerometer, `tilt_sigma_rad` (2,) its standard deviations, infinite if
+    gravity is not used. `uncertainty` are the errors of camera and map that the device states, whose standard
+    deviations count `scale` times; `added_sigma_px` is a further standard deviation of each centroid, for errors that
+    the device does not state. `motion` are the times of the spots and the prior of the velocity where the camera has a
+    rolling shutter, else None.
+    """
+
+    leds_m: Floats
+    lift_m2: Floats
+    camera: Camera
+    image: Floats
+    whitening: Floats
+    from_pixels: Floats
+    tilt_rad: Floats
+    tilt_sigma_rad: Floats
+    uncertainty: Uncertainty
+    scale: float = 1.0
+    added_sigma_px: float = 0.0
+    motion: ShutterMotion | None = None
+
+    @property
+    def correlated(self) -> bool:
+        """Whether errors of camera or map move spots together."""
+        return len(self.uncertainty.sigmas) > 0
+
+    @property
+    def displaced(self) -> bool:
+        """Whether spots may be displaced by more than their centroids' errors: by those of camera or map, or motion."""
+        return self.correlated or self.motion is not None
+
+    @property
+    def still_image(self) -> Floats:
+        """Spots (n, 2) with the turns of the camera undone that the gyroscope says; `image` for a global shutter."""
+        return self.image if self.motion is None else self.motion.turned_back(self.image)
+
+    def images(self, pose: Pose, velocity: Floats | None = None) -> tuple[Floats, Floats]:
+        """Centroids (n, 2) that a pose at mid-readout predicts, and depths (n,), metres; see `centroid_images`.
+
+        `velocity` (6,) is the camera's, that of the prior if None; a global shutter has none.
+        """
+        if self.motion is None:
+            return centroid_images(pose, self.leds_m, self.lift_m2)
+        now = self.motion.prior.velocity if velocity is None else velocity
+        p_cam = seen_in_motion(self.lifted_m(pose, now), pose, now, self.motion.times_s).p_cam
+        return _in_plane(p_cam), p_cam[:, 2]
+
+    def lifted_m(self, pose: Pose, velocity: Floats) -> Floats:
+        """Points (n, 3), world metres, whose images are the centroids of the LEDs' images, see the module."""
+        times_s = np.zeros(len(self.leds_m)) if self.motion is None else self.motion.times_s
+        offset = self.leds_m - pose.position_m - times_s[:, None] * velocity[3:]
+        lifted = self.leds_m.copy()
+        lifted[:, 2] += self.lift_m2 * offset[:, 2] / (offset**2).sum(axis=1)
+        return lifted
+
+    def total_covariance(self, pose: Pose) -> Floats:
+        """`covariance` with the displacements by the prior of the velocity, (2n, 2n)."""
+        total = self.covariance(pose)
+        return total if self.motion is None else total + self.motion.covariance(self.leds_m, pose)
+
+    def covariance(self, pose: Pose) -> Floats:
+        """Covariance (2n, 2n) of the spots at a pose, in normalized pinhole coordinates, (x, y) of each in turn."""
+        count = len(self.leds_m)
+        total = np.zeros((count, 2, count, 2))
+        if self.correlated:
+            # An LED without an image at this pose, an outlier, has no slopes.
+            slopes = np.nan_to_num(self.uncertainty.slopes_px(pose) * (self.scale * self.uncertainty.sigmas))
+            slopes = self.from_pixels @ slopes
+            flat = slopes.reshape(2 * count, -1)
+            total = (flat @ flat.T).reshape(count, 2, count, 2)
+        every = np.arange(count)
+        total[every, :, every] += self.own_covariance()
+        return np.asarray(total.reshape(2 * count, 2 * count))
+
+    def own_covariance(self) -> Floats:
+        """Covariance (n, 2, 2) of each spot by its centroid's own errors and `added_sigma_px`."""
+        spread = np.linalg.inv(self.whitening)
+        added = self.added_sigma_px**2 * (self.from_pixels @ self.from_pixels.transpose(0, 2, 1))
+        return np.asarray(spread @ spread.transpose(0, 2, 1) + added)
+
+    def with_assumed_camera(self) -> "Observations":
+        """The same spots; a camera that states nothing has the errors of one as sold."""
+        if self.camera.uncertainty is not None:
+            return self
+        camera = self.camera.model_copy(update={"uncertainty": assumed_uncertainty(self.camera)})
+        return replace(self, uncertainty=self.uncertainty.with_camera(camera))
+
+    def without_gravity(self) -> "Observations":
+        """The same spots without gravity."""
+        return replace(self, tilt_sigma_rad=np.full(2, np.inf))
+
+    def only(self, chosen: NDArray[np.bool_]) -> "Observations":
+        """The chosen spots, (n,), with the same gravity."""
+        return replace(
+            self,
+            leds_m=self.leds_m[chosen],
+            lift_m2=self.lift_m2[chosen],
+            image=self.image[chosen],
+            whitening=self.whitening[chosen],
+            from_pixels=self.from_pixels[chosen],
+            uncertainty=self.uncertainty.only(chosen),
+            motion=None if self.motion is None else self.motion.only(chosen),
+        )
+
+
+def observe(
+    frame: DeviceFrame, correspondences: Sequence[Correspondence], centroid_sigma_px: float = 0.0
+) -> Observations:
+    """Observations of a frame; spots that cannot be undistorted are left out.
+
+    `centroid_sigma_px` is a standard deviation of each centroid's coordinates beside that by the pixels' noise. Raises
+    EstimationFailure if the accelerometer reads zero or no spot is left.
+    """
+    camera = frame.camera
+    usable = has_pinhole_image(centroids_px(correspondences), camera)
+    if usable.any():
+        correspondences = [one for one, use in zip(correspondences, usable, strict=True) if use]
+    image, prior = pinhole_image(centroids_px(correspondences), camera), motion_prior(frame)
+    covariance_px2 = np.array([one.spot.covariance_px2 for one in correspondences]).reshape(-1, 2, 2)
+    added_px2 = MIN_CENTROID_SIGMA_PX**2 + centroid_sigma_px**2
+    # At depth 1 the projection's Jacobian by x and y is that from pinhole coordinates to the lens's.
+    rays = np.column_stack([image, np.ones(len(image))])
+    to_pixels = camera.matrix()[:2, :2] @ projection_of(camera).project(rays)[1][:, :, :2]
+    from_pixels = np.linalg.inv(to_pixels)
+    covariance = from_pixels @ (covariance_px2 + added_px2 * np.eye(2)) @ from_pixels.transpose(0, 2, 1)
+    tilt, tilt_sigma_rad = (0.0, 0.0), np.full(2, np.inf)
+    if frame.accelerometer is not None:
+        tilt = tilt_from_gravity(frame.accelerometer_m_s2)
+        tilt_sigma_rad = tilt_sigmas(frame.accelerometer, tilt[1])
+    return Observations(
+        leds_m=led_positions_m(correspondences),
+        lift_m2=np.array([4 * one.led.mean_square_extent_m2 for one in correspondences]),
+        camera=camera,
+        image=image,
+        whitening=np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)), dtype=np.float64),
+        from_pixels=np.asarray(from_pixels, dtype=np.float64),
+        tilt_rad=np.array(tilt),
+        tilt_sigma_rad=tilt_sigma_rad,
+        uncertainty=uncertainty(camera, [one.led for one in correspondences], frame.luminaires, frame.map_datum),
+        motion=None if prior is None else ShutterMotion(camera.times_s(*centroids_px(correspondences).T), prior),
+    )
+
+
+def centroid_images(pose: Pose, leds_m: Floats, lift_m2: Floats) -> tuple[Floats, Floats]:
+    """Centroids (n, 2) of the images of LEDs (n, 3) in the pinhole's image plane, and the LEDs' depths (n,), metres."""
+    offset = leds_m - pose.position_m
+    lifted = leds_m.copy()
+    lifted[:, 2] += lift_m2 * offset[:, 2] / (offset**2).sum(axis=1)
+    p_cam = pose.in_camera(lifted)
+    return _in_plane(p_cam), p_cam[:, 2]
+
+
+def _in_plane(p_cam: Floats) -> Floats:
+    """Points (n, 3) in camera axes in the pinhole's image plane, (n, 2)."""
+    # An LED behind the camera has no image; here it only has to be far off, and finite.
+    depth = np.where(np.abs(p_cam[:, 2]) < 1e-9, 1e-9, p_cam[:, 2])
+    return np.asarray(p_cam[:, :2] / depth[:, None])
+
+
+def pose_vector(observations: Observations, pose: Pose) -> Floats:
+    """Parameters (6,) of a pose: a rotation vector, and the mean of the LEDs in camera axes, metres."""
+    vector = Rotation.from_matrix(pose.R_cam_world).as_rotvec()
+    return np.concatenate([vector, pose.R_cam_world @ (observations.leds_m.mean(axis=0) - pose.position_m)])
+
+
+def pose_slopes(observations: Observations, pose: Pose) -> tuple[Floats, Floats]:
+    """Derivatives by six parameters of a pose: of spots in normalized coordinates (n, 2, 6), of the position (3, 6).
+
+    The parameters are a rotation vector and a translation of the LEDs about their mean. Motion is left out.
+    """
+    x = pose_vector(observations, pose)
+    model = np.ascontiguousarray(observations.leds_m - observations.leds_m.mean(axis=0))
+    of_image = cv2.projectPoints(model, x[:3], x[3:], np.eye(3), None)[1][:, :6].reshape(-1, 2, 6)
+    return of_image, position_slopes(x)
+
+
+def moving_slopes(observations: Observations, pose: Pose, velocity: Floats, x: Floats) -> Floats:
+    """Derivatives (n, 2, 12) of spots in normalized coordinates by the six parameters x of `pose_slopes`, and velocity.
+
+    The camera has a rolling shutter.
+    """
+    motion = observations.motion
+    assert motion is not None
+    seen = seen_in_motion(observations.leds_m, pose, velocity, motion.times_s)
+    by_point = image_slopes(seen.p_cam)
+    centre = observations.leds_m.mean(axis=0)
+    # About the LEDs' mean, without the translation.
+    arms = seen.offset_m - (centre - pose.position_m)
+    by_vector = cv2.Rodrigues(x[:3])[1].reshape(3, 3, 3)
+    by_pose = np.concatenate([np.einsum("kij,nj->nik", by_vector, arms), np.tile(np.eye(3), (len(arms), 1, 1))], axis=2)
+    return np.asarray(by_point @ np.concatenate([seen.turned @ by_pose, seen.by_motion], axis=2))
+
+
+def corrected_for_eccentricity(observations: Observations, pose: Pose) -> Observations:
+    """Observations with centroids as a lens that does not bend the images would have them, of the size by a pose.
+
+    Each LED is represented by four points, sqrt(2) s from its centre along x and y, which have its s^2. Their images
+    are weighted by the lens's irradiance, z / |X|^4, for any lens: a lens that spreads light over more pixels makes it
+    dimmer. An LED with a point that has no image is not corrected. Motion shifts an image by some pixels, over which
+    the difference does not change.
+    """
+    steps = np.sqrt(observations.lift_m2 / 2)[:, None, None] * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
+    points_m = (observations.leds_m[:, None] + steps).reshape(-1, 3)
+    p_cam = pose.in_camera(points_m)
+    camera = observations.camera
+    lens_image = projection_of(camera).project(p_cam)[0].reshape(-1, 4, 2)
+    p_cam = p_cam.reshape(-1, 4, 3)
+    imaged = (p_cam[..., 2] > 0).all(axis=1) & np.isfinite(lens_image).all(axis=(1, 2))
+    p_cam, lens_image = p_cam[imaged], lens_image[imaged]
+    weights = p_cam[..., 2] / (p_cam**2).sum(axis=2) ** 2
+    weights /= weights.sum(axis=1, keepdims=True)
+    lens_centroids = pinhole_image(camera.to_pixels((weights[..., None] * lens_image).sum(axis=1)), camera)
+    pinhole_centroids = (weights[..., None] * p_cam[..., :2] / p_cam[..., 2:]).sum(axis=1)
+    image = observations.image.copy()
+    image[imaged] -= lens_centroids - pinhole_centroids
+    return replace(observations, image=image)
+
+
+def position_slopes(x: Floats) -> Floats:
+    """Derivatives (3, 6) of `centre - R^T t` by the rotation vector and t."""
+    R_cam_world, by_vector = cv2.Rodrigues(x[:3])
+    by_rotation = np.column_stack([-by_vector[k].reshape(3, 3).T @ x[3:] for k in range(3)])
+    return np.hstack([by_rotation, -R_cam_world.T])
