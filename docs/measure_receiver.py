@@ -200,7 +200,7 @@ class _Group:
 
 
 def _groups(dataset: Dataset) -> Iterator[_Group]:
-    """Groups of two LED images or more in the first frame of each burst."""
+    """Groups that show as many chips as a packet has bits, in the first frame of each burst."""
     if dataset.downlink is None:
         return
     (packets,) = (one for one in dataset.downlink.transmitters if isinstance(one, Packets))
@@ -210,8 +210,10 @@ def _groups(dataset: Dataset) -> Iterator[_Group]:
         for group in find_groups([frame], [images], packets):
             hypotheses = group.alike()[0]
             laid = np.flatnonzero(hypotheses[0] >= 0)
-            if len(laid) > 1:
-                signals = tuple(images[group.members[one].numbers[0]].signal for one in laid)
+            signals = tuple(images[group.members[one].numbers[0]].signal for one in laid)
+            chips = sum(float(np.ptp(one.start_s)) for one in signals) / (packets.chip_us * 1e-6)
+            # A packet cannot be found in fewer chips: such groups would prove nothing.
+            if chips >= PacketFormat(packets).bits:
                 yield _Group(signals, tuple(one[laid] for one in hypotheses), packets)
 
 
