@@ -36,7 +36,7 @@ RANDOM_PANELS = 10_000
 OFFICE200 = 200
 
 
-def print_bit_errors() -> None:
+def bit_errors() -> None:
     """Error rates of bits in Manchester code against theory; 3 standard deviations are those of a binomial number."""
     heading("exposure / chip", "e/px, lit", "bits", "wrong", "theory", "standard deviations off")
     for ratio in (0.4, 1.0, 1.3):
@@ -215,11 +215,6 @@ def _groups(dataset: Dataset) -> Iterator[_Group]:
             # A packet cannot be found in fewer chips: such groups would prove nothing.
             if chips >= PacketFormat(packets).bits:
                 yield _Group(signals, tuple(one[laid] for one in hypotheses), packets)
-
-
-def bit_errors(measurement: Measurement) -> None:
-    """Bit errors in Manchester code against theory."""
-    print_bit_errors()
 
 
 def identities(measurement: Measurement) -> None:
