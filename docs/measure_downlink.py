@@ -3,7 +3,8 @@
     python docs/measure_downlink.py [SECTION ...]
 
 Sections: `waves` (integrals of the waves against numerical ones), `codes` (parts of codes that are found twice),
-`flicker` (modulation against IEEE 1789), `burst_cost` (time of a further frame of a burst),
+`flicker` (modulation against IEEE 1789), `burst_cost` (time of a further frame of a burst), `bit_errors` (against
+theory), `identities` (decoded from codes), `panels` (decoded from packets; packets found in random chips),
 `motion` (positions by a rolling shutter in motion).
 """
 
@@ -15,6 +16,7 @@ from tempfile import TemporaryDirectory
 from time import perf_counter
 
 import measure_motion
+import measure_receiver
 import numpy as np
 from measure import Measurement, heading, number, row
 from numpy.typing import NDArray
@@ -155,8 +157,23 @@ def motion(chosen: Chosen) -> None:
     measure_motion.rendered(chosen.measurement)
 
 
+def bit_errors(chosen: Chosen) -> None:
+    """Bit errors in Manchester code against theory."""
+    measure_receiver.bit_errors()
+
+
+def identities(chosen: Chosen) -> None:
+    """Codes at 10/40/25 us over the poses of office200, identified in single frames."""
+    measure_receiver.identities(chosen.measurement)
+
+
+def panels(chosen: Chosen) -> None:
+    """Packets at 10/40/50 us over the poses of office200, by one frame of a burst and by two; no map."""
+    measure_receiver.panels(chosen.measurement)
+
+
 SECTIONS: dict[str, Callable[[Chosen], None]] = {
-    section.__name__: section for section in (waves, codes, flicker, burst_cost, motion)
+    section.__name__: section for section in (waves, codes, flicker, burst_cost, bit_errors, identities, panels, motion)
 }
 
 
