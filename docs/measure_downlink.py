@@ -5,7 +5,8 @@
 Sections: `waves` (integrals of the waves against numerical ones), `codes` (parts of codes that are found twice),
 `flicker` (modulation against IEEE 1789), `burst_cost` (time of a further frame of a burst), `bit_errors` (against
 theory), `identities` (decoded from codes), `panels` (decoded from packets; packets found in random chips),
-`motion` (positions by a rolling shutter in motion).
+`motion` (positions by a rolling shutter in motion), `striped` (centres of striped LED images), `tones` (frequencies of
+LED images), `photograph` (a real one; its path is given by --photograph).
 """
 
 import argparse
@@ -17,6 +18,7 @@ from time import perf_counter
 
 import measure_motion
 import measure_receiver
+import measure_striped
 import numpy as np
 from measure import Measurement, heading, number, row
 from numpy.typing import NDArray
@@ -57,6 +59,7 @@ class Chosen:
     """What the command line asks for."""
 
     measurement: Measurement
+    photographs: Sequence[Path] = ()
 
 
 def waves(chosen: Chosen) -> None:
@@ -172,8 +175,36 @@ def panels(chosen: Chosen) -> None:
     measure_receiver.panels(chosen.measurement)
 
 
+def striped(chosen: Chosen) -> None:
+    """Centres of striped LED images, px: by edges, by a plain centroid, and of the same images without stripes."""
+    measure_striped.print_centres(chosen.measurement)
+
+
+def tones(chosen: Chosen) -> None:
+    """Frequencies of tones in an LED image."""
+    measure_striped.print_tones()
+
+
+def photograph(chosen: Chosen) -> None:
+    """A real photograph of five modulated LEDs (Luxapose), as given by --photograph; and refusals."""
+    measure_striped.print_photograph(chosen.photographs, chosen.measurement.out)
+
+
 SECTIONS: dict[str, Callable[[Chosen], None]] = {
-    section.__name__: section for section in (waves, codes, flicker, burst_cost, bit_errors, identities, panels, motion)
+    section.__name__: section
+    for section in (
+        waves,
+        codes,
+        flicker,
+        burst_cost,
+        bit_errors,
+        identities,
+        panels,
+        motion,
+        striped,
+        tones,
+        photograph,
+    )
 }
 
 
@@ -183,12 +214,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("sections", nargs="*", metavar="SECTION", help=f"of {', '.join(SECTIONS)}; default: all")
     parser.add_argument("--out", type=Path, default=Path("out/measure"), help="folder of the datasets")
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--photograph", type=Path, action="append", default=[], help="may be repeated")
     asked = parser.parse_args(arguments)
     unknown = [name for name in asked.sections if name not in SECTIONS]
     if unknown:
         parser.error(f"SECTION {unknown[0]}: unknown; allowed: {', '.join(SECTIONS)}")
     asked.out.mkdir(parents=True, exist_ok=True)
-    chosen = Chosen(Measurement(asked.out, asked.workers))
+    chosen = Chosen(Measurement(asked.out, asked.workers), asked.photograph)
     for name in asked.sections or SECTIONS:
         print(f"\n## {name}: {SECTIONS[name].__doc__}", flush=True)
         SECTIONS[name](chosen)

@@ -106,9 +106,11 @@ def read_picture(path: Path, tone: Tone = "srgb", orientation: Orientation = "st
     if path.suffix.lower() in RAW_SUFFIXES:
         values, bits, curve = _developed(path), 16, _CURVES["linear"]
     else:
-        decoded = cv2.imdecode(
-            np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
-        )
+        try:
+            flags = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
+            decoded = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
+        except cv2.error:  # an empty file, or one that says it has too many pixels
+            decoded = None
         if decoded is None:
             raise InputError(f"{path}: not a readable picture; allowed: JPEG, PNG, TIFF, DNG")
         if decoded.dtype not in (np.uint8, np.uint16):
