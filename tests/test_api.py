@@ -175,7 +175,7 @@ def test_regions_alone_have_no_full_image(office: vr.Scene, small_camera: vr.Cam
 
 
 def test_waves_are_of_the_seed_and_the_start(mean: vr.ExpectedFrame, small_camera: vr.Camera) -> None:
-    """The LEDs of a frame add up to other light at another time; steady ones do not change."""
+    """The image of LEDs that transmit depends on seed and start; that of steady ones on neither."""
     sensor = vr.Sensor(noise="none", gain_e_per_dn=20.0, bits=14, full_well_e=1e6)
     rolling = vr.Camera.model_validate(
         {**small_camera.model_dump(), "shutter": {"kind": "rolling", "row_time_us": 20.0}}

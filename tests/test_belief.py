@@ -20,7 +20,7 @@ from vlcrender.config.presets import presets
 from vlcrender.core.backend import dr
 from vlcrender.dataset.belief import CAMERA_PARAMETERS, Belief
 from vlcrender.dataset.files import read_dataset_file
-from vlcrender.dataset.frame_job import Job, _noise_free_frame, make_frame
+from vlcrender.dataset.frame_job import Job, _rendered, make_frame
 from vlcrender.dataset.generate import generate
 from vlcrender.dataset.recipe import Plan, load_plan
 from vlcrender.dataset.schema import DeviceTruthRow, FrameRow, MapTruthRow, TruthRow
@@ -439,7 +439,7 @@ def test_a_led_raised_into_its_panel_is_not_hidden_by_it() -> None:
     job = Job(raised.recipe.model_dump_json(), framed.settings.model_dump_json(), str(framed.folder), "/nowhere")
     seen = 0
     for pose in range(3):
-        for patch in _noise_free_frame(job, pose, 0, None).view.patches:
+        for patch in _rendered(job, pose, 0, 0, None).image.patches:
             u, v = patch.center_px
             if 10 < u < 390 and 10 < v < 290:
                 assert patch.visible_fraction == 1.0
@@ -585,7 +585,7 @@ def test_an_aspect_ratio_leaves_the_light_of_an_led() -> None:
             *(settings.recipe.model_dump_json(), settings.scene.settings.model_dump_json()),
             *(str(settings.scene.folder), "/nowhere"),
         )
-        patches = _noise_free_frame(job, 0, 0, None).view.patches
+        patches = _rendered(job, 0, 0, 0, None).image.patches
         light.append({p.led_id: float(p.electrons_per_s.sum()) for p in patches if p.visible_fraction == 1})
     common = light[0].keys() & light[1].keys()
     assert len(common) > 5

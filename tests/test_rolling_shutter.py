@@ -60,9 +60,9 @@ def sending(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     return load_scene(scene_file(tmp_path_factory.mktemp("scene")))
 
 
-def plan_of(folder: Path, *assignments: str, downlink: str = CODE, scale: int = 1) -> Plan:
+def plan_of(folder: Path, *assignments: str, downlink: str = CODE, scale: int = 1, ambient_lux: float = 400.0) -> Plan:
     """Frames of the small camera in the room whose LEDs transmit."""
-    scene = scene_file(folder, downlink)
+    scene = scene_file(folder, downlink, ambient_lux)
     changes = [*SMALL, f"scene={scene}", "poses.count=2", "poses.min_leds=2", "expected=true", *assignments]
     return vr.load_recipe(ROOT / "datasets/quickstart.toml", changes, scale=scale)
 
@@ -217,6 +217,7 @@ def test_a_line_of_a_halo_is_that_of_all_leds_at_the_line_s_gains(
         assert by_lines[at] == pytest.approx(alone[at], abs=1e-5 * float(alone.max()))
 
 
+@pytest.mark.slow
 def test_light_of_leds_apart_is_no_part_of_it_with_crosstalk_and_mosaic(sending: Scene, small_camera: Camera) -> None:
     """Through a mosaic, with crosstalk: what remains is ambient light, of the axis the same in each pixel of a colour.
 
@@ -347,6 +348,26 @@ def test_frames_of_a_burst_differ_in_phase_and_noise_alone(bursts: Path) -> None
     assert not np.array_equal(*images)
 
 
+def test_the_room_of_a_set_flickers(tmp_path: Path) -> None:
+    """Without ambient light: each row of the ceiling over its mean in time, by the luminances of Table 1; float32."""
+    plan = plan_of(tmp_path, *ROLLING, "poses.count=1", ambient_lux=0.0)
+    vr.generate(plan, tmp_path / "set")
+    (frame,), (row,) = frames_of(tmp_path / "set")
+    pose = Pose(row.position_m, row.tilt_x_deg, row.tilt_y_deg, row.yaw_deg)
+    (view,) = Renderer(plan.scene).expected_image(PosedCamera(plan.recipe.camera, pose)).parts
+    lit = np.zeros((300, 400), dtype=bool)
+    for patch in view.patches:
+        lit[patch.roi.row : patch.roi.end_row, patch.column : patch.roi.end_column] = True
+    waves = led_waves(plan.scene.leds.transmitters, plan.recipe.seed)
+    ratio = pixels(tmp_path / "set/expected/000000.exr") / (view.background_e_per_s * frame.exposure_s)
+    for line in (5, 100, 250):
+        start_s = frame.start_s + line * 100e-6
+        mean = sum(led * wave.mean(start_s, frame.exposure_s) for led, wave in waves.items()) / 10
+        assert ratio[line][~lit[line]] == pytest.approx(np.full(np.count_nonzero(~lit[line]), mean), abs=1e-5)
+    assert np.ptp(ratio[~lit]) > 0.5
+
+
+@pytest.mark.slow
 def test_a_burst_is_rendered_once_for_each_camera(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     views: list[tuple[int, int]] = []
     rendered = frame_job._rendered
@@ -360,6 +381,7 @@ def test_a_burst_is_rendered_once_for_each_camera(tmp_path: Path, monkeypatch: p
     assert views == [(0, 0), (0, 1), (1, 0), (1, 1)]
 
 
+@pytest.mark.slow
 def test_more_workers_make_the_same_bits(bursts: Path, tmp_path: Path) -> None:
     vr.generate(plan_of(bursts.parent, *ROLLING, *BURSTS, RIG), tmp_path / "set", workers=2)
     for name in ("frames.parquet", "truth.parquet", *(f"frames/{n:06d}.exr" for n in range(24))):
@@ -474,6 +496,7 @@ def test_the_light_of_a_moving_camera_is_where_the_truth_puts_it(
         assert offsets[0][led] == pytest.approx(offsets[1][led], abs=0.02)
 
 
+@pytest.mark.slow
 def test_lines_of_the_room_have_their_own_pose(office: Scene, small_camera: Camera) -> None:
     """Rows of the background of a moving camera are rows of cameras at rest at the poses of the rows."""
     camera = Camera(**{**small_camera.model_dump(), "shutter": rolling("down", 100.0)})
@@ -552,6 +575,7 @@ def test_verify_tells_a_column_that_contradicts(moving: Path, tmp_path: Path, na
     assert any(line in problem for problem in vr.verify(folder))
 
 
+@pytest.mark.slow
 def test_the_bound_of_striped_leds_is_that_of_their_lit_lines(tmp_path: Path) -> None:
     """A direct call with each patch times its gains, in another frame of a burst; expected images are float32, 6e-8."""
     burst = ("burst={frames=2,frame_rate_hz=30.0}", "poses.count=1", "bound=true", "exposure_s=0.9e-6")
@@ -677,3 +701,22 @@ def test_a_sent_map_is_null_for_the_device_and_sealed_in_the_truth(tmp_path: Pat
     assert {row.led: row.position_m for row in rows}[4] == (0.9, 1.1, 3.5)
     assert frames_of(tmp_path / "set")[0][0].spots == ()
     assert vr.verify(tmp_path / "set") == []
+
+
+def test_expose_gives_the_bits_of_a_frame_of_a_set(tmp_path: Path) -> None:
+    plan = plan_of(tmp_path, *ROLLING)
+    vr.generate(plan, tmp_path / "set")
+    frames, truth = frames_of(tmp_path / "set")
+    row = truth[1]
+    pose = Pose(row.position_m, row.tilt_x_deg, row.tilt_y_deg, row.yaw_deg)
+    mean = vr.render(plan.scene, plan.recipe.camera, pose, sensor=plan.recipe.sensor)
+    arguments = (mean, plan.recipe.sensor, frames[1].exposure_s, plan.recipe.seed)
+    raw = vr.expose(*arguments, frame=1, start_s=frames[1].start_s, demodulation="pixels")
+    assert np.array_equal(raw.image_dn, pixels(tmp_path / "set/frames/000001.exr"))
+    record = raw.record()
+    assert record["spots"] == []
+    assert record["downlink"]["demodulation"] == "pixels"
+    assert record["start_s"] == frames[1].start_s
+    earlier = vr.expose(*arguments, frame=1)
+    assert not np.array_equal(raw.image_dn, earlier.image_dn)
+    assert len(earlier.spots) > 0

@@ -70,7 +70,10 @@ class ExpectedFrame(ExpectedImage):
 
     @property
     def truth(self) -> dict[str, Any]:
-        """The pose and every LED that lights a pixel, in the words of truth.parquet (datasets/FORMAT.md)."""
+        """The pose and every LED that lights a pixel, in the words of truth.parquet (datasets/FORMAT.md).
+
+        Clocks and phases of waves belong to a frame: they are not part of it.
+        """
         return {
             "position_m": list(self.pose.position_m),
             "R_cam_world": self.pose.rotation.ravel().tolist(),

@@ -1,4 +1,7 @@
-"""Automatic exposure: the time at which the expected image reaches a target; the image is linear in time."""
+"""Automatic exposure: the time at which the expected image reaches a target; the image is linear in time.
+
+Metering counts the mean of modulated light in time, whatever its phase in the frame.
+"""
 
 from typing import Annotated, Literal
 

@@ -5,6 +5,7 @@ The estimator is generalised least squares of the spots of one frame and the acc
 alone, as if lens and map were exact. Figures are root mean squares over the poses of the recipe.
 """
 
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.rig import MAIN, Mounted
 from vlcrender.camera.roi import RegionImage
+from vlcrender.core.warn_once import warn_once
 from vlcrender.dataset.bound_uncertainty import uncertainty_of
 from vlcrender.dataset.pose_sampling import pose_of_frame
 from vlcrender.dataset.recipe import Plan, Recipe
@@ -27,6 +29,8 @@ from vlcrender.rendering.renderer import Renderer, check_inside
 from vlcrender.rendering.spot_errors import ACCELEROMETER, NOISE, SpotErrors
 from vlcrender.rendering.uncertainty import Uncertainty
 from vlcrender.sensor.signal_chain import variance_e2
+
+log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
@@ -146,6 +150,8 @@ def error_budget(
         raise InputError("budget: needs a camera at rest; remove [motion]")
     if recipe.sensor.noise == "none":
         raise InputError('budget: needs noise; sensor.noise must not be "none"')
+    if any(transmitter.modulated for transmitter in scene.leds.transmitters):
+        warn_once(log, "budget: LEDs are modulated; the figures are those of steady light with the same mean")
     if poses < 1:
         raise InputError(f"poses = {poses}: has to be 1 or more")
     uncertainty = uncertainty_of(recipe, scene, mounted)

@@ -244,7 +244,7 @@ class Recipe(Settings):
         if not (modulated or rolling or self.burst):
             return 0.0
         burst, number = divmod(shot, self.burst_frames)
-        lasts_s = max(self._readout_s(c.camera) for c in self.cameras) + self._max_exposure_s
+        lasts_s = max(self._readout_s(c.camera) for c in self.cameras)
         if self.burst is None:
             return start_of_burst_s(self.seed, burst, lasts_s)
         lasts_s += self.burst.offset_s(self.burst.frames - 1)

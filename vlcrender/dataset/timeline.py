@@ -31,6 +31,6 @@ class Burst(Settings):
 def start_of_burst_s(seed: int, burst: int, longest_s: float) -> float:
     """Start of a burst on the rig's clock, s: at random within the first JITTER_S of its slot.
 
-    longest_s: what the longest burst of the dataset lasts.
+    longest_s: time from the start of a burst to the start of its last line's exposure.
     """
     return burst * (JITTER_S + longest_s) + JITTER_S * float(stream(seed, burst, "start").uniform())
