@@ -3,7 +3,8 @@
     python docs/measure_downlink.py [SECTION ...]
 
 Sections: `waves` (integrals of the waves against numerical ones), `codes` (parts of codes that are found twice),
-`flicker` (modulation against IEEE 1789), `burst_cost` (time of a further frame of a burst),
+`flicker` (modulation against IEEE 1789), `burst_cost` (time of a further frame of a burst), `bit_errors` (against
+theory), `identities` (decoded from codes), `panels` (decoded from packets; packets found in random chips),
 `motion` (positions by a rolling shutter in motion), `striped` (centres of striped LED images), `tones` (frequencies of
 LED images), `photograph` (a real one; its path is given by --photograph).
 """
@@ -16,6 +17,7 @@ from tempfile import TemporaryDirectory
 from time import perf_counter
 
 import measure_motion
+import measure_receiver
 import measure_striped
 import numpy as np
 from measure import Measurement, heading, number, row
@@ -158,6 +160,21 @@ def motion(chosen: Chosen) -> None:
     measure_motion.rendered(chosen.measurement)
 
 
+def bit_errors(chosen: Chosen) -> None:
+    """Bit errors in Manchester code against theory."""
+    measure_receiver.bit_errors()
+
+
+def identities(chosen: Chosen) -> None:
+    """Codes at 10/40/25 us over the poses of office200, identified in single frames."""
+    measure_receiver.identities(chosen.measurement)
+
+
+def panels(chosen: Chosen) -> None:
+    """Packets at 10/40/50 us over the poses of office200, by one frame of a burst and by two; no map."""
+    measure_receiver.panels(chosen.measurement)
+
+
 def striped(chosen: Chosen) -> None:
     """Centres of striped LED images, px: by edges, by a plain centroid, and of the same images without stripes."""
     measure_striped.print_centres(chosen.measurement)
@@ -174,7 +191,20 @@ def photograph(chosen: Chosen) -> None:
 
 
 SECTIONS: dict[str, Callable[[Chosen], None]] = {
-    section.__name__: section for section in (waves, codes, flicker, burst_cost, motion, striped, tones, photograph)
+    section.__name__: section
+    for section in (
+        waves,
+        codes,
+        flicker,
+        burst_cost,
+        bit_errors,
+        identities,
+        panels,
+        motion,
+        striped,
+        tones,
+        photograph,
+    )
 }
 
 

@@ -36,7 +36,7 @@ RANDOM_PANELS = 10_000
 OFFICE200 = 200
 
 
-def print_bit_errors() -> None:
+def bit_errors() -> None:
     """Error rates of bits in Manchester code against theory; 3 standard deviations are those of a binomial number."""
     heading("exposure / chip", "e/px, lit", "bits", "wrong", "theory", "standard deviations off")
     for ratio in (0.4, 1.0, 1.3):
@@ -200,7 +200,7 @@ class _Group:
 
 
 def _groups(dataset: Dataset) -> Iterator[_Group]:
-    """Groups of two LED images or more in the first frame of each burst."""
+    """Groups that show as many chips as a packet has bits, in the first frame of each burst."""
     if dataset.downlink is None:
         return
     (packets,) = (one for one in dataset.downlink.transmitters if isinstance(one, Packets))
@@ -210,14 +210,11 @@ def _groups(dataset: Dataset) -> Iterator[_Group]:
         for group in find_groups([frame], [images], packets):
             hypotheses = group.alike()[0]
             laid = np.flatnonzero(hypotheses[0] >= 0)
-            if len(laid) > 1:
-                signals = tuple(images[group.members[one].numbers[0]].signal for one in laid)
+            signals = tuple(images[group.members[one].numbers[0]].signal for one in laid)
+            chips = sum(float(np.ptp(one.start_s)) for one in signals) / (packets.chip_us * 1e-6)
+            # A packet cannot be found in fewer chips: such groups would prove nothing.
+            if chips >= PacketFormat(packets).bits:
                 yield _Group(signals, tuple(one[laid] for one in hypotheses), packets)
-
-
-def bit_errors(measurement: Measurement) -> None:
-    """Bit errors in Manchester code against theory."""
-    print_bit_errors()
 
 
 def identities(measurement: Measurement) -> None:

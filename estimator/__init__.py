@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from estimator.io.device import DeviceFrame, frame
     from estimator.methods.registry import estimate, estimate_device, variants
     from estimator.methods.variant import DeviceMethod, Estimate, Variant
+    from estimator.receiver.receive import receive_frames
 
     __version__: str
 
@@ -40,6 +41,7 @@ __all__ = [
     "frame",
     "read_dataset",
     "read_frame",
+    "receive_frames",
     "run",
     "score",
     "variants",
@@ -59,6 +61,7 @@ _MODULES = {
     "frame": "estimator.io.device",
     "read_dataset": "estimator.io.dataset",
     "read_frame": "estimator.io.dataset",
+    "receive_frames": "estimator.receiver.receive",
     "run": "estimator.evaluate.run",
     "score": "estimator.evaluate.score",
     "variants": "estimator.methods.registry",

@@ -18,7 +18,7 @@ from estimator.io.device import Accelerometer, Camera, DecodedSpot, DeviceFrame,
 from estimator.methods import maximum_likelihood
 from estimator.methods.gravity_fit import gravity_fit
 from estimator.methods.maximum_likelihood import Maximum, maximize, ml
-from estimator.pixels import search
+from estimator.pixels import initial, search
 from estimator.pixels.initial import Start, gravity_of, start_at_spots
 from estimator.pixels.led_model import ImageState
 from estimator.pixels.led_pixels import gather_led_pixels, leds_in_view
@@ -540,7 +540,7 @@ def test_the_areas_of_spots_tell_sizes() -> None:
     spots = find_correspondences(frame)
     pose = Pose(np.array(view.position_m), view.R_cam_world)
     start = start_at_spots(frame, gravity_of(frame), priors, spots, pose, NO_COMPONENTS)
-    assert np.abs(start.nuisances.leds[:, SIZE] - errors).max() < 4 * maximum_likelihood.START_RADIUS_PX / 17 + 0.005
+    assert np.abs(start.nuisances.leds[:, SIZE] - errors).max() < 4 * initial.START_RADIUS_PX / 17 + 0.005
 
 
 @pytest.mark.slow

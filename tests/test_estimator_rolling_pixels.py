@@ -172,8 +172,10 @@ def found_with_gains(frame: DeviceFrame, view: View) -> Maximum:
     """The maximum from a pose half a millimetre off."""
     priors = Priors.of(frame, tuple(frame.leds.values()))
     start = Pose(np.array(view.position_m) + [5e-4, -5e-4, 5e-4], view.R_cam_world)
-    nobody = np.zeros(len(frame.leds), dtype=bool)
-    return maximize(frame, gravity_of(frame), priors, Start(start, Nuisances.zero(priors), 1e-12 * np.eye(12), nobody))
+    unlocated = np.zeros(len(frame.leds), dtype=bool)
+    return maximize(
+        frame, gravity_of(frame), priors, Start(start, Nuisances.zero(priors), 1e-12 * np.eye(12), unlocated)
+    )
 
 
 @pytest.mark.slow

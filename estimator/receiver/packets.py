@@ -72,6 +72,11 @@ class PacketFormat:
         """Chips of a packet."""
         return self.packets.length
 
+    @property
+    def bits(self) -> int:
+        """Bits of a packet: data and CRC."""
+        return self.packets.data_bits + CRC_BITS
+
     def chips(self, data: Bits) -> Ints:
         """All chips (length,) of a packet with these data bits (3 coordinates and a 0)."""
         bits = np.concatenate([data, crc(data, self.packets.polynomial)])
@@ -217,10 +222,13 @@ def decode_packet(
     clock = _best_clock(normal, packets)
     period = form.length
     sums = [_added([clock.sums(signal, period) for signal in signals], period).of_one_image() for signals in normal]
+    if sum(int(one.shown.sum()) for one in sums) < form.bits - MAX_ERASED:
+        return None
     delays = np.array(packets.delays_chips)
+    ways = _different(hypotheses, delays, period)
     fits = [
-        _added([fit.turned(int(delays[index])) for fit, index in zip(sums, indices, strict=True)], period)
-        for indices in hypotheses
+        _added([fit.turned(int(delays[index])) for fit, index in zip(sums, hypotheses[way[0]], strict=True)], period)
+        for way in ways
     ]
     for number, start, data, erased in _checked(fits, form):
         chips = form.chips(data)
@@ -230,12 +238,24 @@ def decode_packet(
         if explained < (MIN_EXPLAINED_ERASED if erased else MIN_EXPLAINED):
             continue
         others = [float(some.min()) for other, some in enumerate(misfits) if other != number]
+        # Ways that no signal tells apart are equally good.
+        others += [own] * (len(ways[number]) - 1)
         ratio = min(others, default=np.inf) / max(own, 1e-12 * fits[number].square)
-        late = [float(delays[index]) + start for index in hypotheses[number]]
+        indices = hypotheses[ways[number][0]]
+        late = [float(delays[index]) + start for index in indices]
         clock = clock.refined(images, chips, late, packets)
         waves = tuple(clock.wave(chips, one, packets.depth) for one in late)
-        return PacketMatch(data, explained, erased, ratio, hypotheses[number], waves)
+        return PacketMatch(data, explained, erased, ratio, indices, waves)
     return None
+
+
+def _different(hypotheses: Sequence[Ints], delays: Ints, period: int) -> list[list[int]]:
+    """Numbers of the hypotheses in lists whose signals differ by a common delay alone, which is unknown anyway."""
+    found: dict[tuple[int, ...], list[int]] = {}
+    for number, indices in enumerate(hypotheses):
+        relative = (delays[indices] - delays[indices[0]]) % period
+        found.setdefault(tuple(relative.tolist()), []).append(number)
+    return list(found.values())
 
 
 def _checked(fits: Sequence[_Fit], form: PacketFormat) -> Iterator[tuple[int, int, Bits, int]]:
