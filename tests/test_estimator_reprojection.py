@@ -181,6 +181,21 @@ def test_the_cost_is_chi_square() -> None:
     assert found.chi2 == pytest.approx(13.0, rel=1e-3)
 
 
+def test_an_error_of_the_model_adds_to_the_variance_of_a_displacement() -> None:
+    """By hand: a spot of 1 px of standard deviation, 3 px off, and a model that errs by 4 px: 9 / (1 + 16)."""
+    leds = grid(5, 4, 0.14, (3, 2, 2.7))
+    view = view_of((3, 2, 2.7), 2.6, 30, -20, 140)
+    spots = simulated(view, leds, 1e-3)
+    spots[7] = replace(spots[7], spot=replace(spots[7].spot, u_px=spots[7].spot.u_px + 3, covariance_px2=np.eye(2)))
+    observed = observe(device(view, 1.0), spots)
+    found = fit(observed, Pose(np.array(view.position_m), view.R_cam_world))
+    # The other spots are a thousand times more exact: their share of the variance is 1e-6, and the lens's scale changes
+    # over the image by less than 1e-3 where the spot moved.
+    assert found.outlier_chi2()[7] == pytest.approx(9.0, rel=1e-3)
+    error = 4 * observed.camera.pixel_angle_rad
+    assert found.outlier_chi2(error)[7] == pytest.approx(9 / 17, rel=1e-3)
+
+
 def test_tilts_to_both_sides_of_180_deg_are_near() -> None:
     """A camera upside down: held at 179 deg, read as -179 deg, which is 2 deg off and not 358."""
     leds = grid(5, 4, 0.14, (3, 2, 0.0))

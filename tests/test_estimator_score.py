@@ -55,6 +55,14 @@ def test_errors_of_a_frame_by_hand() -> None:
     assert score.vertical.median_m == pytest.approx(0.12)
 
 
+def test_frames_of_no_stated_device_are_of_device_0() -> None:
+    """As in the format, where the first device has the number 0: groups by device are then of one."""
+    frames = score_variant("x", [ok(0, TRUTH), ok(1, TRUTH)], truths(2), LEDS)
+    assert [row.device for row in frames.rows] == [0, 0]
+    of_two = score_variant("x", [ok(0, TRUTH), ok(1, TRUTH)], truths(2), LEDS, [0, 1])
+    assert [row.device for row in of_two.rows] == [0, 1]
+
+
 def test_a_summary_by_hand() -> None:
     """Vertical errors 1, 2, 3, 6 m: median 2.5, mean 3, RMSE sqrt(50 / 4), p95 = 3 + 0.85 x 3, max 6; time 0.2 s."""
     heights = [1.0, -2.0, 3.0, 6.0]
