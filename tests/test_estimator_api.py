@@ -249,3 +249,21 @@ def test_a_square_has_its_side() -> None:
     # s^2 of a square is a twelfth of its side squared, of a disc a quarter of its radius squared.
     assert frame.leds[10].mean_square_extent_m2 == pytest.approx(0.03**2 / 12)
     assert frame.leds[11].mean_square_extent_m2 == pytest.approx(0.01**2 / 4)
+
+
+def test_what_a_photograph_does_not_say_may_be_null() -> None:
+    """Electrons are then digital numbers, the last code saturates, and an LED has the extent of a point."""
+    unknown = record()
+    sensor = {**unknown["sensor"], "gain_e_per_dn": None, "full_well_e": None, "bits": 8}
+    led_map = [{**led, "radius_m": None} for led in unknown["led_map"]]
+    parts = [{"row": 0, "column": 0, "image_dn": np.full((2, 3), 255, np.uint32)}]
+    unknown |= {"sensor": sensor, "led_map": led_map, "accelerometer": None, "accelerometer_m_s2": None, "parts": parts}
+    frame = est.frame(unknown)
+    assert frame.electrons(frame.parts[0]).max() == 255
+    assert frame.clipped(frame.parts[0]).all()
+    led = next(iter(frame.leds.values()))
+    assert not led.has_size
+    assert (led.mean_square_extent_m2, led.shift_by_gradient_m) == (0, 0)
+    for problem in ({"accelerometer_m_s2": [0, 0, 9.8]}, {"accelerometer": {"kind": "imu", "error_deg": 1.0}}):
+        with pytest.raises(est.InputError, match="accelerometer"):
+            est.frame({**unknown, **problem})

@@ -138,7 +138,8 @@ class Dataset:
     """Device knowledge of a dataset, and its frame records; `read_frame` reads the images, a frame at a time.
 
     `cameras` are by name, `leds` and `luminaires` by id; `room_m` is the room's extent along x, y and z, metres, None
-    where it is not known. `leds` is empty where the map is null: a receiver then makes it of the packets that the LEDs send.
+    where it is not known. `leds` is empty where the map is null: a receiver then makes it of the packets that the LEDs
+    send.
     """
 
     folder: Path

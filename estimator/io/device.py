@@ -190,8 +190,9 @@ class Camera(Row):
 class Sensor(Row):
     """Sensor of a device; keys as in dataset.json: `dn = round(min(e, full_well_e) / gain_e_per_dn) + black_level_dn`.
 
-    A photograph says neither gain nor full well: both are None, and electrons are then digital numbers. Noise other than shot noise is given by standard deviations, as in a data sheet. `crosstalk` is the share of a
-    pixel's electrons that its four neighbours collect, a quarter each.
+    Gain and full well are None where the device does not know them, as of a photograph: electrons are then digital
+    numbers. Noise other than shot noise is given by standard deviations, as in a data sheet. `crosstalk` is the share
+    of a pixel's electrons that its four neighbours collect, a quarter each.
     """
 
     bits: int = Field(ge=1, le=32)
@@ -514,8 +515,8 @@ class LineGains(Protocol):
 class DeviceFrame:
     """A frame as the device has it: the regions read out (one for a full frame), and all that the device knows.
 
-    `accelerometer_m_s2` is the reading in the axes of this frame's camera, None without an accelerometer; `spots` are decoded identities; `leds` is
-    the LED map by id.
+    `accelerometer_m_s2` is the reading in the axes of this frame's camera, None without an accelerometer; `spots` are
+    decoded identities; `leds` is the LED map by id.
     """
 
     parts: tuple[Part, ...]

@@ -105,14 +105,15 @@ def _tone(lamp: Lamp, line_time_s: float, exposure_s: float, lowest_hz: float, h
     profile = lamp.profile
     if not lamp.striped or len(profile.lines) < 2:
         return None
-    whole = Signal(profile.lines * line_time_s, exposure_s, profile.level_e, profile.weight)
+    starts_s = np.asarray(profile.lines * line_time_s, dtype=np.float64)
+    whole = Signal(starts_s, exposure_s, profile.level_e, profile.weight)
     envelope = envelope_of(whole, int(np.ceil(1 / lowest_hz / line_time_s)))
     highest = float(envelope.max())
     used = envelope >= MIN_ENVELOPE * highest
     variance = (LEVEL_SHARE * envelope) ** 2 + (FLOOR_SHARE * highest) ** 2 + 1 / profile.weight
     weight = np.asarray(1 / variance[used], dtype=np.float64)
-    starts_s, levels = np.asarray(whole.start_s[used]), np.asarray(whole.level[used], dtype=np.float64)
-    signal = Signal(starts_s, exposure_s, levels, weight)
+    level = np.asarray(whole.level[used], dtype=np.float64)
+    signal = Signal(np.asarray(whole.start_s[used], dtype=np.float64), exposure_s, level, weight)
     low, high = band_hz(line_time_s, exposure_s, int(used.sum()))
     band = max(low, lowest_hz / BAND_BEYOND), min(high, highest_hz * BAND_BEYOND)
     fits = [fit for duty in DUTIES if (fit := fit_tone(signal, band, duty, envelope[used])) is not None]
