@@ -144,7 +144,7 @@ def _print_rendered(measurement: Measurement) -> None:
     overrides = {"poses.count": RENDERED_POSES, "bound": False}
     folder = measurement.dataset(f"striped-{RENDERED_POSES}", "downlink_codes", overrides)
     dataset, whole, single, off, nees = est.read_dataset(folder), 0, 0, [], []
-    for record, true in zip(dataset.frames, read_truth(folder), strict=True):
+    for record, true in zip(dataset.frames, read_truth(folder / "truth.parquet", len(dataset.frames)), strict=True):
         frame = est.read_frame(dataset, record)
         pose = Pose(np.array(true.position_m), np.reshape(true.R_cam_world, (3, 3)))
         lamps = lamps_of(frame)

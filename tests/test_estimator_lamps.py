@@ -61,7 +61,7 @@ def test_the_longest_dark_run_of_a_code_counts_around_its_end() -> None:
 
 
 def test_spots_of_striped_led_images_are_the_centroids_of_their_light(expected: Array) -> None:
-    """The uneven light of a lens moves a centroid by 0.06 px here: without its correction the mean would be off."""
+    """The uneven light of a lens moves centroids by up to 0.25 px here, along each direction of the image."""
     rng = np.random.default_rng(1)
     starts = np.arange(VIEW.height_px) * ROW_US
     waves = {k: 2 * gains(code(rng), CHIP_US, starts + 1e3 * rng.random(), EXPOSURE_US) for k in range(len(LEDS))}

@@ -84,6 +84,7 @@ def test_the_covariance_covers_the_error(located: Located) -> None:
     assert off @ np.linalg.solve(found.covariance, off) < chi2.isf(1e-3, 3)
 
 
+@pytest.mark.slow
 def test_a_right_handed_map_is_left_as_it_is_and_uniform_lamps_have_edges(folder: Path) -> None:
     picture = write_picture(folder / "discs.png", photograph(bell=False))
     found = locate(picture, read_led_table(folder / "right.csv", "cm"), None, LEVEL, KNOWN)
@@ -92,6 +93,7 @@ def test_a_right_handed_map_is_left_as_it_is_and_uniform_lamps_have_edges(folder
     assert answer(found).position == pytest.approx(POSITION_CM, abs=3.0)
 
 
+@pytest.mark.slow
 def test_columns_as_lines_are_found_out(folder: Path) -> None:
     picture = write_picture(folder / "columns.png", photograph(along="columns"))
     found = locate(picture, read_led_table(folder / "right.csv", "cm"), None, LEVEL, KNOWN)
@@ -107,6 +109,7 @@ def stretched() -> dict[int, tuple[float, float]]:
     return {hz: (x + 15 * np.sign(x), y) for hz, (x, y) in LAMPS_CM.items()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong", [exchanged, stretched])
 def test_a_wrong_map_is_refused(folder: Path, wrong: Callable[[], dict[int, tuple[float, float]]]) -> None:
     table = read_led_table(write_map(folder / "wrong.csv", wrong()), "cm")
@@ -114,18 +117,21 @@ def test_a_wrong_map_is_refused(folder: Path, wrong: Callable[[], dict[int, tupl
         locate(folder / "bell.jpg", table, None, LEVEL, KNOWN)
 
 
+@pytest.mark.slow
 def test_a_wrong_axis_is_refused_and_the_message_names_the_other(folder: Path) -> None:
     options = Options(**{**vars(KNOWN), "readout": "columns"})
     with pytest.raises(EstimationFailure, match="try --readout rows"):
         locate(folder / "bell.jpg", read_led_table(folder / "left.csv", "cm"), None, LEVEL, options)
 
 
+@pytest.mark.slow
 def test_frequencies_of_other_lamps_are_refused(folder: Path) -> None:
     others = {hz + 7000: place for hz, place in LAMPS_CM.items()}
     with pytest.raises(EstimationFailure, match="no lamp sends a tone of the map"):
         locate(folder / "bell.jpg", read_led_table(write_map(folder / "other.csv", others), "cm"), None, LEVEL, KNOWN)
 
 
+@pytest.mark.slow
 def test_of_two_lamps_of_one_frequency_the_geometry_tells_which_is_which(folder: Path) -> None:
     tones = [2000.0, 2000.0, 3000.0, 3500.0, 4000.0]
     picture = write_picture(folder / "twice.png", photograph(frequencies_hz=tones))
@@ -136,6 +142,7 @@ def test_of_two_lamps_of_one_frequency_the_geometry_tells_which_is_which(folder:
     assert {led for led, *_ in found.solved.spots} == {0, 1, 2, 3, 4}
 
 
+@pytest.mark.slow
 def test_steady_lamps_need_spots_by_hand(folder: Path) -> None:
     picture = write_picture(folder / "steady.png", photograph(steady=True))
     table = read_led_table(folder / "right.csv", "cm")
@@ -149,6 +156,7 @@ def test_steady_lamps_need_spots_by_hand(folder: Path) -> None:
     assert not found.frame.camera.shutter.rolls
 
 
+@pytest.mark.slow
 def test_without_gravity_the_fits_that_need_it_say_so(folder: Path) -> None:
     found = locate(folder / "bell.jpg", read_led_table(folder / "left.csv", "cm"), None, attitude(), KNOWN)
     assert answer(found, "pnp").position is not None
@@ -188,6 +196,7 @@ def test_a_saved_dataset_is_read_and_estimated_as_any_other(
     assert "is there already" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_picture_without_a_position_does_not_stop_the_others(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -231,6 +240,7 @@ def test_statements_of_attitude_that_are_none_are_refused(given: dict[str, objec
         attitude(**given)  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_a_given_tilt_is_the_format_s(folder: Path) -> None:
     """Raising tilt_x moves the image of an LED overhead to +v (datasets/FORMAT.md)."""
     reading = attitude(tilt="10,0").accelerometer_m_s2
