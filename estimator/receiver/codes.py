@@ -17,6 +17,10 @@ from estimator.receiver.signal import ChipWave, Ints, Signal, folded, overlaps
 MIN_CORRELATION = 0.9
 MIN_MISFIT_RATIO = 1.5
 """The misfit of the best code of another LED has to be this many times the best one's."""
+MIN_MISFIT_DIFFERENCE = 0.01
+"""... and larger by this much: levels that are 2 % of the bright ones off (`signal.ENVELOPE_SHARE`) leave a misfit of
+some 0.002 by themselves. Short images, which show a part of a code, may fit two codes nearly exactly. Over the poses of
+office200, wrong codes were better than the right one by up to 0.003 (docs/measure_downlink.py identities)."""
 MIN_MISFIT = 1e-12
 MIN_LINES = 8
 CLOCK_SIGMAS = 3.0
@@ -33,17 +37,22 @@ Singles = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class CodeMatch:
-    """The code that fits a signal best: its LED, correlation, the runner-up's misfit over its own, and its wave."""
+    """The code that fits a signal best: its LED, correlation, and its wave.
+
+    `misfit_ratio` is the misfit of the best code of another LED over its own, `misfit_difference` that less its own.
+    """
 
     led: int
     correlation: float
     misfit_ratio: float
+    misfit_difference: float
     wave: ChipWave
 
     @property
     def clear(self) -> bool:
         """Whether the LED is taken as identified."""
-        return self.correlation >= MIN_CORRELATION and self.misfit_ratio >= MIN_MISFIT_RATIO
+        told_apart = self.misfit_ratio >= MIN_MISFIT_RATIO and self.misfit_difference >= MIN_MISFIT_DIFFERENCE
+        return self.correlation >= MIN_CORRELATION and told_apart
 
 
 class CodeBook:
@@ -115,7 +124,7 @@ class CodeBook:
         tried = phase + later + np.arange(-steps, steps + 1) / PHASES
         found = [self.refined(signal, row, one) for one in tried]
         best, correlation = max(found, key=lambda one: one[1])
-        return CodeMatch(int(self.leds[row]), correlation, 1.0, self.wave(row, best, float(signal.start_s[0])))
+        return CodeMatch(int(self.leds[row]), correlation, 1.0, 0.0, self.wave(row, best, float(signal.start_s[0])))
 
     def _later(self, later_s: float, clock_error: float) -> tuple[float, float]:
         """Chips that pass in a time, modulo the length, and by how many more or less by the clock's error."""
@@ -176,7 +185,9 @@ def match_code_of_frames(
     second = min((one[0] for one in found if one[1] != led), default=1.0)
     ratio = second / max(misfit_of, MIN_MISFIT)
     joint = float(np.sqrt(max(1 - misfit_of, 0.0)))
-    of_signal_number = iter([replace(one, correlation=joint, misfit_ratio=ratio) for one in matches])
+    of_signal_number = iter(
+        [replace(one, correlation=joint, misfit_ratio=ratio, misfit_difference=second - misfit_of) for one in matches]
+    )
     return [next(of_signal_number) if any(signal is one for one in used) else None for signal in signals]
 
 
@@ -198,4 +209,5 @@ def match_code(signal: Signal, books: Sequence[CodeBook]) -> CodeMatch | None:
     correlation, led, book, row, phase = found[0]
     second = max((one[0] for one in found if one[1] != led), default=0.0)
     misfits = [max(1 - max(one, 0.0) ** 2, MIN_MISFIT) for one in (second, correlation)]
-    return CodeMatch(led, correlation, misfits[0] / misfits[1], book.wave(row, phase, float(signal.start_s[0])))
+    wave = book.wave(row, phase, float(signal.start_s[0]))
+    return CodeMatch(led, correlation, misfits[0] / misfits[1], misfits[0] - misfits[1], wave)
