@@ -251,7 +251,7 @@ def photo(
     camera
         Calibration: YAML by OpenCV, ROS (camera_info) or Kalibr, or a NumPy .npz. Without one, --focal-px or EXIF.
     units
-        Unit of the map; overrides the file's. Default: the file's, or m.
+        Unit of the map. Default: the file's, by its columns' names (x_cm) or units, or m.
     mirror
         Axis of the map to reverse where its axes are left-handed; auto finds out.
     exposure

@@ -202,7 +202,10 @@ def test_other_yaml_is_refused(text: str) -> None:
 def test_a_map_may_have_any_unit_and_names(tmp_path: Path) -> None:
     path = tmp_path / "map.csv"
     path.write_text("Name;X (cm);Y_cm;height;Hz;radius\nlobby;-35.5;36;246;2000;5\nhall;1;2;246;;5\n")
-    table = read_led_table(path, "cm")
+    table = read_led_table(path)
+    assert table.unit == "cm"
+    with pytest.raises(InputError, match="the columns are in cm, but --units says m"):
+        read_led_table(path, "m")
     assert [(entry.label, entry.position, entry.frequency_hz) for entry in table.entries] == [
         ("lobby", (-35.5, 36.0, 246.0), 2000.0),
         ("hall", (1.0, 2.0, 246.0), None),
@@ -225,10 +228,21 @@ def test_a_map_in_json_says_its_unit(tmp_path: Path) -> None:
     assert not made[1].has_size
 
 
+def test_a_map_in_json_may_have_its_leds_by_name(tmp_path: Path) -> None:
+    path = tmp_path / "map.json"
+    path.write_text(json.dumps({"a": {"position_cm": [1, 2, 3], "frequency_hz": 2000}, "b": {"x": 1, "y": 1, "z": 3}}))
+    table = read_led_table(path)
+    assert [(entry.label, entry.position) for entry in table.entries] == [("a", (1, 2, 3)), ("b", (1, 1, 3))]
+    assert table.unit == "cm"
+    path.write_text(json.dumps({"units": "mm", "a": [1, 2, 3]}))
+    assert read_led_table(path).leds("none")[0].position_m == pytest.approx((1e-3, 2e-3, 3e-3))
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("x,y\n1,2\n", "LED 0: no z"),
+        ("x_cm,y_m,z_m\n1,2,3\n", "columns in cm and m; needed one unit"),
         ("x,y,z\n1,2,high\n", "z 'high' is not a number"),
         ("x,y,z,f,hz\n1,2,3,4,5\n", "f and hz are the same"),
         ("id,x,y,z\na,1,2,3\na,1,2,4\n", "id a is there twice"),

@@ -18,7 +18,7 @@ Mirror = Literal["none", "x", "y"]
 
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
 NAMES = {
-    "id": ("id", "led", "name", "label"),
+    "id": ("id", "led", "led_id", "name", "label"),
     "x": ("x",),
     "y": ("y",),
     "z": ("z", "height", "h"),
@@ -26,6 +26,7 @@ NAMES = {
     "radius": ("radius", "r"),
     "side": ("side", "a"),
     "shape": ("shape",),
+    "position": ("position", "xyz"),
 }
 """Names of a column or key, whatever their case and the unit behind them, such as `x_cm`."""
 MAX_LEDS = 10_000
@@ -98,7 +99,8 @@ def read_led_table(path: Path, units: str | None = None) -> LedTable:
         Each LED has `x`, `y`, `z` (or `position`, a list); `id`, `frequency_hz`, `radius`, `side` and `shape` are
         optional. Of several LEDs with one frequency, the geometry decides.
     units
-        Unit of lengths: "m", "cm", "mm", "in" or "ft"; overrides the file's. Default: the file's, or metres.
+        Unit of lengths: "m", "cm", "mm", "in" or "ft"; overrides a `units` of the file, but not units in the names of
+        its columns (`x_cm`), which have to agree. Default: the file's, or metres.
 
     Raises
     ------
@@ -112,7 +114,10 @@ def read_led_table(path: Path, units: str | None = None) -> LedTable:
     except OSError as error:
         raise InputError(f"{path}: {error.strerror or error}") from None
     stated, rows = _json_rows(path, text) if path.suffix.lower() == ".json" else (None, _csv_rows(path, text))
-    unit = units or stated or "m"
+    named = _named_unit(path, rows)
+    if named and units and named != units:
+        raise InputError(f"{path}: the columns are in {named}, but --units says {units}")
+    unit = units or named or stated or "m"
     if unit not in UNITS_M:
         raise InputError(f"{path}: units {unit!r}; allowed: {', '.join(UNITS_M)}")
     if not rows:
@@ -137,13 +142,16 @@ def _json_rows(path: Path, text: str) -> tuple[str | None, list[Mapping[str, Any
     stated = None
     if isinstance(content, dict):
         stated = content.get("units")
-        content = content.get("leds")
+        content = content.get("leds", {key: value for key, value in content.items() if key != "units"})
+    if isinstance(content, dict):
+        # LEDs by name: objects, or positions alone.
+        content = [{"id": k, **(v if isinstance(v, dict) else {"position": v})} for k, v in content.items()]
     if not isinstance(content, list) or not all(isinstance(row, dict) for row in content):
         raise InputError(f"{path}: needed a list of LEDs, or an object with one as leds")
     rows: list[Mapping[str, Any]] = []
     for row in content:
-        place = row.get("position")
-        axes = dict(zip("xyz", place, strict=False)) if isinstance(place, list) else {}
+        places = [value for key, value in row.items() if _bare(key) in NAMES["position"] and isinstance(value, list)]
+        axes = dict(zip("xyz", places[0], strict=False)) if places else {}
         rows.append({**row, **axes})
     return stated if isinstance(stated, str) else None, rows
 
@@ -201,6 +209,22 @@ def _bare(key: str) -> str:
         for unit in (*UNITS_M, "hz"):
             name = name.removesuffix(f"_{unit}")
     return name
+
+
+def _named_unit(path: Path, rows: Sequence[Mapping[str, Any]]) -> str | None:
+    """The unit that the names of the columns of lengths state; None if they state none."""
+    lengths = [name for key in ("x", "y", "z", "radius", "side", "position") for name in NAMES[key]]
+    found = {
+        unit
+        for row in rows
+        for key in row
+        if isinstance(key, str) and _bare(key) in lengths
+        for unit in UNITS_M
+        if key.strip().lower().endswith((f"_{unit}", f"({unit})", f"[{unit}]"))
+    }
+    if len(found) > 1:
+        raise InputError(f"{path}: columns in {' and '.join(sorted(found))}; needed one unit")
+    return next(iter(found), None)
 
 
 def _number(where: str, name: str, given: Any) -> float:

@@ -122,14 +122,14 @@ def solve(
         raise EstimationFailure("position", "no pose has the camera below the LEDs and the LEDs in front of it")
     best = ranked[0]
     others = [one for one in ranked[1:] if one.leds != best.leds or one.mirror != best.mirror]
-    if others and others[0].chi2 < best.chi2 + MIN_CLEAR_CHI2:
-        what = "handedness of the map" if others[0].leds == best.leds else "assignment of the LEDs of one frequency"
-        raise EstimationFailure("identify", f"the spots do not tell the {what}; give --mirror or --spots")
     leds = table.leds(best.mirror)
     chosen = _correspondences(centres, best.leds, leds)
     added_px = _sigma_px(frame, chosen) if sigma_px is None else sigma_px
     answers = tuple(_answer(name, frame, table, best.mirror, chosen, added_px) for name in VARIANTS)
     _check_fit(frame, answers)
+    if others and others[0].chi2 < best.chi2 + MIN_CLEAR_CHI2:
+        what = "handedness of the map" if others[0].leds == best.leds else "assignment of the LEDs of one frequency"
+        raise EstimationFailure("identify", f"the spots do not tell the {what}; give --mirror or --spots")
     spots = tuple((one.led.id, one.spot.u_px, one.spot.v_px) for one in chosen)
     return Solved(best.mirror, best.leds, spots, added_px, answers, _handed(best.mirror, mirrors))
 
