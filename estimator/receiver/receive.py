@@ -27,8 +27,9 @@ MIN_OWN_CORRELATION = 0.8
 """Correlation of an LED image with the packet of its panel, below which it is of another lamp."""
 MIN_MISFIT_RATIO_CUT = 3.0
 MIN_CHIPS_CUT = 20.0
-"""`codes.MIN_MISFIT_RATIO` for an LED image that the border cuts, and the chips that it has to show: its outline is less
-certain, and so are its levels."""
+"""`codes.MIN_MISFIT_RATIO` for an LED image that the border cuts, and the chips that it has to show.
+
+Its outline is less certain, and so are its levels."""
 MAX_OFF_MAP_M = 0.01
 """A packet's LED is the LED of the map within this distance."""
 REFLECTED = 2.0
