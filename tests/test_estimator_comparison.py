@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from test_estimator_score import LEDS, TRUTH, failed, ok, truths
+from test_estimator_score import LEDS_M, TRUTH, failed, ok, truths
 
 from estimator.evaluate.comparison import best, compare
 from estimator.evaluate.score import VariantScore, score_variant
@@ -14,7 +14,7 @@ def scored(name: str, errors_m: Sequence[float | None]) -> VariantScore:
     """A variant that is off by so much in x, or failed."""
     x, y, z = TRUTH
     rows = [failed(k, "a: b") if e is None else ok(k, (x + e, y, z)) for k, e in enumerate(errors_m)]
-    return score_variant(name, rows, truths(len(rows)), LEDS)
+    return score_variant(name, rows, truths(len(rows)), LEDS_M)
 
 
 def test_a_pair_by_hand() -> None:

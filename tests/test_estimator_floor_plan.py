@@ -3,7 +3,7 @@
 import xml.etree.ElementTree as Tree
 
 import pytest
-from test_estimator_score import LEDS, TRUTH, failed, ok, truths
+from test_estimator_score import LEDS, LEDS_M, TRUTH, failed, ok, truths
 
 from estimator.evaluate.score import VariantScore, score_variant
 from estimator.report.floor_plan import BORDER, WIDTH, estimates_outside, floor_plan
@@ -15,7 +15,7 @@ PX_PER_M = (460 - 2 * 12) / 4.0
 
 def scored(*positions: tuple[float, float, float] | None) -> VariantScore:
     rows = [failed(k, "a: <b>") if p is None else ok(k, p) for k, p in enumerate(positions)]
-    return score_variant("x", rows, truths(len(rows)), LEDS)
+    return score_variant("x", rows, truths(len(rows)), LEDS_M)
 
 
 def plan(variant: VariantScore, room_m: tuple[float, float, float] = ROOM_M) -> Tree.Element:

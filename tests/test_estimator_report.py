@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from html_text import texts
-from test_estimator_score import LEDS, TRUTH, failed, ok, truths
+from test_estimator_score import LEDS, LEDS_M, TRUTH, failed, ok, truths
 
 from estimator.evaluate.score import Scores, VariantScore, score_variant
 from estimator.evaluate.score_table import (
@@ -30,7 +30,7 @@ def scored(
 ) -> VariantScore:
     x, y, z = TRUTH
     rows = [failed(k, "a: b") if e is None else ok(k, (x + e, y, z)) for k, e in enumerate(errors_m)]
-    return score_variant(name, rows, truths(len(rows), bound_m2), LEDS)
+    return score_variant(name, rows, truths(len(rows), bound_m2), LEDS_M)
 
 
 def scores_of(variants: Sequence[VariantScore]) -> Scores:
@@ -156,7 +156,8 @@ def test_names_and_reasons_are_text_and_never_markup(tmp_path: Path) -> None:
     """Names of datasets, variants and previews, and reasons, come from files: `<`, `&` and quotes are text."""
     hostile = """<script>"a"&'b'"""
     variants = [
-        score_variant(name, [failed(0, hostile), ok(1, TRUTH)], truths(2), LEDS) for name in (hostile, f"{hostile}:c,d")
+        score_variant(name, [failed(0, hostile), ok(1, TRUTH)], truths(2), LEDS_M)
+        for name in (hostile, f"{hostile}:c,d")
     ]
     (tmp_path / "previews").mkdir()
     (tmp_path / "previews/000'<i>.png").write_bytes(b"PNG")
@@ -211,7 +212,7 @@ def of_devices(errors_m: Sequence[float | None], devices: Sequence[int], name: s
         one.model_copy(update={"map": device % 2})
         for one, device in zip(truths(len(rows), BOUND), devices, strict=True)
     ]
-    return score_variant(name, rows, truth, LEDS, devices)
+    return score_variant(name, rows, truth, LEDS_M, devices)
 
 
 def test_devices_are_shown_by_map_with_their_rmse_and_nees() -> None:

@@ -11,10 +11,12 @@ from conftest import copy_of
 
 from estimator.errors import InputError
 from estimator.evaluate.score import Scores, read_or_score, score, score_variant
+from estimator.io.device import DiscLed
 from estimator.io.estimates import EstimateRow, LedRange, write_estimates
 from estimator.io.truth import TrueLed, TruthRow
 
-LEDS = {10: (1.0, 2.0, 3.5)}
+LEDS = {10: DiscLed(id=10, position_m=(1.0, 2.0, 3.5), radius_m=0.01)}
+LEDS_M = {led.id: led.position_m for led in LEDS.values()}
 TRUTH = (1.0, 2.0, 0.5)
 
 
@@ -45,7 +47,7 @@ def failed(frame: int, reason: str, *ranges_m: float) -> EstimateRow:
 
 def test_errors_of_a_frame_by_hand() -> None:
     """(0.03, 0.04, -0.12) off: 0.05 m horizontal, 0.12 m too low, 0.13 m in all; the LED is 3 m above the camera."""
-    score = score_variant("x", [ok(0, (1.03, 2.04, 0.38), 3.02)], truths(1), LEDS)
+    score = score_variant("x", [ok(0, (1.03, 2.04, 0.38), 3.02)], truths(1), LEDS_M)
     (row,) = score.rows
     assert row.horizontal_error_m == pytest.approx(0.05)
     assert row.vertical_error_m == pytest.approx(-0.12)
@@ -69,7 +71,7 @@ def test_a_summary_by_hand() -> None:
     rows = [
         ok(i, (1.0, 2.0, 0.5 + h), time_s=t) for i, (h, t) in enumerate(zip(heights, (0.1, 0.2, 0.2, 5), strict=True))
     ]
-    score = score_variant("x", rows, truths(4), LEDS)
+    score = score_variant("x", rows, truths(4), LEDS_M)
     summary = score.error_3d
     assert summary is not None
     assert summary.median_m == pytest.approx(2.5)
@@ -85,7 +87,7 @@ def test_a_summary_by_hand() -> None:
 
 def test_failures_are_counted_by_reason_and_stay_in_the_rows() -> None:
     rows = [failed(0, "a: x", 4.0), ok(1, TRUTH, 3.1), failed(2, "b: y", 3.5), failed(3, "a: x")]
-    score = score_variant("x", rows, truths(4), LEDS)
+    score = score_variant("x", rows, truths(4), LEDS_M)
     assert (score.frames, score.ok, score.failed) == (4, 1, 3)
     assert score.failures == {"a: x": 2, "b: y": 1}
     assert [row.reason for row in score.rows] == ["a: x", "", "b: y", "a: x"]
@@ -98,7 +100,7 @@ def test_failures_are_counted_by_reason_and_stay_in_the_rows() -> None:
 
 
 def test_without_a_success_there_is_no_summary() -> None:
-    score = score_variant("x", [failed(0, "a: x")], truths(1), LEDS)
+    score = score_variant("x", [failed(0, "a: x")], truths(1), LEDS_M)
     assert (score.error_3d, score.horizontal, score.vertical, score.median_time_s) == (None, None, None, None)
 
 
@@ -108,7 +110,7 @@ def test_the_bound_is_held_against_the_frames_that_have_it_and_succeeded() -> No
     rows = [ok(0, (x + 0.003, y, z)), ok(1, (x, y + 0.004, z)), ok(2, (x, y, z + 0.012)), failed(3, "a: x")]
     bound_m2 = (12e-6, 0.0, 0.0, 0.0, 12e-6, 0.0, 0.0, 0.0, 12e-6)
     truth = [row.model_copy(update={"bound_m2": bound_m2 if row.frame % 2 else None}) for row in truths(4)]
-    score = score_variant("x", rows, truth, LEDS)
+    score = score_variant("x", rows, truth, LEDS_M)
     assert score.against_bound is not None
     assert score.against_bound.frames == 1
     assert score.against_bound.efficiency == pytest.approx(1.5)
@@ -121,7 +123,7 @@ def test_reported_covariances_and_ambiguity_are_counted() -> None:
     covariance_m2 = (1e-4, 0.0, 0.0, 0.0, 1e-4, 0.0, 0.0, 0.0, 1e-4)
     rows = [ok(k, (x + 0.01 * (k + 1), y, z)).model_copy(update={"covariance_m2": covariance_m2}) for k in range(2)]
     rows.append(ok(2, TRUTH).model_copy(update={"ambiguous": True}))
-    score = score_variant("x", rows, truths(3), LEDS)
+    score = score_variant("x", rows, truths(3), LEDS_M)
     assert score.nees is not None
     assert (score.nees.frames, score.nees.mean) == (2, pytest.approx(2.5))
     assert [row.nees for row in score.rows] == [pytest.approx(1), pytest.approx(4), None]
@@ -132,8 +134,8 @@ def test_failing_the_worst_frames_lowers_the_success_rate_and_no_error_of_all() 
     """The summary of the ok frames falls to a tenth; those over all frames do not."""
     x, y, z = TRUTH
     rows = [ok(k, (x + (0.01 if k < 15 else 1.0), y, z)) for k in range(20)]
-    complete = score_variant("x", rows, truths(20), LEDS)
-    dropped = score_variant("x", [*rows[:15], *(failed(k, "a: too hard") for k in range(15, 20))], truths(20), LEDS)
+    complete = score_variant("x", rows, truths(20), LEDS_M)
+    dropped = score_variant("x", [*rows[:15], *(failed(k, "a: too hard") for k in range(15, 20))], truths(20), LEDS_M)
     assert complete.error_3d is not None
     assert dropped.error_3d is not None
     assert dropped.error_3d.rmse_m < complete.error_3d.rmse_m / 10
@@ -237,7 +239,7 @@ def test_the_efficiency_is_of_the_frames_that_have_a_bound() -> None:
     rows = [ok(0, (x + 1, y, z)), failed(1, "a: x"), ok(2, (x, y, z + 0.012))]
     bound_m2 = (12e-6, 0.0, 0.0, 0.0, 12e-6, 0.0, 0.0, 0.0, 12e-6)
     truth = [row.model_copy(update={"bound_m2": bound_m2 if row.frame == 2 else None}) for row in truths(3)]
-    found = score_variant("x", rows, truth, LEDS).against_bound
+    found = score_variant("x", rows, truth, LEDS_M).against_bound
     assert found is not None
     assert (found.frames, found.rmse_m, found.efficiency) == (1, pytest.approx(0.012), pytest.approx(0.5))
 
@@ -245,18 +247,18 @@ def test_the_efficiency_is_of_the_frames_that_have_a_bound() -> None:
 def test_a_variant_that_gives_up_early_does_not_look_fast() -> None:
     """Times are of the frames that succeeded: 0.1, 0.3 and 0.5 s; failed ones took 0.9 s here and could take none."""
     rows = [*(ok(k, TRUTH, time_s=t) for k, t in enumerate((0.5, 0.1, 0.3))), *(failed(k, "a: x") for k in (3, 4, 5))]
-    assert score_variant("x", rows, truths(6), LEDS).median_time_s == pytest.approx(0.3)
+    assert score_variant("x", rows, truths(6), LEDS_M).median_time_s == pytest.approx(0.3)
 
 
 def test_a_range_that_is_too_long_has_a_positive_error() -> None:
-    (row,) = score_variant("x", [ok(0, TRUTH, 3.02, 2.99)], truths(1), LEDS).rows
+    (row,) = score_variant("x", [ok(0, TRUTH, 3.02, 2.99)], truths(1), LEDS_M).rows
     assert [error.error_m for error in row.range_errors] == pytest.approx([0.02, -0.01])
 
 
 def test_the_bound_of_a_frame_is_the_root_of_its_trace() -> None:
     """Variances of 4, 9 and 36 mm^2: 7 mm; the covariances do not count."""
     bound_m2 = (4e-6, 1e-6, 2e-6, 1e-6, 9e-6, 3e-6, 2e-6, 3e-6, 36e-6)
-    (row,) = score_variant("x", [ok(0, TRUTH)], truths(1, bound_m2), LEDS).rows
+    (row,) = score_variant("x", [ok(0, TRUTH)], truths(1, bound_m2), LEDS_M).rows
     assert row.bound_m == pytest.approx(0.007)
 
 
@@ -284,7 +286,7 @@ def test_scores_by_device_map_and_good_leds_by_hand() -> None:
         )
         for one, of_map, of_frame in zip(truths(5), (1, 0, 1, 1, 0), shares, strict=True)
     ]
-    score = score_variant("x", rows, truth, LEDS, devices=[3, 4, 3, 5, 4])
+    score = score_variant("x", rows, truth, LEDS_M, devices=[3, 4, 3, 5, 4])
     table = [(d.device, d.map, d.frames, d.failed, d.rmse_m, d.nees) for d in score.by_device]
     rmse = pytest.approx(12.5**0.5 * 1e-3)
     assert table == [
@@ -308,10 +310,10 @@ def test_one_of_several_devices_has_no_interval() -> None:
     """Its frames share errors, and nothing tells how devices differ. One device in all has independent frames."""
     sure = {"covariance_m2": (1e-6, 0.0, 0.0, 0.0, 1e-6, 0.0, 0.0, 0.0, 1e-6)}
     rows = [*(ok(k, TRUTH).model_copy(update=sure) for k in range(3)), failed(3, "a: b")]
-    several = score_variant("x", rows, truths(4), LEDS, devices=[0, 0, 0, 1])
+    several = score_variant("x", rows, truths(4), LEDS_M, devices=[0, 0, 0, 1])
     assert (several.median_interval, several.rmse_interval, several.nees) == (None, None, None)
     assert several.by_device[0].nees == 0.0
-    alone = score_variant("x", rows, truths(4), LEDS, devices=[0, 0, 0, 0])
+    alone = score_variant("x", rows, truths(4), LEDS_M, devices=[0, 0, 0, 0])
     assert alone.median_interval is not None
     assert alone.nees is not None
 
@@ -323,12 +325,12 @@ def test_both_bounds_are_compared_where_they_differ() -> None:
     exact = tuple(value / 4 for value in bound)
     rows = [ok(0, (x + 4e-3, y, z))]
     (truth,) = truths(1, bound)
-    both = score_variant("x", rows, [truth.model_copy(update={"bound_exact_m2": exact})], LEDS)
+    both = score_variant("x", rows, [truth.model_copy(update={"bound_exact_m2": exact})], LEDS_M)
     assert both.against_bound is not None
     assert both.against_exact_bound is not None
     assert both.against_bound.efficiency == pytest.approx(0.5)
     assert both.against_exact_bound.efficiency == pytest.approx(0.25)
-    alone = score_variant("x", rows, [truth], LEDS)
+    alone = score_variant("x", rows, [truth], LEDS_M)
     assert alone.against_exact_bound is None
     assert alone.against_bound == both.against_bound
 

@@ -1,6 +1,6 @@
 """Cells of score tables: rounding, units, infinite and missing values."""
 
-from test_estimator_score import LEDS, TRUTH, failed, ok, truths
+from test_estimator_score import LEDS_M, TRUTH, failed, ok, truths
 
 from estimator.evaluate.comparison import compare
 from estimator.evaluate.score import VariantScore, score_variant
@@ -56,10 +56,10 @@ def test_shares_as_text_never_round_up_to_100() -> None:
 
 def test_failed_frames_are_infinite_in_the_columns_of_all() -> None:
     rows = [ok(0, TRUTH), failed(1, "a: b"), failed(2, "a: b")]
-    cells = dict(zip(ERROR_HEADERS, error_cells(score_variant("x", rows, truths(3), LEDS)), strict=True))
+    cells = dict(zip(ERROR_HEADERS, error_cells(score_variant("x", rows, truths(3), LEDS_M)), strict=True))
     assert (cells["ok"], cells["failed"], cells["success rate"]) == ("1", "2", "33.3 %")
     assert (cells["median of all"], cells["p95 of all"], cells["median"]) == ("∞", "∞", "0 µm")
-    none = dict(zip(ERROR_HEADERS, error_cells(score_variant("x", [], [], LEDS)), strict=True))
+    none = dict(zip(ERROR_HEADERS, error_cells(score_variant("x", [], [], LEDS_M)), strict=True))
     assert (none["success rate"], none["median of all"], none["time"]) == ("–", "–", "–")
 
 
@@ -69,7 +69,7 @@ def test_a_covariance_that_is_too_small_is_said_to_be() -> None:
     sure = ok(0, (x + 0.1, y, z)).model_copy(update={"covariance_m2": (1e-4, 0, 0, 0, 1e-4, 0, 0, 0, 1e-4)})
     modest = ok(0, (x + 1e-4, y, z)).model_copy(update={"covariance_m2": sure.covariance_m2, "ambiguous": True})
     cells = [
-        dict(zip(LIMIT_HEADERS, limit_cells(score_variant("x", [row], truths(1), LEDS)), strict=True))
+        dict(zip(LIMIT_HEADERS, limit_cells(score_variant("x", [row], truths(1), LEDS_M)), strict=True))
         for row in (sure, modest)
     ]
     assert [c["NEES"] for c in cells] == ["100 (overconfident)", "0.0001 (conservative)"]
@@ -83,7 +83,7 @@ def test_a_pair_is_counted_over_all_frames_and_compared_over_those_of_both() -> 
 
     def scored(name: str, *errors_m: float | None) -> VariantScore:
         rows = [failed(k, "a: b") if e is None else ok(k, (x + e, y, z)) for k, e in enumerate(errors_m)]
-        return score_variant(name, rows, truths(len(rows)), LEDS)
+        return score_variant(name, rows, truths(len(rows)), LEDS_M)
 
     a, b = scored("a", 0.01, 0.01, 0.04, 0.1, None), scored("b", 0.02, 0.04, 0.01, None, 0.1)
     cells = dict(zip(PAIR_HEADERS, pair_cells(compare(a, b)), strict=True))
@@ -97,7 +97,7 @@ def test_errors_and_bounds_stand_in_the_columns_of_their_names() -> None:
     """One frame: (3, 4, -12) cm off, 13 cm in all, 2 cm of range; a bound of 6.5 cm, half of the error; 0.1 s."""
     x, y, z = TRUTH
     bound_m2 = (0.065**2 / 3, 0.0, 0.0, 0.0, 0.065**2 / 3, 0.0, 0.0, 0.0, 0.065**2 / 3)
-    score = score_variant("x", [ok(0, (x + 0.03, y + 0.04, z - 0.12), 3.02)], truths(1, bound_m2), LEDS)
+    score = score_variant("x", [ok(0, (x + 0.03, y + 0.04, z - 0.12), 3.02)], truths(1, bound_m2), LEDS_M)
     cells = dict(zip(ERROR_HEADERS, error_cells(score), strict=True))
     expected = dict.fromkeys(("median of all", "p95 of all", "median", "RMSE", "mean", "p95", "max"), "130 mm")
     expected |= {"horizontal": "50 mm", "vertical": "120 mm", "range": "20 mm", "time": "100 ms", "95 % interval": "–"}
@@ -113,21 +113,21 @@ def test_cells_by_device_and_map() -> None:
     sure = {"covariance_m2": (1e-6, 0.0, 0.0, 0.0, 1e-6, 0.0, 0.0, 0.0, 1e-6)}
     rows = [ok(0, (x + 3e-3, y, z)).model_copy(update=sure), ok(1, (x + 4e-3, y, z)).model_copy(update=sure)]
     truth = [one.model_copy(update={"map": one.frame}) for one in truths(2)]
-    score = score_variant("x", rows, truth, LEDS, devices=[0, 1])
+    score = score_variant("x", rows, truth, LEDS_M, devices=[0, 1])
     assert has_groups(score)
     cells = dict(zip(GROUP_HEADERS, group_cells(score), strict=True))
     assert (cells["devices"], cells["maps"], cells["RMSE by device"]) == ("2", "2", "3 to 4 mm")
     assert (cells["NEES by device"], cells["NEES by map"]) == ("9 to 16", "12.5")
-    alone = score_variant("x", rows[:1], truth[:1], LEDS)
+    alone = score_variant("x", rows[:1], truth[:1], LEDS_M)
     assert not has_groups(alone)
     assert group_cells(alone)[4:] == ("–", "–")
-    lost = score_variant("x", [failed(0, "a: b"), failed(1, "a: b")], truth, LEDS, devices=[0, 1])
+    lost = score_variant("x", [failed(0, "a: b"), failed(1, "a: b")], truth, LEDS_M, devices=[0, 1])
     assert group_cells(lost)[2:4] == ("–", "–")
 
 
 def test_failed_frames_by_good_leds_as_cells() -> None:
     """One frame of two without any good LED failed; no frame has more."""
-    cells = lost_cells(score_variant("x", [ok(0, TRUTH), failed(1, "a: b")], truths(2), LEDS))
+    cells = lost_cells(score_variant("x", [ok(0, TRUTH), failed(1, "a: b")], truths(2), LEDS_M))
     assert dict(zip(LOST_HEADERS, cells, strict=True)) == {
         "no good LED": "1 of 2",
         **dict.fromkeys(("1", "2", "3", "4 or more"), "–"),

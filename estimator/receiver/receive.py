@@ -26,7 +26,10 @@ from estimator.spots.striped import Lamp
 MIN_OWN_CORRELATION = 0.8
 """Correlation of an LED image with the packet of its panel, below which it is of another lamp."""
 MIN_MISFIT_RATIO_CUT = 3.0
-"""`codes.MIN_MISFIT_RATIO` for an LED image that the border cuts: its outline, and so its levels, are less certain."""
+MIN_CHIPS_CUT = 20.0
+"""`codes.MIN_MISFIT_RATIO` for an LED image that the border cuts, and the chips that it has to show.
+
+Its outline is less certain, and so are its levels."""
 MAX_OFF_MAP_M = 0.01
 """A packet's LED is the LED of the map within this distance."""
 REFLECTED = 2.0
@@ -144,8 +147,11 @@ def _by_codes(
             joint = match_code_of_frames(signals, books, clock_error)
             matches = [one if one is not None and one.clear else None for one in joint]
         for (frame, number), match, signal in zip(places, matches, signals, strict=True):
-            cut = lamps[frame][number].touches_border
-            if match is not None and match.clear and not (cut and match.misfit_ratio < MIN_MISFIT_RATIO_CUT):
+            if match is None or not match.clear:
+                continue
+            shown = float(np.ptp(signal.start_s)) / match.wave.chip_s
+            uncertain = match.misfit_ratio < MIN_MISFIT_RATIO_CUT or shown < MIN_CHIPS_CUT
+            if not (lamps[frame][number].touches_border and uncertain):
                 bits = bits_seen(signal, match.wave)
                 yield (frame, number), Reception(lamps[frame][number], match.led, match.correlation, bits, match.wave)
 
