@@ -19,7 +19,7 @@ def scored(*positions: tuple[float, float, float] | None) -> VariantScore:
 
 
 def plan(variant: VariantScore, room_m: tuple[float, float, float] = ROOM_M) -> Tree.Element:
-    return Tree.fromstring(floor_plan(room_m, list(LEDS.values()), variant, 3))
+    return Tree.fromstring(floor_plan(room_m, [led.position_m for led in LEDS.values()], variant, 3))
 
 
 def numbers(element: Tree.Element, *keys: str) -> tuple[float, ...]:

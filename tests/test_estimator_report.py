@@ -17,7 +17,6 @@ from estimator.evaluate.score_table import (
     error_cells,
     interval_text,
 )
-from estimator.io.device import DiscLed
 from estimator.report.figures import Decades, device_plot, distribution_plot, error_plot
 from estimator.report.report import page
 from estimator.report.svg import COLOURS, DASHES, MARKS, mark, style_of_variants
@@ -34,12 +33,7 @@ def scored(
 
 
 def scores_of(variants: Sequence[VariantScore]) -> Scores:
-    return Scores(
-        dataset="set",
-        room_m=(4.0, 5.0, 3.5),
-        led_map=tuple(DiscLed(id=led, position_m=m, radius_m=0.01) for led, m in LEDS.items()),
-        variants=tuple(variants),
-    )
+    return Scores(dataset="set", room_m=(4.0, 5.0, 3.5), led_map=tuple(LEDS.values()), variants=tuple(variants))
 
 
 def test_28_variants_have_marks_and_curves_of_their_own() -> None:

@@ -59,9 +59,9 @@ def test_errors_of_a_frame_by_hand() -> None:
 
 def test_frames_of_no_stated_device_are_of_device_0() -> None:
     """As in the format, where the first device has the number 0: groups by device are then of one."""
-    frames = score_variant("x", [ok(0, TRUTH), ok(1, TRUTH)], truths(2), LEDS)
+    frames = score_variant("x", [ok(0, TRUTH), ok(1, TRUTH)], truths(2), LEDS_M)
     assert [row.device for row in frames.rows] == [0, 0]
-    of_two = score_variant("x", [ok(0, TRUTH), ok(1, TRUTH)], truths(2), LEDS, [0, 1])
+    of_two = score_variant("x", [ok(0, TRUTH), ok(1, TRUTH)], truths(2), LEDS_M, [0, 1])
     assert [row.device for row in of_two.rows] == [0, 1]
 
 
