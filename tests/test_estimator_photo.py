@@ -118,6 +118,23 @@ def test_a_wrong_map_is_refused(folder: Path, wrong: Callable[[], dict[int, tupl
 
 
 @pytest.mark.slow
+def test_one_led_that_hangs_elsewhere_is_left_out_and_named(folder: Path) -> None:
+    """35 cm beside its place in the map: some 210 px; no fit is led astray."""
+    x, y = LAMPS_CM[2500]
+    table = read_led_table(write_map(folder / "moved.csv", {**LAMPS_CM, 2500: (x + 35, y)}), "cm")
+    found = locate(folder / "bell.jpg", table, None, LEVEL, Options(**{**vars(KNOWN), "mirror": "none"}))
+    ((led, off_px),) = found.solved.misplaced
+    assert table.frequencies_hz()[led] == 2500
+    assert off_px > 100
+    assert any("left out" in remark for remark in found.remarks)
+    assert led not in {spot.led for spot in found.frame.spots}
+    for variant in ("gravity-fit", "pnp"):
+        assert answer(found, variant).rms_px < 10
+    # As with all five, but for the larger share of the tilt that four leave open: 0.5 deg are 2 cm at 2.3 m.
+    assert answer(found).position == pytest.approx(POSITION_CM, abs=4.0)
+
+
+@pytest.mark.slow
 def test_a_wrong_axis_is_refused_and_the_message_names_the_other(folder: Path) -> None:
     options = Options(**{**vars(KNOWN), "readout": "columns"})
     with pytest.raises(EstimationFailure, match="try --readout rows"):

@@ -126,6 +126,10 @@ def locate(path: Path, table: LedTable, calibration: Calibration | None, held: A
     solved = solve(frame, table, centres, mirrors, options.centroid_sigma_px)
     spots = tuple(DecodedSpot(led=led, u_px=u, v_px=v) for led, u, v in solved.spots)
     frame = replace(frame, leds=table.leds(solved.mirror), spots=spots)
+    remarks += [
+        f"LED {table.label(led)}: {off_px:.0f} px off where the map has it, left out"
+        for led, off_px in solved.misplaced
+    ]
     return Located(picture, tuple(lamps), solved, frame, _marks(centres, lamps, solved, table), tuple(remarks))
 
 

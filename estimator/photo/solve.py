@@ -91,7 +91,11 @@ class Answer:
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """Answers of all variants; `spots` are (LED id, u, v) in the order of the residuals."""
+    """Answers of all variants; `spots` are (LED id, u, v) in the order of the residuals.
+
+    `misplaced` are LEDs, by id, whose lamps are far from where the map puts them, with the distance in pixels: they are
+    left out of `leds`, `spots` and answers.
+    """
 
     mirror: Mirror
     leds: tuple[int | None, ...]
@@ -99,6 +103,7 @@ class Solved:
     sigma_px: float
     answers: tuple[Answer, ...]
     handed: str
+    misplaced: tuple[tuple[int, float], ...] = ()
 
 
 def solve(
@@ -123,15 +128,26 @@ def solve(
     best = ranked[0]
     others = [one for one in ranked[1:] if one.leds != best.leds or one.mirror != best.mirror]
     leds = table.leds(best.mirror)
-    chosen = _correspondences(centres, best.leds, leds)
-    added_px = _sigma_px(frame, chosen) if sigma_px is None else sigma_px
-    answers = tuple(_answer(name, frame, table, best.mirror, chosen, added_px) for name in VARIANTS)
-    _check_fit(frame, answers)
+
+    def answered(chosen: Sequence[Correspondence]) -> tuple[float, tuple[Answer, ...], Floats]:
+        added_px = _sigma_px(frame, chosen) if sigma_px is None else sigma_px
+        answers = tuple(_answer(name, frame, table, best.mirror, chosen, added_px) for name in VARIANTS)
+        return added_px, answers, _check_fit(frame, answers)
+
+    ids = best.leds
+    chosen = _correspondences(centres, ids, leds)
+    added_px, answers, off_px = answered(chosen)
+    far = off_px > 3 * _limit_px(frame)
+    misplaced = tuple((chosen[k].led.id, float(off_px[k])) for k in np.flatnonzero(far))
+    if misplaced and (~far).sum() >= MIN_LEDS:
+        ids = tuple(None if led in dict(misplaced) else led for led in ids)
+        chosen = _correspondences(centres, ids, leds)
+        added_px, answers, _ = answered(chosen)
     if others and others[0].chi2 < best.chi2 + MIN_CLEAR_CHI2:
         what = "handedness of the map" if others[0].leds == best.leds else "assignment of the LEDs of one frequency"
         raise EstimationFailure("identify", f"the spots do not tell the {what}; give --mirror or --spots")
     spots = tuple((one.led.id, one.spot.u_px, one.spot.v_px) for one in chosen)
-    return Solved(best.mirror, best.leds, spots, added_px, answers, _handed(best.mirror, mirrors))
+    return Solved(best.mirror, ids, spots, added_px, answers, _handed(best.mirror, mirrors), misplaced)
 
 
 def _handed(mirror: Mirror, mirrors: Sequence[Mirror]) -> str:
@@ -269,13 +285,17 @@ def _at_position(frame: DeviceFrame, correspondences: Sequence[Correspondence], 
     return residuals(found.x).reshape(-1, 2)
 
 
-def _check_fit(frame: DeviceFrame, answers: Sequence[Answer]) -> None:
-    """Refuse a map that does not fit: no variant has small residuals."""
+def _limit_px(frame: DeviceFrame) -> float:
+    return MAX_RESIDUAL_SHARE * float(np.hypot(frame.camera.width_px, frame.camera.height_px))
+
+
+def _check_fit(frame: DeviceFrame, answers: Sequence[Answer]) -> Floats:
+    """Distances (n,) of the spots from the best variant's model, pixels; refuses a map that fits none of them."""
     usable = [answer for answer in answers if answer.residuals_px is not None]
     if not usable:
         why = "; ".join(dict.fromkeys(answer.failure for answer in answers))
         raise EstimationFailure("position", f"no variant has a position ({why})")
-    limit_px = MAX_RESIDUAL_SHARE * float(np.hypot(frame.camera.width_px, frame.camera.height_px))
+    limit_px = _limit_px(frame)
     distances = [np.linalg.norm(one.residuals_px, axis=1) for one in usable if one.residuals_px is not None]
     off = min(distances, key=lambda some: float(np.median(some)))
     fitting = off <= 3 * limit_px
@@ -285,6 +305,7 @@ def _check_fit(frame: DeviceFrame, answers: Sequence[Answer]) -> None:
             f"the map does not fit the spots: residuals of {np.sqrt((off**2).mean()):.0f} px, at most {limit_px:.0f} "
             "px are allowed; check the map, its frequencies, --mirror, and the focal length",
         )
+    return np.asarray(off)
 
 
 def covered(answer: Answer, truth: Floats) -> float | None:
