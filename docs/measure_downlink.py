@@ -170,6 +170,11 @@ def identities(chosen: Chosen) -> None:
     measure_receiver.identities(chosen.measurement)
 
 
+def given(chosen: Chosen) -> None:
+    """Positions with decoded identities against given ones, on the same frames."""
+    measure_receiver.given(chosen.measurement)
+
+
 def panels(chosen: Chosen) -> None:
     """Packets at 10/40/50 us over the poses of office200, by one frame of a burst and by two; no map."""
     measure_receiver.panels(chosen.measurement)
@@ -199,6 +204,7 @@ SECTIONS: dict[str, Callable[[Chosen], None]] = {
         burst_cost,
         bit_errors,
         identities,
+        given,
         panels,
         motion,
         striped,

@@ -1,5 +1,6 @@
 """Sections of measure_downlink.py about the receiver: bit errors, identities by codes, panels by packets."""
 
+import json
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -8,7 +9,10 @@ from math import sqrt
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 from measure import Measurement, figure, heading, row
+from measure_belief import copied
 from numpy.typing import NDArray
 
 import estimator as est
@@ -31,9 +35,13 @@ PIXELS_A_LINE = 60
 LINES_A_CHIP = 5
 BITS = 10_000
 SEED_OF_OFFICE200 = 200
+GIVEN_FRAMES = 40
+GIVEN_VARIANTS = ("gravity-fit", "up2p", "ml")
 LEDS_OF_PANEL = 25
 RANDOM_PANELS = 10_000
 OFFICE200 = 200
+GIVEN_FRAMES = 40
+GIVEN_VARIANTS = ("gravity-fit", "up2p", "ml")
 
 
 def bit_errors() -> None:
@@ -221,6 +229,43 @@ def identities(measurement: Measurement) -> None:
     """Codes at 10/40/25 us over the poses of office200, identified in single frames."""
     changes = {"seed": SEED_OF_OFFICE200, "poses.count": OFFICE200, "bound": False}
     print_identities(measurement.dataset("identities", "downlink_codes", changes))
+
+
+def given(measurement: Measurement) -> None:
+    """Positions with identities decoded from pixels, and with the same frames' true identities handed over."""
+    changes = {"seed": SEED_OF_OFFICE200, "poses.count": GIVEN_FRAMES, "bound": False}
+    decoded = measurement.dataset("decoded", "downlink_codes", changes)
+    handed = copied(decoded, "given")
+    device = json.loads((handed / "dataset.json").read_text(encoding="utf-8"))
+    device["downlink"]["demodulation"] = "given"
+    (handed / "dataset.json").write_text(json.dumps(device), encoding="utf-8")
+    table = pq.read_table(handed / "frames.parquet")
+    place = table.schema.get_field_index("spots")
+    spots = [
+        [{key: led[key] for key in ("led", "u_px", "v_px")} for led in leds if led["visible_fraction"] >= WHOLE]
+        for leds in pq.read_table(handed / "truth.parquet")["leds"].to_pylist()
+    ]
+    spots_of_frames = pa.array(spots, type=table.schema.field("spots").type)
+    pq.write_table(table.set_column(place, table.schema.field("spots"), spots_of_frames), handed / "frames.parquet")
+    heading("identities", "variant", "failed", "median", "RMSE (95 % interval)", "NEES (99 % interval)")
+    for name, folder in (("decoded", decoded), ("given", handed)):
+        est.run(folder, GIVEN_VARIANTS, measurement.workers)
+        for score in est.score(folder).variants:
+            if score.variant not in GIVEN_VARIANTS or score.error_3d is None or score.rmse_interval is None:
+                continue
+            ends = score.rmse_interval
+            rmse = f"{1e6 * score.error_3d.rmse_m:.1f} um ({1e6 * ends.low_m:.1f} to {1e6 * ends.high_m:.1f})"
+            nees = (
+                "" if score.nees is None else f"{score.nees.mean:.2f} ({score.nees.low:.2f} to {score.nees.high:.2f})"
+            )
+            row(
+                name,
+                score.variant,
+                f"{score.failed} of {score.frames}",
+                f"{1e6 * score.error_3d.median_m:.1f} um",
+                rmse,
+                nees,
+            )
 
 
 def panels(measurement: Measurement) -> None:
