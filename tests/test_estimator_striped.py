@@ -6,7 +6,8 @@ from scipy.stats import chi2
 from striped_images import Array, code, coverage, gains, readout
 
 from estimator.spots.detect import Readout
-from estimator.spots.striped import EdgeEllipse, EdgeParallelogram, Lamp, find_lamps
+from estimator.spots.outlines import EdgeEllipse, EdgeParallelogram
+from estimator.spots.striped import Lamp, find_lamps
 
 ROW_US, EXPOSURE_US, CHIP_US = 10.0, 40.0, 25.0
 STRIPE_PX = (4 * CHIP_US + EXPOSURE_US) / ROW_US

@@ -22,7 +22,7 @@ from estimator.photo.save import digital_numbers, photograph_sensor
 from estimator.photo.solve import Centre, Solved, solve
 from estimator.spots.detect import Readout, Spot, detect
 from estimator.spots.identify import gate_px
-from estimator.spots.striped import Along
+from estimator.spots.striped_blobs import Along
 
 Floats = NDArray[np.float64]
 
