@@ -68,7 +68,7 @@ def attitude(
     else:
         return Attitude(None, None, "attitude unknown")
     if not 0 < error_deg <= 90:
-        raise InputError(f"{name} {error_deg:g}: needed a standard deviation from 0 to 90 degrees")
+        raise InputError(f"{name} {error_deg:g}: needed a standard deviation above 0 and at most 90 degrees")
     x, y, z = reading.tolist()
     return Attitude((x, y, z), Accelerometer(kind="tilt-error", error_deg=error_deg), f"{said}, {error_deg:g} deg")
 

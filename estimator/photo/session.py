@@ -111,7 +111,7 @@ def _options(request: PhotoRequest, leds: LedTable) -> Options:
         ("--centroid-sigma", request.centroid_sigma, 1e3),
     ):
         if value is not None and not 0 < value <= largest:
-            raise InputError(f"{name} {value:g}: needed a number from 0 to {largest:g}")
+            raise InputError(f"{name} {value:g}: needed a number above 0 and at most {largest:g}")
     return Options(
         tone=request.tone,
         orientation=request.orientation,
