@@ -12,7 +12,7 @@ demo: $(READY)
 	$(BIN)/estimator report out/quickstart --out out/quickstart/report.html
 
 test: $(READY)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 check: lint
 	$(BIN)/python -m pytest -m "not slow"
