@@ -1,5 +1,6 @@
 """Parallelogram of a square LED image: a robust, weighted fit to the edges of its lines."""
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -46,15 +47,16 @@ class _Ends:
 
 
 @dataclass(frozen=True, eq=False)
-class _ParallelogramModel:
+class _ParallelogramModel(ABC):
     """Parameters of a parallelogram, of which the first two are its centre (x, y), and how to fit them."""
 
     edges: LineEdges
     ends: _Ends
     start: Floats
 
+    @abstractmethod
     def outline(self, p: Floats) -> EdgeParallelogram:
-        raise NotImplementedError
+        """The parallelogram of some parameters."""
 
     def residuals(self, p: Floats) -> Floats:
         """Whitened residuals (2n + 1,): of the left edges, of the right edges, and of the middle of the ends."""
