@@ -35,7 +35,7 @@ Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 logger = logging.getLogger(__name__)
 
-CACHE_VERSION = 7
+CACHE_VERSION = 8
 """Raised with every change of the program that changes bakes of the same scene."""
 BATCHES = 8
 """Independent estimates of a path-traced illuminance; their scatter gives the standard error."""

@@ -1,6 +1,7 @@
 """A room as a Mitsuba scene: its mesh, its glazing, and the luminance that surfaces emit."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,8 +12,11 @@ from vlcrender.scene.fresnel import glazing_reflectance
 from vlcrender.scene.mesh import Mesh
 from vlcrender.scene.surfaces import Glazing
 
-BEHIND_M = 1e-3
-"""Distance of the scene outside behind its glazing in metres, and the share by which it is larger than the glazing."""
+BEHIND_SHARE = 1e-3
+"""Distance of the scene outside behind its glazing, as a share of 1 m and the largest coordinate. Mitsuba lifts a ray
+off what it has met by 9e-5 of that length, and what is nearer is not seen."""
+GRAZING = 10.0
+"""Distances by which the scene outside goes on past the edges of its glazing: rays at 84 deg to the normal meet it."""
 GLAZING_FACES = np.array([[0, 1, 2], [0, 2, 3]])
 
 Array = NDArray[np.float64]
@@ -48,10 +52,21 @@ def glazing_shape(glazing: Glazing) -> "mi.Mesh":
 
 def outside_shape(glazing: Glazing) -> "mi.Mesh":
     """The scene outside of glazing as a Mitsuba shape: black, emitting the glazing's luminance, just behind it."""
-    middle = glazing.corners_m.mean(axis=0)
-    corners = middle + (1 + BEHIND_M) * (glazing.corners_m - middle) - BEHIND_M * glazing.normal
+    corners_m = outside_of(glazing).corners_m
     black = {"type": "diffuse", "reflectance": 0.0}
-    return _shape(f"outside {glazing.name}", corners, GLAZING_FACES, black, np.full(4, glazing.luminance_cd_m2))
+    return _shape(f"outside {glazing.name}", corners_m, GLAZING_FACES, black, np.full(4, glazing.luminance_cd_m2))
+
+
+def outside_of(glazing: Glazing) -> Glazing:
+    """The rectangle just behind glazing that stands for the scene outside."""
+    behind_m = BEHIND_SHARE * (1 + float(np.abs(glazing.corners_m).max()))
+    past_u, past_v = (GRAZING * behind_m * edge / np.linalg.norm(edge) for edge in (glazing.edge_u_m, glazing.edge_v_m))
+    return replace(
+        glazing,
+        corner_m=glazing.corner_m - behind_m * glazing.normal - past_u - past_v,
+        edge_u_m=glazing.edge_u_m + 2 * past_u,
+        edge_v_m=glazing.edge_v_m + 2 * past_v,
+    )
 
 
 class GlazingBsdf(mi.BSDF):

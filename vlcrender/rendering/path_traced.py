@@ -16,7 +16,7 @@ from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.core.backend import dr, mi
 from vlcrender.core.face_profile import FaceProfile
 from vlcrender.errors import InputError
-from vlcrender.light.mitsuba_room import BEHIND_M, glazing_bsdf, room_shape
+from vlcrender.light.mitsuba_room import glazing_bsdf, outside_of, room_shape
 from vlcrender.scene.furniture import furniture_meshes
 from vlcrender.scene.loader import Scene
 from vlcrender.scene.surfaces import TOUCH_M, Surface
@@ -185,11 +185,8 @@ def scene_dict(scene: Scene, posed: PosedCamera) -> dict[str, object]:
     for i, mesh in enumerate(furniture_meshes(scene, 0)):
         tree[f"furniture{i}"] = room_shape(mesh, np.zeros(len(mesh.vertices_m)))
     for i, glazing in enumerate(scene.glazings):
-        frame = _frame(glazing.corner_m, glazing.edge_u_m, glazing.edge_v_m)
+        frame, behind = (_frame(one.corner_m, one.edge_u_m, one.edge_v_m) for one in (glazing, outside_of(glazing)))
         tree[f"glazing{i}"] = _shape("rectangle", frame, glazing_bsdf(glazing.refractive_index), 0.0)
-        behind = frame.copy()
-        behind[:3, 3] -= BEHIND_M * frame[:3, 2]
-        behind[:3, :2] *= 1 + BEHIND_M
         tree[f"outside{i}"] = _shape("rectangle", behind, _diffuse(0.0), glazing.luminance_cd_m2)
     leds, face = scene.leds, scene.settings.led_reflectance
     for i in range(len(leds)):
