@@ -2,14 +2,13 @@
 
 `up2p` is PoseLib's upright two-point solver (Kukelova, Bujnak & Pajdla 2010) inside a RANSAC of this package, because
 PoseLib's Python interface has the solver alone. The solver assumes gravity to be exact, so the error of the reading
-displaces the other spots under the pose of a pair; the gate for inliers includes that displacement, and that by the
-errors of camera and map that the device states. The refinement then fits position and orientation to the inliers
-without gravity. If the inliers do not determine the orientation (fewer than four, or on one line), or the device states
-errors of camera or map, beside which gravity counts, gravity is used as a prior.
+displaces the other spots under the pose of a pair; the gate at which pairs are ranked includes that displacement. The
+refinement then fits position and orientation to the spots that agree, without gravity. If these do not determine the
+orientation (fewer than four, or on one line), or the device states errors of camera or map, beside which gravity
+counts, gravity is used as a prior.
 
-With a rolling shutter the pairs are solved with the turns undone that the gyroscope says, the gate includes the
-displacement by the prior of the motion, and the refinement fits the velocity with the pose, as `gravity-fit` does, with
-gravity as a prior.
+With a rolling shutter the pairs are solved with the turns undone that the gyroscope says, and the refinement fits the
+velocity with the pose, as `gravity-fit` does, with gravity as a prior.
 """
 
 from collections.abc import Sequence
@@ -81,8 +80,6 @@ def _from_pairs(observations: Observations) -> list[Pose]:
         generator = np.random.Generator(np.random.Philox(key=len(pairs)))
         pairs = [pairs[k] for k in generator.choice(len(pairs), MAX_PAIRS, replace=False)]
     gate = GATE_SIGMA * float(observations.tilt_sigma_rad.max()) + GATE_PX * observations.camera.pixel_angle_rad
-    if observations.displaced and (pose := upright_pose(observations)) is not None:
-        gate += GATE_SIGMA * float(np.sqrt(np.diag(observations.total_covariance(pose)).max()))
     ranked: list[tuple[float, int, Pose]] = []
     for pair in pairs:
         found = poselib.up2p(level[list(pair)] @ Y_UP.T, observations.leds_m[list(pair)] @ Y_UP.T)
