@@ -166,7 +166,7 @@ def bit_errors(chosen: Chosen) -> None:
 
 
 def identities(chosen: Chosen) -> None:
-    """Codes at 10/40/25 us over the poses of office200, identified in single frames."""
+    """Codes at 10/40/25 us over the poses of office200 and as many others, identified in single frames."""
     measure_receiver.identities(chosen.measurement)
 
 
