@@ -4,6 +4,8 @@
                                                             with the statements and branches that none executes
     python tests/mutation/run.py chosen [--only NAME]       the kept lists, chosen_*.toml
     python tests/mutation/run.py sample --count 150 --seed 7
+    python tests/mutation/run.py sample --test-seconds 30   a first pass with fewer tests; the next one takes its
+                                                            survivors only
 
 Each mutant is one change to one file of a copy of the checkout. The tests that execute the changed line run against it,
 those of its module first, then the quickest, up to the first failure: killed. A mutant whose tests all pass survived:
@@ -39,7 +41,7 @@ from operators import sites  # noqa: E402  beside this file
 OUT = ROOT / "out/mutants"
 PACKAGES = ("vlcrender", "estimator")
 MAX_TEST_S = 240.0
-"""Recorded time of the tests that one mutant is held against; the quickest are taken."""
+"""Recorded time of the tests that one mutant is held against, if no other is asked for; the quickest are taken."""
 NEAR = 0.1
 """Tests of a module find most of its mutants: their times are weighted by this."""
 BAKING = tuple(f"vlcrender/{floor}" for floor in ("light", "scene", "camera", "config", "core", "sensor"))
@@ -131,10 +133,10 @@ class Map:
             for line in (end for end in ends if end > 0):
                 lines.setdefault(line, set()).update(tests)
 
-    def tests(self, file: str, line: int) -> tuple[list[str], float]:
+    def tests(self, file: str, line: int, most_s: float) -> tuple[list[str], float]:
         """Tests that execute a line, the quickest first (one of its module counts as NEAR of its time), and their time.
 
-        For a line that runs at import, the tests of the whole file.
+        Those that take `most_s` together; for a line that runs at import, of the tests of the whole file.
         """
         lines = self._rows.get(file, {})
         near = lines.get(line) or set().union(*lines.values()) if lines else set()
@@ -147,10 +149,10 @@ class Map:
         total, taken = 0.0, []
         for test in ordered:
             total += self._times.get(test, 1.0)
-            if taken and total > MAX_TEST_S:
+            if taken and total > most_s:
                 break
             taken.append(test)
-        return taken, min(total, MAX_TEST_S)
+        return taken, min(total, most_s)
 
 
 def make_map() -> None:
@@ -207,9 +209,9 @@ class Sandboxes:
         shutil.rmtree(self._folder, ignore_errors=True)
 
 
-def judge(mutant: Mutant, tests: Map, sandboxes: Sandboxes) -> dict[str, object]:
+def judge(mutant: Mutant, tests: Map, sandboxes: Sandboxes, most_s: float) -> dict[str, object]:
     """Run the tests of a mutant: killed by which, or survived."""
-    names, seconds = tests.tests(mutant.file, mutant.line)
+    names, seconds = tests.tests(mutant.file, mutant.line, most_s)
     result: dict[str, object] = {"name": mutant.name, "change": mutant.change, "tests": len(names)}
     if not names:
         return {**result, "outcome": "survived", "by": "no test executes this line", "s": 0.0}
@@ -242,7 +244,7 @@ def judge(mutant: Mutant, tests: Map, sandboxes: Sandboxes) -> dict[str, object]
     return {**result, "outcome": "killed", "by": failed[0][:160] if failed else f"exit {done.returncode}", "s": took}
 
 
-def run(mutants: list[Mutant], workers: int) -> int:
+def run(mutants: list[Mutant], workers: int, most_s: float) -> int:
     """Judge all mutants that have no result yet; print each and the score. The number of survivors."""
     tests, sandboxes = Map(), Sandboxes()
     state = _digest_of_tests()
@@ -251,8 +253,8 @@ def run(mutants: list[Mutant], workers: int) -> int:
     if kept.exists():
         for line in kept.read_text().splitlines():
             row = json.loads(line)
-            # A kill stays one; a survivor is tried again when tests have changed.
-            if row["outcome"] == "killed" or row["state"] == state:
+            # A kill stays one; a survivor is tried again when tests have changed, or if more of them are asked for.
+            if row["outcome"] == "killed" or (row["state"] == state and row.get("most_s", 0.0) >= most_s):
                 known[row["digest"]] = row
     equivalents = [
         entry for path in HERE.glob("equivalent*.toml") for entry in tomllib.loads(path.read_text())["mutant"]
@@ -260,7 +262,9 @@ def run(mutants: list[Mutant], workers: int) -> int:
     lock, outcomes, survivors = threading.Lock(), Counter[str](), []
     try:
         with concurrent.futures.ThreadPoolExecutor(workers) as pool:
-            pending = {pool.submit(lambda m=m: known.get(m.digest) or judge(m, tests, sandboxes)): m for m in mutants}
+            pending = {
+                pool.submit(lambda m=m: known.get(m.digest) or judge(m, tests, sandboxes, most_s)): m for m in mutants
+            }
             for future in concurrent.futures.as_completed(pending):
                 mutant, row = pending[future], future.result()
                 outcome = str(row["outcome"])
@@ -270,7 +274,9 @@ def run(mutants: list[Mutant], workers: int) -> int:
                     outcomes[outcome] += 1
                     if mutant.digest not in known:
                         with kept.open("a") as file:
-                            file.write(json.dumps({**row, "digest": mutant.digest, "state": state}) + "\n")
+                            file.write(
+                                json.dumps({**row, "digest": mutant.digest, "state": state, "most_s": most_s}) + "\n"
+                            )
                     if outcome == "survived":
                         survivors.append(mutant.name)
                     print(f"{outcome:10} {mutant.name}: {mutant.change!r} {row['by']} ({row['s']:.0f} s)", flush=True)
@@ -309,12 +315,13 @@ def main() -> None:
     of_sample.add_argument("--seed", type=int, default=1)
     for command in (of_chosen, of_sample):
         command.add_argument("--workers", type=int, default=2)
+        command.add_argument("--test-seconds", type=float, default=MAX_TEST_S)
     arguments = parser.parse_args()
     if arguments.command == "map":
         make_map()
         return
     mutants = chosen(arguments.only) if arguments.command == "chosen" else sample(arguments.count, arguments.seed)
-    sys.exit(1 if run(mutants, arguments.workers) else 0)
+    sys.exit(1 if run(mutants, arguments.workers, arguments.test_seconds) else 0)
 
 
 if __name__ == "__main__":
