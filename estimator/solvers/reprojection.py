@@ -177,7 +177,7 @@ def _fit(observations: Observations, start: Pose, whitening: Floats, loss: Liter
         return np.concatenate(parts)
 
     def jacobian(x: Floats) -> Floats:
-        # The lift of an LED, some micrometres, changes these by some millionths.
+        # The eccentricity changes these by s^2 / d^2: some millionths for an LED of 1 cm, a hundredth for one of 60 cm.
         if motion is None:
             of_image = cv2.projectPoints(model, x[:3], x[3:], np.eye(3), None)[1][:, :6].reshape(-1, 2, 6)
             return np.vstack([_whitened(whitening, of_image), _tilt_jacobian(x, observations)])

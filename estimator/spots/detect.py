@@ -5,6 +5,11 @@ an ellipse. The ellipse of a small LED image, which the smoothing widens, is rep
 moments. The centroid is computed over the ellipse padded by a margin, so that it contains all light of the LED image,
 blurred or not, and the background around it cancels. What the sampling by pixels adds is subtracted
 (`estimator.spots.sampling`).
+
+The background has the lens's fall-off, as the light of the LED has: across the image of a luminaire of 60 cm by a wide
+lens it changes by a third, which moved the centroid by 0.4 px of 560. A large LED image therefore tells the fall-off by
+its own light, and the background is subtracted with it. The light of a large LED image, or of one that may be square,
+is summed over the padded part above half level itself, which holds less background than an ellipse around it.
 """
 
 from collections.abc import Iterator, Sequence
@@ -41,12 +46,17 @@ RING_PX = 3.0
 MIN_SIGNAL_TO_NOISE = 5.0
 # The 5 x 5 mean widens the part above half level of LED images with a smaller semi-axis than about its own width.
 SMALL_PX = 6.0
+# Across a disc with a larger semi-axis the lens's fall-off changes the background by more than noise. The ellipse
+# around a square contains so much background that this holds from SMALL_PX on.
+LARGE_PX = 40.0
 # Second moments replace the ellipse where noise changes them by a few percent at most.
 MIN_SIGNAL_FOR_MOMENTS = 50.0
 # Pixels of the ring this many standard deviations from its median are no background of the LED.
 BACKGROUND_SIGMA = 3.0
 # Of fewer pixels the variance is not measured.
 MIN_RING_PIXELS = 20
+# Of fewer pixels within an LED image the gradient of its light is not measured.
+MIN_INSIDE_PIXELS = 20
 # A ring whose variance exceeds the noise's by this many standard deviations has a structure.
 STRUCTURE_SIGMA = 4.0
 # Below this share of the variance, which noise of half a step exceeds, rounding errors are independent.
@@ -101,7 +111,8 @@ class _Ellipse:
 
     `axes` (2, 2) are its unit axes as columns, `semi_axes_px` (2,) their lengths. `low_px` and `high_px` (2,) are
     opposite vertices of the upright box around the part itself. `stretch` is the factor that makes the ellipse enclose
-    a square. `fringe_px` is the width of the light found around the ellipse beyond that of a sharp LED image.
+    a square. `fringe_px` is the width of the light found around the ellipse beyond that of a sharp LED image. `core`
+    are the pixels of the part, the first of them at `low_px`, where they describe the LED image better than the ellipse.
     """
 
     centre_px: NDArray[np.float64]
@@ -112,6 +123,7 @@ class _Ellipse:
     area_px: int
     stretch: float
     fringe_px: float = 0.0
+    core: NDArray[np.bool_] | None = None
 
     def distance2(self, u_px: NDArray[np.float64], v_px: NDArray[np.float64], padding_px: float) -> NDArray[np.float64]:
         """Squared distance from the centre in units of the padded ellipse, at most 1 inside.
@@ -299,7 +311,9 @@ def _ellipse(core: NDArray[np.bool_], left: int, top: int, stretch: float) -> _E
     columns, rows = np.flatnonzero(of_columns), np.flatnonzero(of_rows)
     low_px = np.array([columns[0] + left, rows[0] + top], dtype=np.float64)
     high_px = np.array([columns[-1] + left + 1, rows[-1] + top + 1], dtype=np.float64)
-    return _Ellipse(centre, axes, semi_axes_px, low_px, high_px, int(count), stretch)
+    uses_core = semi_axes_px.max() > (LARGE_PX if stretch == 1.0 else SMALL_PX)
+    own = core[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] if uses_core else None
+    return _Ellipse(centre, axes, semi_axes_px, low_px, high_px, int(count), stretch, core=own)
 
 
 def _fringe_px(ellipse: _Ellipse, low_px: NDArray[np.int64], high_px: NDArray[np.int64]) -> float:
@@ -359,16 +373,24 @@ class _Light:
 def _light(readout: Readout, ellipse: _Ellipse, others: list[_Ellipse], denoise_radius_px: int) -> _Light:
     """Light in the ellipse and a margin; the background is that of a ring around them."""
     margin_px = MARGIN_PX + max(denoise_radius_px, ellipse.fringe_px)
-    height_px, width_px = readout.image_e.shape
-    half_extent = ellipse.half_extent(margin_px + RING_PX)
-    left, top = np.maximum(np.floor(ellipse.centre_px - half_extent), 0).astype(int)
-    right, bottom = np.minimum(np.ceil(ellipse.centre_px + half_extent), (width_px, height_px)).astype(int)
+    left, top, right, bottom = _surroundings(ellipse, margin_px + RING_PX, readout.image_e.shape)
     roi = np.s_[top:bottom, left:right]
     u_px, v_px = np.arange(left, right)[None, :] + 0.5, np.arange(top, bottom)[:, None] + 0.5
     electrons = readout.image_e[roi].astype(np.float64)
     distance2 = ellipse.distance2(u_px, v_px, margin_px)
-    support = distance2 <= 1
-    ring = ~support & (ellipse.distance2(u_px, v_px, margin_px + RING_PX) <= 1)
+    fall_off = np.ones(electrons.shape)
+    if ellipse.core is None:
+        support = distance2 <= 1
+        ring = ~support & (ellipse.distance2(u_px, v_px, margin_px + RING_PX) <= 1)
+    else:
+        face = np.zeros(electrons.shape, dtype=bool)
+        column, row = ellipse.low_px.astype(int) - (left, top)
+        face[row : row + ellipse.core.shape[0], column : column + ellipse.core.shape[1]] = ellipse.core
+        edge_px = SMOOTHING_PX // 2 + ellipse.fringe_px
+        fall_off = _relative_fall_off(electrons, _distance_px(face) > edge_px)
+        beyond_px = _distance_px(~face)
+        support = beyond_px <= margin_px
+        ring = ~support & (beyond_px <= margin_px + RING_PX)
     for other in others:
         # A pixel in two supports belongs to the nearer spot.
         other_distance2 = other.distance2(u_px, v_px, MARGIN_PX + max(denoise_radius_px, other.fringe_px))
@@ -377,19 +399,51 @@ def _light(readout: Readout, ellipse: _Ellipse, others: list[_Ellipse], denoise_
     # Shot noise: a raw pixel's variance is its electrons.
     raw_e = np.maximum(readout.raw_e[roi].astype(np.float64), 0.0)
     variance_e2 = raw_e + readout.floor_e2 + (readout.prnu * raw_e) ** 2
-    background_e = 0.0
+    background_e = np.zeros(electrons.shape)
     if ring.any():
         # One electron more: the noise of a pixel with fewer is not normal.
         gate_e = BACKGROUND_SIGMA * float(np.sqrt(np.median(variance_e2[ring]) + 1.0))
+        even_e = electrons / fall_off
         # The ring without pixels of another surface or light.
-        ring &= np.abs(electrons - np.median(electrons[ring])) <= gate_e
-        background_e = float(electrons[ring].mean())
+        ring &= np.abs(even_e - np.median(even_e[ring])) <= gate_e
+        background_e = float(even_e[ring].mean()) * fall_off
         if np.count_nonzero(ring) >= MIN_RING_PIXELS:
             unlit = support & (electrons - background_e <= gate_e)
-            excess_e2 = _excess_variance(readout, readout.raw_e[roi][ring], float(variance_e2[ring].mean()))
+            ring_e = readout.raw_e[roi][ring] / fall_off[ring]
+            excess_e2 = _excess_variance(readout, ring_e, float(variance_e2[ring].mean()))
             variance_e2[unlit] = np.maximum(variance_e2[unlit] + excess_e2, 0.0)
     signal_e = np.where(support, electrons - background_e, 0.0)
     return _Light(roi, u_px, v_px, electrons, support, signal_e, variance_e2)
+
+
+def _distance_px(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Distance of each pixel of a mask from the nearest one that is not in it; 0 for the others."""
+    return np.asarray(cv2.distanceTransform(mask.view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE))
+
+
+def _surroundings(ellipse: _Ellipse, padding_px: float, shape: tuple[int, ...]) -> tuple[int, int, int, int]:
+    """First column and row, and those after the last, of a padded LED image in an image of this shape."""
+    low_px, high_px = ellipse.low_px - padding_px, ellipse.high_px + padding_px
+    if ellipse.core is None:
+        half_extent = ellipse.half_extent(padding_px)
+        low_px, high_px = ellipse.centre_px - half_extent, ellipse.centre_px + half_extent
+    left, top = np.maximum(np.floor(low_px), 0).astype(int).tolist()
+    right, bottom = np.minimum(np.ceil(high_px), shape[::-1]).astype(int).tolist()
+    return left, top, right, bottom
+
+
+def _relative_fall_off(electrons: Pixels, inside: NDArray[np.bool_]) -> Pixels:
+    """Illumination by the lens in each pixel: the plane that the light inside an LED image follows, 1 at its middle.
+
+    With the second moments S of the pixels inside, a relative gradient g of the light moves their centroid by S g.
+    """
+    if np.count_nonzero(inside) < MIN_INSIDE_PIXELS:
+        return np.ones(electrons.shape)
+    offset = np.indices(electrons.shape, dtype=np.float64)
+    offset -= offset[:, inside].mean(axis=1)[:, None, None]
+    moments = np.cov(offset[:, inside], bias=True)
+    gradient = np.linalg.solve(moments, offset[:, inside] @ electrons[inside] / electrons[inside].sum())
+    return np.asarray(1 + np.tensordot(gradient, offset, axes=1))
 
 
 def _excess_variance(readout: Readout, ring_e: NDArray[np.float32], model_e2: float) -> float:
