@@ -10,7 +10,8 @@ from test_estimator_maximum_likelihood import frame_of
 
 from estimator.io.device import DecodedSpot, DeviceFrame, Led, Part, SquareLed
 from estimator.spots.correspondences import centroids_px, find_correspondences, led_positions_m
-from estimator.spots.detect import Readout, detect
+from estimator.spots.detect import detect
+from estimator.spots.led_light import Readout
 from estimator.spots.sampling import sampling_variance_px2
 
 TARGET = (3.5, 3.6, 3.5)

@@ -7,7 +7,8 @@ from estimator_synthetic import Array, View, grid, poisson, render, view_of
 
 from estimator.errors import EstimationFailure
 from estimator.spots.denoise import NEIGHBOURHOOD_RADIUS_PX, neighbourhood_mean
-from estimator.spots.detect import Readout, Spot, detect
+from estimator.spots.detect import Spot, detect
+from estimator.spots.led_light import Readout
 from estimator.spots.sampling import LensBlur
 
 SMALL = (400, 300, 1500.0)

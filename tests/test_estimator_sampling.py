@@ -7,7 +7,8 @@ import pytest
 from estimator_synthetic import Array
 from test_estimator_device import CAMERA
 
-from estimator.spots.detect import Readout, detect
+from estimator.spots.detect import detect
+from estimator.spots.led_light import Readout
 from estimator.spots.sampling import SHARP, LensBlur, lens_blur, sampling_error, sampling_variance_px2
 
 POSITIONS_PX = np.linspace(20.0, 21.0, 41)

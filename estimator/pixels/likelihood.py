@@ -150,6 +150,9 @@ def fit_photometry(
             total[:, -1, -1] += of_phase
             sums[len(pairs) + count - 1] -= of_phase * bright * phase
         total[~determined] = np.eye(count)
+        # Few unsaturated pixels may determine background and amplitude, and not the background's slopes beside them.
+        determined &= np.linalg.det(_of_equal_size(total)[0]) > MIN_DETERMINANT
+        total[~determined] = np.eye(count)
         covariance = _inverse(total) * determined[:, None, None]
         coefficients = np.einsum("gij,jg->gi", covariance, sums[len(pairs) :])
         expected = np.einsum("mi,mi->m", basis, coefficients[group])
@@ -187,9 +190,15 @@ def _products(basis: Floats, y: Floats, pairs: list[tuple[int, int]]) -> Floats:
 
 
 def _inverse(matrices: Floats) -> Floats:
-    """Inverses of positive definite matrices (n, k, k), with parameters scaled to equal size."""
+    """Inverses of positive definite matrices (n, k, k)."""
+    scaled, scale = _of_equal_size(matrices)
+    return np.asarray(np.linalg.inv(scaled) * scale[:, :, None] * scale[:, None])
+
+
+def _of_equal_size(matrices: Floats) -> tuple[Floats, Floats]:
+    """Positive definite matrices (n, k, k) with parameters scaled to a diagonal of ones, and the scales (n, k)."""
     scale = 1 / np.sqrt(np.diagonal(matrices, axis1=1, axis2=2))
-    return np.asarray(np.linalg.inv(matrices * scale[:, :, None] * scale[:, None]) * scale[:, :, None] * scale[:, None])
+    return np.asarray(matrices * scale[:, :, None] * scale[:, None]), np.asarray(scale)
 
 
 def _mean_deviance(electrons: Floats, expected: Floats, dark_e2: Floats) -> float:

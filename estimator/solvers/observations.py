@@ -12,8 +12,8 @@ then the image of the face's mean X, weighted by 1 / |X|^4. To second order that
 point **above the LED by 4 s^2 h / d^2**, where s^2 is the mean square extent of the face along any direction, h the
 height of the LED above the camera, and d its distance. s^2 is r^2 / 4 for a disc of radius r, and a^2 / 12 for a square
 of side a. `light_centres_m` takes the mean by Gauss's rule of 3 x 3 points, which is exact for the terms of fourth
-order of a square; with second order alone the position is off by some r^4 / h^3, a nanometre for LEDs of 1 cm and 0.1 mm
-for luminaires of 60 cm. A disc has the points of the square with the same s^2.
+order of a square; with second order alone the position is off by some r^4 / h^3, a nanometre for LEDs of 1 cm and 0.1
+mm for luminaires of 60 cm. A disc has the points of the square with the same s^2, which is exact to second order.
 
 The mean holds in a pinhole's image plane. A lens that bends straight lines also bends the image of an LED, and
 the undistorted centroid is then not the centroid of the undistorted image. `corrected_for_eccentricity` subtracts that

@@ -8,9 +8,10 @@ from numpy.typing import NDArray
 
 from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame
-from estimator.spots.detect import Readout, Spot, detect
+from estimator.spots.detect import Spot, detect
 from estimator.spots.identify import Correspondence, gate_px, identify
 from estimator.spots.lamps import has_stripes, lamps_of, light_centre_px
+from estimator.spots.led_light import Readout
 from estimator.spots.sampling import lens_blur
 
 Floats = NDArray[np.float64]

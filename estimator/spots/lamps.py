@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from estimator.camera.projection import relative_illumination
 from estimator.io.device import Camera, DeviceFrame
 from estimator.io.downlink import Codes, Downlink, Packets, SquareFace, Tones, Transmitter
-from estimator.spots.detect import Readout
+from estimator.spots.led_light import Readout
 from estimator.spots.striped import Lamp, find_lamps
 
 Floats = NDArray[np.float64]

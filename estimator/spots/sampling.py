@@ -33,8 +33,8 @@ SHAPE_UNCERTAINTY = 0.003
 MIN_HALF_EXTENT_PX = 0.7
 # A centroid that moves by less than this share of the LED image's movement says little about it.
 MIN_SLOPE = 0.3
-# Second moment by light beyond the two columns around the centroid below which the half extent is not determined: 1 % of
-# the light in a third column adds 0.02 px^2 at most.
+# Second moment by light beyond the two columns around the centroid below which the half extent is not determined: 1 %
+# of the light in a third column adds 0.02 px^2 at most.
 MIN_THIRD_COLUMN_PX2 = 0.02
 MAX_ROUNDS = 30
 CONVERGED_PX = 1e-5
@@ -111,7 +111,7 @@ def sampling_error(centroid_px: Floats, moments_px2: Floats, moment_sigmas_px2: 
     x = 2 * np.pi * HARMONICS * half_px[:, None]
     envelope2 = np.minimum(8 / (np.pi * x**3), 1.0)
     rest = (envelope2 * (1 - shrinking**2) / (np.pi * HARMONICS) ** 2).sum(axis=1) / 2
-    # Light in two columns alone has the second moment p (1 - p) with the share p, which says nothing of its half extent.
+    # Light in two columns alone has the second moment p (1 - p) with the share p of one: nothing of its half extent.
     share = (centroid_px - 0.5) % 1
     usable = solved & (slope > MIN_SLOPE) & (moments_px2 - share * (1 - share) > MIN_THIRD_COLUMN_PX2)
     return SamplingError(
