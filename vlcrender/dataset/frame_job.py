@@ -45,7 +45,7 @@ from vlcrender.scene.loader import Scene, build_scene
 from vlcrender.scene.schema import SceneSettings
 from vlcrender.sensor.radiometry import detectors, electron_rate_per_cd_m2
 from vlcrender.sensor.sensor import Sensor
-from vlcrender.sensor.signal_chain import expose, variance_e2
+from vlcrender.sensor.signal_chain import expose_regions, variance_e2
 
 
 @dataclass(frozen=True)
@@ -86,10 +86,7 @@ def make_frame(job: Job, frame: int) -> FrameRecord:
     exposed = view.exposed(waves, start_s)
     noise = random_key(recipe.seed, frame, "shot-noise")
     of_device = device_sensor(recipe, device)
-    dn = [
-        RegionImage(roi, expose(of_device, mean, noise, roi.row, roi.column, exposure_s=exposure_s, camera=told.name))
-        for roi, mean in exposed.expected
-    ]
+    dn = expose_regions(of_device, exposed.expected, noise, exposure_s=exposure_s, camera=told.name)
     attributes = exr_attributes(camera, told.name, exposure_s, frame)  # of the told camera: a reader sees them
     file = f"{FRAMES}/{frame:06d}.exr"
     digest = write_exr(directory / file, dn, sensor, attributes)
