@@ -100,7 +100,7 @@ def test_the_bound_of_a_frame_is_that_of_its_noise_and_its_accelerometer(tmp_pat
     bound = position_bound_m2(
         mounted,
         pose,
-        renderer.led_patches,
+        renderer.led_slopes,
         1.6e-6,
         [variance],
         float(np.median(np.linalg.norm(plan.scene.leds.centers_m - truth.position_m, axis=1))),

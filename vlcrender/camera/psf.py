@@ -236,8 +236,16 @@ def blur(image: NDArray[Any], kernel: Array | None, border: str = "zero") -> NDA
         wide = np.pad(image, kernel.shape[0] // 2, mode="edge").astype(np.float64)
         blurred = signal.oaconvolve(wide, kernel, mode="valid")
     else:
-        blurred = signal.oaconvolve(image.astype(np.float64), kernel, mode="full")
+        blurred = spread(image.astype(np.float64), kernel)
     return np.maximum(blurred, 0.0).astype(image.dtype)
+
+
+def spread(light: Array, kernel: Array | None) -> Array:
+    """Convolve numbers of either sign with a kernel; the result is padded by the kernel's radius on each side."""
+    if kernel is None:
+        return light
+    spread: Array = signal.oaconvolve(light, kernel, mode="full")
+    return spread
 
 
 def kernel_radius_px(kernel: Array | None) -> int:

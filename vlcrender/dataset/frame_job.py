@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property, lru_cache
+from functools import cache, cached_property, lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -240,7 +240,7 @@ class _View:
         return FrameSlopes.rendered(
             mounted,
             main,
-            lambda posed: renderer.led_patches(posed, recipe.regions, at.pose),
+            partial(renderer.led_slopes, regions=recipe.regions),
             self.exposure_s,
             [],
             float(np.median(np.linalg.norm(renderer.scene.leds.centers_m - at.position_m, axis=1))),

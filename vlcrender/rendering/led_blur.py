@@ -5,6 +5,7 @@ Where the blur is narrow, pixels that the LED's edge crosses are split (`led_edg
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,12 +13,12 @@ from numpy.typing import NDArray
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.psf import (
     SplitKernel,
-    blur,
     blur_kernel,
     kernel_radius_px,
     off_axis_sigma_px,
     split_for,
     split_kernel,
+    spread,
 )
 from vlcrender.camera.roi import Roi
 from vlcrender.rendering.led_coverage import candidate_leds
@@ -57,7 +58,12 @@ class LedKernel:
 
         edges: of the LED's images at one or more poses; light_per_excess: light of an excess of 1, in units of `light`.
         """
-        result = blur(light, self.whole)
+        positive: Array = np.maximum(self.spread(light, roi, edges, light_per_excess), 0.0)
+        return positive
+
+    def spread(self, light: Array, roi: Roi, edges: Sequence[LedEdges], light_per_excess: float) -> Array:
+        """`blurred` of numbers of either sign, such as changes of light."""
+        result = spread(light, self.whole)
         if self.parts is None:
             return result
         n, m = self.parts.split, self.parts.parts.shape[-1]
@@ -67,8 +73,7 @@ class LedKernel:
             for row, column, of_pixel in zip(edge.rows - roi.row, edge.columns - roi.column, excess, strict=True):
                 # not `@`: the last bits of a matrix product may depend on threads and processor
                 result[row : row + m, column : column + m] += np.einsum("p,pq->q", of_pixel, kernels).reshape(m, m)
-        positive: Array = np.maximum(result, 0.0)
-        return positive
+        return result
 
 
 @dataclass(frozen=True)
@@ -78,7 +83,7 @@ class LedBlur:
     kernels: tuple[LedKernel, ...]
     typical: Array | None
 
-    @property
+    @cached_property
     def radius_px(self) -> int:
         """Greatest radius of the kernels."""
         return max((kernel.radius_px for kernel in self.kernels), default=0)

@@ -31,6 +31,7 @@ from vlcrender.rendering.expected_image import ExpectedImage, ExpectedRegion, Im
 from vlcrender.rendering.halo import GlareHalo, glare_halo, halo_of_sources
 from vlcrender.rendering.led_blur import LedBlur, led_blur
 from vlcrender.rendering.led_radiance import LedImage, led_images
+from vlcrender.rendering.led_slopes import Cameras, led_slopes
 from vlcrender.rendering.occlusion import Occlusion
 from vlcrender.rendering.readout import Knot, RollingPoses, image_at_own_line
 from vlcrender.rendering.specular_reflection import blurred, specular_reflections
@@ -118,6 +119,7 @@ class Renderer:
         crosstalk: share of a pixel's electrons that its neighbours collect.
         """
         self._crosstalk = crosstalk
+        self._latest: tuple[tuple[PosedCamera, LedRegions | None], LedView] | None = None
         self.scene = scene
         self.detector = detector or Silicon()
         self._light = light or bake(scene)
@@ -130,6 +132,7 @@ class Renderer:
         The room's light and all occluders remain the scene's. `leds` has as many LEDs, in the same order.
         """
         renderer = copy.copy(self)
+        renderer._latest = None
         renderer.scene = replace(self.scene, leds=leds)
         # Where LEDs are as built, cameras are as made: each device, or frame, has its own.
         renderer._background = self._background.with_varying_cameras()
@@ -170,7 +173,10 @@ class Renderer:
             bands = tuple(self._band(posed, knot.poses, regions, blurs, knot) for knot in during.knots)
         else:
             bands = (self._band(posed, [posed.pose] if during is None else during, regions, blurs),)
-        return LedView(posed, bands, blurs, _patch_rois(posed.camera, bands, blurs, regions), rolling)
+        view = LedView(posed, bands, blurs, _patch_rois(posed.camera, bands, blurs, regions), rolling)
+        still = rolling is None and bands[0].poses == (posed,)
+        self._latest = ((posed, regions), view) if still else None
+        return view
 
     def _band(
         self,
@@ -222,13 +228,42 @@ class Renderer:
         blurred_at: pose whose blur is applied, `posed` itself where not given. Kernels change in steps of depth, which
         differences between images at two poses must not contain.
         """
+        return self._with_crosstalk(self._patches(self._still(posed, regions, blurred_at), np.float64), posed)
+
+    def led_slopes(
+        self, posed: PosedCamera, changes: Sequence[Cameras], regions: LedRegions | None = None
+    ) -> tuple[tuple[LedPatch, ...], ...]:
+        """`led_patches`, and for each small change of the camera the changes of their light, to first order.
+
+        changes: cameras (after, before). The lens's blur and what is occluded count as constant.
+        """
+        view, leds, led_rate = self._still(posed, regions), self.scene.leds, self._rates(posed.camera).led
+        patches = self._patches(view, np.float64)
+        images = {i: view.bands[0].images[0][i] for i in view.patch_rois}
+        changed: list[list[LedPatch]] = [[] for _ in changes]
+        splits = [kernel.split for kernel in view.blurs.kernels]
+        for patch, (i, slopes) in zip(patches, led_slopes(leds, posed, changes, images, splits), strict=True):
+            roi, kernel, rate = images[i].roi, view.blurs.kernels[i], led_rate * float(leds.luminances_cd_m2[i])
+            for slope, of_change in zip(slopes, changed, strict=True):
+                edges = [] if slope.edges is None else [slope.edges]
+                light = _cut(
+                    kernel.spread(rate * slope.change, roi, edges, rate), roi.padded(kernel.radius_px), patch.roi
+                )
+                of_change.append(replace(patch, electrons_per_s=light))
+        return tuple(self._with_crosstalk(one, posed) for one in (patches, *changed))
+
+    def _still(self, posed: PosedCamera, regions: LedRegions | None, blurred_at: Pose | None = None) -> "LedView":
+        """The view of a camera at rest."""
+        if blurred_at is None and self._latest is not None and self._latest[0] == (posed, regions):
+            return self._latest[1]
         leds = self.scene.leds
         blurs = led_blur(leds, posed if blurred_at is None else posed.at(blurred_at))
         bands = (LedBand((posed,), (led_images(leds, self._occlusion, posed, regions, blurs),)),)
-        view = LedView(posed, bands, blurs, _patch_rois(posed.camera, bands, blurs, regions))
-        patches = self._patches(view, np.float64)
+        return LedView(posed, bands, blurs, _patch_rois(posed.camera, bands, blurs, regions))
+
+    def _with_crosstalk(self, patches: Iterable[LedPatch], posed: PosedCamera) -> tuple[LedPatch, ...]:
         if not self._crosstalk:
-            return patches
+            return tuple(patches)
         return tuple(shared_patch(patch, self._crosstalk, Roi.of_sensor(posed.camera)) for patch in patches)
 
     def halo_of(self, camera: Camera) -> Callable[[Sequence[LedPatch], Roi], Array] | None:
@@ -339,6 +374,7 @@ class Renderer:
     def _patches(self, view: LedView, precision: type[np.floating] = np.float32) -> tuple[LedPatch, ...]:
         """Patches of the LEDs: means over the images at several poses, blurred."""
         leds, posed = self.scene.leds, view.posed
+        led_rate = self._rates(posed.camera).led
         center_px = posed.project(leds.centers_m)
         patches = []
         for i, roi in view.patch_rois.items():
@@ -349,7 +385,8 @@ class Renderer:
                 shared = band.share(roi)
                 if not of_led or shared is None:
                     continue
-                of_band = self._light_of(view, i, of_led, len(band.poses), roi if light is None else shared[0])
+                here = roi if light is None else shared[0]
+                of_band = self._light_of(view, i, of_led, len(band.poses), here, led_rate)
                 visible, imaged = (
                     sum(getattr(image, name) for image in of_led) / len(band.poses)
                     for name in ("visible_fraction", "imaged_fraction")
@@ -379,10 +416,11 @@ class Renderer:
             )
         return tuple(patches)
 
-    def _light_of(self, view: LedView, i: int, of_led: Sequence[LedImage], poses: int, roi: Roi) -> Array:
+    def _light_of(
+        self, view: LedView, i: int, of_led: Sequence[LedImage], poses: int, roi: Roi, led_rate: float
+    ) -> Array:
         """Light of LED number i in a region: the mean over its images at this number of poses, blurred."""
         luminance, kernel = self.scene.leds.luminances_cd_m2[i], view.blurs.kernels[i]
-        led_rate = self._rates(view.posed.camera).led
         union = _union(of_led)
         light = np.zeros((union.rows, union.columns))
         for image in of_led:
