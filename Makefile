@@ -36,6 +36,7 @@ figures: $(READY)
 
 bench: $(READY)
 	$(BIN)/python benchmarks/full_frame.py
+	$(BIN)/python benchmarks/options.py
 	$(BIN)/python benchmarks/regions.py
 	$(BIN)/python benchmarks/errors.py
 	$(BIN)/python benchmarks/sensor.py

@@ -29,6 +29,8 @@ DISC_OF_GAUSSIAN = 4 / np.pi * np.sqrt(2 * np.pi)
 """Diameter of the disc whose line spread function is as high as a normal one's, in standard deviations."""
 MAX_DEVIATIONS = 4.5
 """Radius of the kernel of a normal blur, in standard deviations: exp(-4.5^2 / 2) = 4e-5 of the light is beyond."""
+BAND_ROWS = 1000
+"""Rows that are blurred together."""
 MAX_PARTS = 64
 """Most parts across a pixel. A disc narrower than a part is ignored: it moves 0.2 % of an edge pixel's light."""
 
@@ -224,20 +226,31 @@ def _four_quarters(quarter: Array) -> Array:
 
 
 def blur(image: NDArray[Any], kernel: Array | None, border: str = "zero") -> NDArray[Any]:
-    """Convolve an image of light (rows, columns) with a kernel in double precision; the result has the image's dtype.
+    """Convolve an image of light (rows, columns) with a kernel; the result has the image's dtype.
 
     border "zero": the image is dark beyond its border; the result is padded by the kernel's radius on each side and
-    holds all the light (LED patches). border "edge": border pixels are repeated; the result has the image's shape
-    (backgrounds). Negative pixels from rounding become 0. Without a kernel the image is returned.
+    holds all the light (LED patches); in double precision. border "edge": border pixels are repeated; the result has
+    the image's shape (backgrounds); in the image's precision. Negative pixels from rounding become 0. Without a kernel
+    the image is returned.
     """
     if kernel is None:
         return image
     if border == "edge":
-        wide = np.pad(image, kernel.shape[0] // 2, mode="edge").astype(np.float64)
-        blurred = signal.oaconvolve(wide, kernel, mode="valid")
-    else:
-        blurred = spread(image.astype(np.float64), kernel)
-    return np.maximum(blurred, 0.0).astype(image.dtype)
+        return _blurred_in_bands(image, kernel.astype(image.dtype))
+    return np.maximum(spread(image.astype(np.float64), kernel), 0.0).astype(image.dtype)
+
+
+def _blurred_in_bands(image: NDArray[Any], kernel: NDArray[Any]) -> NDArray[Any]:
+    """An image whose border pixels are repeated, blurred in bands of rows, which bounds the memory."""
+    radius, rows = kernel.shape[0] // 2, len(image)
+    blurred = np.empty_like(image)
+    for start in range(0, rows, BAND_ROWS):
+        end = min(start + BAND_ROWS, rows)
+        inside = image[max(0, start - radius) : end + radius]
+        above, below = max(0, radius - start), max(0, end + radius - rows)
+        wide = np.pad(inside, ((above, below), (radius, radius)), mode="edge")
+        np.maximum(signal.oaconvolve(wide, kernel, mode="valid"), 0.0, out=blurred[start:end])
+    return blurred
 
 
 def spread(light: Array, kernel: Array | None) -> Array:

@@ -171,6 +171,7 @@ def _edges(surfaces: NDArray[np.uint32], roi: Roi, sensor: Roi) -> NDArray[np.bo
 
 def differs_from_neighbour(labels: NDArray[Any]) -> NDArray[np.bool_]:
     """Pixels (rows, columns) with another label than one of their 8 neighbours."""
+    labels = labels.astype(np.min_scalar_type(labels.max(initial=0)), copy=False)  # most scenes: 8 bits, a pass of 4
     differs = np.zeros(labels.shape, dtype=bool)
     for here, there in (
         (np.s_[:, 1:], np.s_[:, :-1]),
