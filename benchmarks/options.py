@@ -2,8 +2,8 @@
 
     python benchmarks/options.py [REPEATS]
 
-Frames of the office, 4000 x 3000. CPU time of all threads, alternately in one process. The peak memory of each option is
-that of a process of its own, above that of a process that makes a frame of 100 x 75 pixels.
+Frames of the office, 4000 x 3000. CPU time of all threads, alternately in one process. The peak memory of each option
+is that of a process of its own, above that of a process that makes a frame of 100 x 75 pixels.
 """
 
 import resource

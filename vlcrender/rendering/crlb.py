@@ -293,9 +293,10 @@ class FrameSlopes:
         """Light of some LEDs in a region, electrons a second: of those in `patches` (by id) that `leds` names."""
         found = [patches[led.led_id] for led in leds if led.led_id in patches]
         image = np.zeros((roi.rows, roi.columns))
-        for sign in (1.0, -1.0) if self.halo_of is not None else ():  # halos are of light, which is positive
-            light = [replace(p, electrons_per_s=np.maximum(sign * p.electrons_per_s, 0.0)) for p in found]
-            image += sign * self.halo_of(light, roi)
+        if self.halo_of is not None:
+            for sign in (1.0, -1.0):  # a halo is that of light, which is positive
+                light = [replace(p, electrons_per_s=np.maximum(sign * p.electrons_per_s, 0.0)) for p in found]
+                image += sign * self.halo_of(light, roi)
         for patch in found:
             if roi.overlaps(patch.roi):
                 both = roi.intersection(patch.roi)
