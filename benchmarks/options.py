@@ -23,7 +23,7 @@ from vlcrender.dataset.recipe import load_plan
 
 ROOT = Path(__file__).parent.parent
 QUICKSTART, REGIONS = ROOT / "datasets/quickstart.toml", ROOT / "datasets/office200.toml"
-DIFFUSER = ("[panels.leds]", "[panels.diffuser]\ndistance_m = 0.02\ntransmittance = 0.6\n\n[panels.leds]")
+DIFFUSER = ("[panels.leds]", "[panels.diffuser]\ndistance_m = 0.04\ntransmittance = 0.6\n\n[panels.leds]")
 MOTION = ["motion.angular_velocity_deg_s=[5.0, 3.0, 0.0]", "exposure_s=1e-3"]
 PIXELS = 4000 * 3000
 SMALL = ["camera.width_px=100", "camera.height_px=75", "camera.pixel_pitch_um=48.0"]

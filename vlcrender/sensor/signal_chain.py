@@ -61,14 +61,17 @@ def expose_regions(
 ) -> list[RegionImage]:
     """`expose` of one or more regions of a frame, by one launch of one kernel."""
     rois = [roi for roi, _ in expected_e]
-    flat = np.concatenate([np.minimum(image, np.float32(MAX_MEAN)).ravel() for _, image in expected_e])
+    images = [image.ravel() for _, image in expected_e]
+    flat = np.concatenate(images) if len(images) > 1 else images[0]
+    if flat.max() > MAX_MEAN:
+        flat = np.minimum(flat, np.float32(MAX_MEAN))
     if sensor.noise == "full":
         dn = _full_chain(sensor, flat, key, random_key(sensor.serial, camera), rois, exposure_s)
     else:
         electrons: Electrons = poisson_of_regions(flat, key, rois) if sensor.noise == "shot" else flat
         dn = sensor.quantise(clip_full_well(electrons, sensor.full_well_e))
-    images = np.split(dn, np.cumsum([roi.pixels for roi in rois])[:-1])
-    return [RegionImage(roi, image.reshape(roi.rows, roi.columns)) for roi, image in zip(rois, images, strict=True)]
+    parts = np.split(dn, np.cumsum([roi.pixels for roi in rois])[:-1])
+    return [RegionImage(roi, part.reshape(roi.rows, roi.columns)) for roi, part in zip(rois, parts, strict=True)]
 
 
 def _full_chain(
