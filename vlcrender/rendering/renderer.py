@@ -119,7 +119,7 @@ class Renderer:
         crosstalk: share of a pixel's electrons that its neighbours collect.
         """
         self._crosstalk = crosstalk
-        self._latest: tuple[tuple[PosedCamera, LedRegions | None], LedView] | None = None
+        self._latest: tuple[tuple[PosedCamera, LedRegions | None], LedView] | None = None  # for `led_slopes`
         self.scene = scene
         self.detector = detector or Silicon()
         self._light = light or bake(scene)
@@ -167,6 +167,7 @@ class Renderer:
             raise InputError(OVERSCAN_WITH_GLARE)
         if posed.camera.lateral_colour_um is not None:
             raise InputError("camera.lateral_colour_um: needs a sensor with a mosaic; remove it, or choose a mosaic")
+        self._latest = None  # one view at a time is in memory
         blurs = led_blur(self.scene.leds, posed)
         rolling = during if isinstance(during, RollingPoses) else None
         if isinstance(during, RollingPoses):
@@ -174,8 +175,8 @@ class Renderer:
         else:
             bands = (self._band(posed, [posed.pose] if during is None else during, regions, blurs),)
         view = LedView(posed, bands, blurs, _patch_rois(posed.camera, bands, blurs, regions), rolling)
-        still = rolling is None and bands[0].poses == (posed,)
-        self._latest = ((posed, regions), view) if still else None
+        if rolling is None and bands[0].poses == (posed,):
+            self._latest = ((posed, regions), view)
         return view
 
     def _band(
@@ -254,8 +255,9 @@ class Renderer:
 
     def _still(self, posed: PosedCamera, regions: LedRegions | None, blurred_at: Pose | None = None) -> "LedView":
         """The view of a camera at rest."""
-        if blurred_at is None and self._latest is not None and self._latest[0] == (posed, regions):
-            return self._latest[1]
+        latest = self._latest
+        if blurred_at is None and latest is not None and latest[0] == (posed, regions):
+            return latest[1]
         leds = self.scene.leds
         blurs = led_blur(leds, posed if blurred_at is None else posed.at(blurred_at))
         bands = (LedBand((posed,), (led_images(leds, self._occlusion, posed, regions, blurs),)),)
@@ -311,7 +313,8 @@ class Renderer:
             if totals is None:
                 totals = [room.image for room in rooms]
             else:
-                totals = [total + room.image for total, room in zip(totals, rooms, strict=True)]
+                for total, room in zip(totals, rooms, strict=True):
+                    total += room.image
             for number in range(len(self.scene.glazings) if with_reflections else 0):
                 label = self._background.room.first_glazing + number
                 if any((room.surfaces == label).any() for room in rooms):
