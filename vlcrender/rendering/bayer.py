@@ -14,7 +14,8 @@ from vlcrender.camera.roi import LedRegions, Roi
 from vlcrender.rendering.crosstalk import REACH_PX, shared_patch, with_crosstalk
 from vlcrender.rendering.expected_image import ExpectedImage, ExpectedRegion, Gain, Gains, Halo, Image, LedPatch
 from vlcrender.rendering.led_slopes import Cameras
-from vlcrender.rendering.renderer import During, Renderer, read_out
+from vlcrender.rendering.led_view import During, read_out
+from vlcrender.rendering.renderer import Renderer
 from vlcrender.scene.leds import Leds
 from vlcrender.scene.loader import Scene
 from vlcrender.sensor.quantum_efficiency import COLOURS

@@ -10,9 +10,9 @@ by the kernel of its depth (`led_blur`), and scatters a share of all light into 
 
 import copy
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import partial, reduce
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.psf import blur
-from vlcrender.camera.roi import LedRegions, Roi, led_regions
+from vlcrender.camera.roi import LedRegions, Roi
 from vlcrender.core.backend import dr
 from vlcrender.errors import InputError
 from vlcrender.light.lightmap import Lightmap, bake
@@ -32,6 +32,7 @@ from vlcrender.rendering.halo import GlareHalo, glare_halo, halo_of_sources
 from vlcrender.rendering.led_blur import LedBlur, led_blur
 from vlcrender.rendering.led_radiance import LedImage, led_images
 from vlcrender.rendering.led_slopes import Cameras, led_slopes
+from vlcrender.rendering.led_view import During, LedBand, LedView, cut, patch_rois, read_out, union_of
 from vlcrender.rendering.occlusion import Occlusion
 from vlcrender.rendering.readout import Knot, RollingPoses, image_at_own_line
 from vlcrender.rendering.specular_reflection import blurred, specular_reflections
@@ -45,62 +46,6 @@ MAX_SENSORS = 16
 OVERSCAN_WITH_GLARE = "regions.overscan = true: glare is computed on the sensor only; remove overscan or camera.glare"
 
 Array = NDArray[np.float64]
-LedImages = Mapping[int, LedImage]
-"""Images of the LEDs at one pose, by the LED's index."""
-
-
-During = Sequence[Pose] | RollingPoses
-"""Poses of a moving camera: spread evenly over the exposure of all lines, or of each line."""
-
-
-@dataclass(frozen=True)
-class LedBand:
-    """The LEDs as a camera sees them at one or more poses, in lines of the sensor."""
-
-    poses: tuple[PosedCamera, ...]
-    images: tuple[LedImages, ...]
-    knot: Knot | None = None
-    """The lines, and the share of these poses in each; None for all lines."""
-
-    def share(self, roi: Roi) -> tuple[Roi, Array | float] | None:
-        """The lines in a region, and the share of these poses in them; None where there are none."""
-        if self.knot is None:
-            return roi, 1.0
-        if not self.knot.lines.overlaps(roi):
-            return None
-        inside = self.knot.lines.intersection(roi)
-        return inside, self.knot.weights_in(inside)
-
-
-@dataclass(frozen=True)
-class LedView:
-    """The LEDs as a camera sees them at one or more poses, and the pixels that each lights, by its index."""
-
-    posed: PosedCamera
-    bands: tuple[LedBand, ...]
-    blurs: LedBlur
-    patch_rois: Mapping[int, Roi]
-    rolling: RollingPoses | None = None
-    """Poses of the lines of a moving camera with a rolling shutter."""
-
-
-def read_out(views: Sequence[LedView], regions: LedRegions | None, reach_px: int = 0) -> tuple[Roi, ...]:
-    """The regions that are read out of a sensor: all of it, or regions around the LEDs of one or more views.
-
-    reach_px: pixels around its image that an LED lights by crosstalk.
-    """
-    camera = views[0].posed.camera
-    if regions is None:
-        return (Roi.of_sensor(camera),)
-    rois = dict(views[0].patch_rois)
-    for view in views[1:]:
-        for i, roi in view.patch_rois.items():
-            rois[i] = rois[i].union(roi) if i in rois else roi
-    if reach_px:
-        sensor = Roi.of_sensor(camera)
-        lit = {i: roi.padded(reach_px) for i, roi in rois.items()}
-        rois = {i: lit[i].intersection(sensor) if sensor.contains(roi) else lit[i] for i, roi in rois.items()}
-    return led_regions(rois.values(), camera, regions)
 
 
 class Renderer:
@@ -174,7 +119,7 @@ class Renderer:
             bands = tuple(self._band(posed, knot.poses, regions, blurs, knot) for knot in during.knots)
         else:
             bands = (self._band(posed, [posed.pose] if during is None else during, regions, blurs),)
-        view = LedView(posed, bands, blurs, _patch_rois(posed.camera, bands, blurs, regions), rolling)
+        view = LedView(posed, bands, blurs, patch_rois(posed.camera, bands, blurs, regions), rolling)
         if rolling is None and bands[0].poses == (posed,):
             self._latest = ((posed, regions), view)
         return view
@@ -247,7 +192,7 @@ class Renderer:
             roi, kernel, rate = images[i].roi, view.blurs.kernels[i], led_rate * float(leds.luminances_cd_m2[i])
             for slope, of_change in zip(slopes, changed, strict=True):
                 edges = [] if slope.edges is None else [slope.edges]
-                light = _cut(
+                light = cut(
                     kernel.spread(rate * slope.change, roi, edges, rate), roi.padded(kernel.radius_px), patch.roi
                 )
                 of_change.append(replace(patch, electrons_per_s=light))
@@ -261,7 +206,7 @@ class Renderer:
         leds = self.scene.leds
         blurs = led_blur(leds, posed if blurred_at is None else posed.at(blurred_at))
         bands = (LedBand((posed,), (led_images(leds, self._occlusion, posed, regions, blurs),)),)
-        return LedView(posed, bands, blurs, _patch_rois(posed.camera, bands, blurs, regions))
+        return LedView(posed, bands, blurs, patch_rois(posed.camera, bands, blurs, regions))
 
     def _with_crosstalk(self, patches: Iterable[LedPatch], posed: PosedCamera) -> tuple[LedPatch, ...]:
         if not self._crosstalk:
@@ -424,47 +369,14 @@ class Renderer:
     ) -> Array:
         """Light of LED number i in a region: the mean over its images at this number of poses, blurred."""
         luminance, kernel = self.scene.leds.luminances_cd_m2[i], view.blurs.kernels[i]
-        union = _union(of_led)
+        union = union_of(of_led)
         light = np.zeros((union.rows, union.columns))
         for image in of_led:
             light[union.slices(image.roi)] += led_rate * luminance * image.coverage * image.weight * image.pattern
         edges = [image.edges for image in of_led if image.edges is not None]
         light_per_excess = led_rate * float(luminance) / poses
         result = kernel.blurred(light / poses, union, edges, light_per_excess)
-        return _cut(result, union.padded(kernel.radius_px), roi)
-
-
-def _union(images: Iterable[LedImage]) -> Roi:
-    """The region that contains several images of an LED."""
-    return reduce(Roi.union, (image.roi for image in images))
-
-
-def _cut(light: Array, of: Roi, roi: Roi) -> Array:
-    """Light in the region `of`, in another region that it may not fill."""
-    if of.contains(roi):
-        return light[of.slices(roi)]
-    filled = np.zeros((roi.rows, roi.columns))
-    if of.overlaps(roi):
-        both = of.intersection(roi)
-        filled[roi.slices(both)] = light[of.slices(both)]
-    return filled
-
-
-def _patch_rois(camera: Camera, bands: Sequence[LedBand], blurs: LedBlur, regions: LedRegions | None) -> dict[int, Roi]:
-    """By the LED's index, the pixels that it lights, blur included; on the sensor only, unless with overscan."""
-    sensor = Roi.of_sensor(camera)
-    rois: dict[int, Roi] = {}
-    for band in bands:
-        for i in sorted({i for of_pose in band.images for i in of_pose}):
-            roi = _union(of_pose[i] for of_pose in band.images if i in of_pose).padded(blurs.kernels[i].radius_px)
-            if regions is None or not regions.overscan:
-                if not sensor.overlaps(roi):
-                    continue
-                roi = roi.intersection(sensor)
-            shared = band.share(roi)
-            if shared is not None:
-                rois[i] = rois[i].union(shared[0]) if i in rois else shared[0]
-    return dict(sorted(rois.items()))
+        return cut(result, union.padded(kernel.radius_px), roi)
 
 
 def _check_size(rois: Sequence[Roi], camera: Camera) -> None:
