@@ -1,9 +1,12 @@
 """LEDs of a scene: identity, place, size, luminance and its profile, beam and diffuser of each."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from vlcrender.core.face_profile import FaceProfile
 from vlcrender.core.random_keys import stream
@@ -12,6 +15,9 @@ from vlcrender.modulation.transmission import Transmitter, transmission_of
 from vlcrender.scene.diffuser import MIN_DISTANCE_RADII, Diffuser
 from vlcrender.scene.schema import PanelDiffuser, PanelGrid, PanelLeds, SceneSettings
 from vlcrender.scene.surfaces import TOUCH_M, panel_centers_m, panel_opening_m
+
+LEDS_AT_ONCE = 1000
+"""LEDs whose neighbours are looked up together: bounds the memory where many are at one place."""
 
 
 @dataclass(frozen=True)
@@ -43,12 +49,12 @@ class Leds:
         """Number of LEDs."""
         return len(self.ids)
 
-    @property
+    @cached_property
     def areas_m2(self) -> NDArray[np.float64]:
         """Area of each face, (n,)."""
         return np.where(self.squares, 4.0, np.pi) * self.half_widths_m**2
 
-    @property
+    @cached_property
     def fluxes_lm(self) -> NDArray[np.float64]:
         """Luminous flux that each LED sends into the room, (n,): 2 pi L A / (m + 1), less what a diffuser absorbs."""
         through = np.array([1.0 if diffuser is None else diffuser.transmittance for diffuser in self.diffusers])
@@ -62,7 +68,7 @@ class Leds:
             return None
         return FaceProfile.of((gradient[0], gradient[1]), falloff, float(self.half_widths_m[i]), bool(self.squares[i]))
 
-    @property
+    @cached_property
     def circumradii_m(self) -> NDArray[np.float64]:
         """Distance from each centre to the farthest luminous point, (n,).
 
@@ -213,15 +219,31 @@ def _check_leds(leds: Leds, origins: list[str], room_m: NDArray[np.float64], sou
             f"{source}: {origins[i]}: LED {leds.ids[i]} at {center} m, {2 * leds.half_widths_m[i]:.4g} m wide, "
             f"is not inside the room of {room_m.tolist()} m"
         )
-    for i in range(len(leds) - 1):
-        between = leds.centers_m[i + 1 :] - leds.centers_m[i]
-        both_square = leds.squares[i + 1 :] & leds.squares[i]
+    for i, other in _neighbours(leds):
+        between = leds.centers_m[other] - leds.centers_m[i]
+        both_square = leds.squares[other] & leds.squares[i]
         apart = np.where(both_square, np.abs(between).max(axis=1), np.linalg.norm(between, axis=1))
-        close = np.flatnonzero(apart < leds.half_widths_m[i + 1 :] + leds.half_widths_m[i] - TOUCH_M)
+        close = np.flatnonzero(apart < leds.half_widths_m[other] + leds.half_widths_m[i] - TOUCH_M)
         if len(close):
-            other = i + 1 + close[0]
+            near, first, second = apart[close[0]], i[close[0]], other[close[0]]
             raise InputError(
-                f"{source}: {origins[other]}: LEDs {leds.ids[i]} and {leds.ids[other]} overlap: centres "
-                f"{apart[close[0]]:.4g} m apart, widths {2 * leds.half_widths_m[i]:.4g} and "
-                f"{2 * leds.half_widths_m[other]:.4g} m"
+                f"{source}: {origins[second]}: LEDs {leds.ids[first]} and {leds.ids[second]} overlap: centres "
+                f"{near:.4g} m apart, widths {2 * leds.half_widths_m[first]:.4g} and "
+                f"{2 * leds.half_widths_m[second]:.4g} m"
             )
+
+
+def _neighbours(leds: Leds) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """All pairs of LEDs that may overlap, as indices (n,) and larger indices (n,), in order, for some LEDs at a time.
+
+    An LED's neighbours of its size or smaller have centres within its whole width, along each axis.
+    """
+    tree = cKDTree(leds.centers_m)
+    for start in range(0, len(leds), LEDS_AT_ONCE):
+        here = slice(start, start + LEDS_AT_ONCE)
+        found = tree.query_ball_point(leds.centers_m[here], 2 * leds.half_widths_m[here], p=np.inf)
+        one = np.repeat(np.arange(start, start + len(found)), list(map(len, found)))
+        another = np.concatenate(found).astype(np.int64)
+        pairs = np.stack([np.minimum(one, another), np.maximum(one, another)], axis=1)
+        pairs = np.unique(pairs[one != another], axis=0)
+        yield pairs[:, 0], pairs[:, 1]
