@@ -25,8 +25,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         for name in (FRAMES, EXPECTED, PREVIEWS):
             (Path(folder) / name).mkdir()
-        settings = plan.scene.settings.model_dump_json()
-        job = Job(plan.recipe.model_dump_json(), settings, str(plan.scene.folder), folder)
+        job = Job.of(plan, Path(folder))
         for frame in range(frames):
             record = make_frame(job, frame)
             (Path(folder) / record["device"]["file"]).unlink()

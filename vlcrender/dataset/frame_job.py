@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from vlcrender.dataset.files import EXPECTED, FRAMES, PREVIEWS, PROCESSED
 from vlcrender.dataset.motion import poses_during
 from vlcrender.dataset.pose_sampling import pose_of_frame
 from vlcrender.dataset.preview import write_preview
-from vlcrender.dataset.recipe import Recipe
+from vlcrender.dataset.recipe import Plan, Recipe
 from vlcrender.dataset.schema import Flat9, FrameRecord, FrameRow, LedTruth, SpotRow, TruthRow, five, flat9, triple
 from vlcrender.dataset.true_world import (
     built_leds,
@@ -56,6 +57,18 @@ class Job:
     scene_json: str
     scene_folder: str
     directory: str
+
+    @classmethod
+    def of(cls, plan: Plan, directory: Path) -> Self:
+        """The job of a plan. In this process its frames use the plan's scene, which is not loaded again."""
+        scene, folder = plan.scene.settings.model_dump_json(), str(plan.scene.folder)
+        _loaded.clear()
+        _loaded[scene, folder] = plan.scene
+        return cls(plan.recipe.model_dump_json(), scene, folder, str(directory))
+
+
+_loaded: dict[tuple[str, str], Scene] = {}
+"""The scene of the latest job that this process made, by its JSON and folder."""
 
 
 def make_frames(job: Job, frames: Sequence[int]) -> list[FrameRecord]:
@@ -312,7 +325,9 @@ def _white_balance(camera: Camera, sensor: Sensor, scene: Scene) -> tuple[float,
 @cache
 def _renderer(recipe_json: str, scene_json: str, scene_folder: str) -> tuple[Recipe, Renderer | MosaicRenderer]:
     """The recipe and its renderer; one for each process and plan."""
-    scene = build_scene(SceneSettings.model_validate_json(scene_json), "scene", Path(scene_folder))
+    scene = _loaded.get((scene_json, scene_folder))
+    if scene is None:
+        scene = build_scene(SceneSettings.model_validate_json(scene_json), "scene", Path(scene_folder))
     recipe, light = Recipe.model_validate_json(recipe_json), bake(scene)
     sensor = recipe.sensor
     if sensor.mosaic == "none":

@@ -100,9 +100,7 @@ def generate(
             built_leds(plan.recipe, plan.scene, map_number)
     room_mesh(plan.scene)  # impossible furniture ends the run before anything is written
     _prepare(directory, provenance, plan.recipe)
-    job = Job(
-        plan.recipe.model_dump_json(), plan.scene.settings.model_dump_json(), str(plan.scene.folder), str(directory)
-    )
+    job = Job.of(plan, directory)
     done = _journal(directory, plan.recipe)
     total = plan.recipe.frame_count
     missing = [frame for frame in range(total) if frame not in done]
