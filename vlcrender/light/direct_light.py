@@ -132,5 +132,6 @@ def _blocked(blockers: Any, origin: Any, target: Any, active: Any) -> Any:
     span = target - origin
     length = dr.norm(span)
     ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(span / length))
-    ray.maxt = mi.Float(length)
+    maxt: Any = mi.Float(length)
+    ray.maxt = maxt
     return blockers.ray_test(ray, active)

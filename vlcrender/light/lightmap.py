@@ -206,8 +206,8 @@ def illuminance_at(
 ) -> BakedIlluminance:
     """Illuminance at surface points (n, 3) with unit normals (n, 3), not interpolated.
 
-    mesh: `room_mesh(scene)`. paths: light paths traced from each point. A bake has the mesh's probes as its points; other
-    points tell what its interpolation leaves out.
+    mesh: `room_mesh(scene)`. paths: light paths traced from each point. A bake has the mesh's probes as its points;
+    other points tell what its interpolation leaves out.
     """
     vertices = _direct_lux(scene, mesh, mesh.probes_m, mesh.normals, progress)
     direct = _direct_lux(scene, mesh, points_m, normals, progress)

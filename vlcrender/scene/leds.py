@@ -219,13 +219,13 @@ def _check_leds(leds: Leds, origins: list[str], room_m: NDArray[np.float64], sou
             f"{source}: {origins[i]}: LED {leds.ids[i]} at {center} m, {2 * leds.half_widths_m[i]:.4g} m wide, "
             f"is not inside the room of {room_m.tolist()} m"
         )
-    for i, other in _neighbours(leds):
-        between = leds.centers_m[other] - leds.centers_m[i]
-        both_square = leds.squares[other] & leds.squares[i]
+    for one, other in _neighbours(leds):
+        between = leds.centers_m[other] - leds.centers_m[one]
+        both_square = leds.squares[other] & leds.squares[one]
         apart = np.where(both_square, np.abs(between).max(axis=1), np.linalg.norm(between, axis=1))
-        close = np.flatnonzero(apart < leds.half_widths_m[other] + leds.half_widths_m[i] - TOUCH_M)
+        close = np.flatnonzero(apart < leds.half_widths_m[other] + leds.half_widths_m[one] - TOUCH_M)
         if len(close):
-            near, first, second = apart[close[0]], i[close[0]], other[close[0]]
+            near, first, second = apart[close[0]], one[close[0]], other[close[0]]
             raise InputError(
                 f"{source}: {origins[second]}: LEDs {leds.ids[first]} and {leds.ids[second]} overlap: centres "
                 f"{near:.4g} m apart, widths {2 * leds.half_widths_m[first]:.4g} and "
