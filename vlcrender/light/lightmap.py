@@ -60,13 +60,13 @@ class Lightmap:
     sigma_lux: Array
     """Monte Carlo standard error of the whole illuminance, (n,)."""
 
-    def led_cd_m2(self) -> Array:
-        """Luminance by reflected light of LEDs, (n,): albedo * illuminance / pi."""
-        return self.albedo * self.led_lux / np.pi
+    def led_cd_m2(self, places: slice = slice(None)) -> Array:
+        """Luminance by reflected light of LEDs at all places or some, (n,): albedo * illuminance / pi."""
+        return self.albedo[places] * self.led_lux[places] / np.pi
 
-    def ambient_cd_m2(self) -> Array:
-        """Luminance by reflected ambient light and daylight, (n,)."""
-        return self.albedo * self.ambient_lux / np.pi
+    def ambient_cd_m2(self, places: slice = slice(None)) -> Array:
+        """Luminance by reflected ambient light and daylight at all places or some, (n,)."""
+        return self.albedo[places] * self.ambient_lux[places] / np.pi
 
 
 @lru_cache(maxsize=1)

@@ -95,7 +95,7 @@ def led_images(
     images = {}
     for (i, image), share in zip(imaged, clear, strict=True):
         coverage, clear_fraction = image.coverage, 1.0
-        split = blurs.kernels[i].split
+        split = blurs.kernel(i).split
         edges = edges_of_led(posed, face_of_led(leds, i), image, split) if split > 1 else None
         if not isinstance(share, float):
             coverage = image.coverage * share

@@ -316,8 +316,8 @@ class Renderer:
 
         step: the number of the pose of each band.
         """
-        vertices = len(self._light.mesh.vertices_m)  # the lightmap has the faces after the mesh
-        faces = rates.led * self._light.led_cd_m2()[vertices:] + rates.ambient * self._light.ambient_cd_m2()[vertices:]
+        places = slice(len(self._light.mesh.vertices_m), None)  # the lightmap has the faces after the mesh
+        faces = rates.led * self._light.led_cd_m2(places) + rates.ambient * self._light.ambient_cd_m2(places)
         sharp = [room.image.copy() for room in rooms] if len(bands) > 1 else [room.image for room in rooms]
         for band in bands:
             for i, led in band.images[step].items():
@@ -339,9 +339,9 @@ class Renderer:
     def _patches(self, view: LedView, precision: type[np.floating] = np.float32) -> tuple[LedPatch, ...]:
         """Patches of the LEDs: means over the images at several poses, blurred."""
         leds, posed = self.scene.leds, view.posed
-        center_px = posed.project(leds.centers_m)
+        centers_px = posed.project(leds.centers_m[list(view.patch_rois)]).tolist()
         patches = []
-        for i, roi in view.patch_rois.items():
+        for (i, roi), (u, v) in zip(view.patch_rois.items(), centers_px, strict=True):
             light = np.zeros((roi.rows, roi.columns)) if view.rolling else None
             shares: list[tuple[float, float, float]] = []
             for band in view.bands:
@@ -363,7 +363,6 @@ class Renderer:
                     shares.append((float(of_band.sum()), visible, imaged))
             assert light is not None  # an LED without an image has no patch
             total = sum(share for share, _, _ in shares) or 1.0
-            u, v = center_px[i].tolist()
             if view.rolling is not None:
                 u, v = image_at_own_line(posed, view.rolling.pose_at, leds.centers_m[i])
             patches.append(
@@ -381,7 +380,7 @@ class Renderer:
 
     def _light_of(self, view: LedView, i: int, of_led: Sequence[LedImage], poses: int, roi: Roi) -> Array:
         """Light of LED number i in a region: the mean over its images at this number of poses, blurred."""
-        luminance, kernel = self.scene.leds.luminances_cd_m2[i], view.blurs.kernels[i]
+        luminance, kernel = self.scene.leds.luminances_cd_m2[i], view.blurs.kernel(i)
         led_rate = self._rates(view.posed.camera).led
         union = _union(of_led)
         light = np.zeros((union.rows, union.columns))
@@ -415,7 +414,7 @@ def _patch_rois(camera: Camera, bands: Sequence[LedBand], blurs: LedBlur, region
     rois: dict[int, Roi] = {}
     for band in bands:
         for i in sorted({i for of_pose in band.images for i in of_pose}):
-            roi = _union(of_pose[i] for of_pose in band.images if i in of_pose).padded(blurs.kernels[i].radius_px)
+            roi = _union(of_pose[i] for of_pose in band.images if i in of_pose).padded(blurs.kernel(i).radius_px)
             if regions is None or not regions.overscan:
                 if not sensor.overlaps(roi):
                     continue
