@@ -9,8 +9,8 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import signal
 from scipy.special import j1, ndtr
 
 from vlcrender.camera.intrinsics import Camera
@@ -77,7 +77,7 @@ def blur_kernel(camera: Camera, depth_m: float, sigma_px: float = 0.0) -> Array 
     """
     kernel = _kernel(camera, float(defocus_diameter_px(camera, depth_m)), sigma_px, 1)
     if camera.psf_kernel is not None:
-        kernel = signal.convolve(kernel, np.array(camera.psf_kernel), method="direct")
+        kernel = scipy.signal.convolve(kernel, np.array(camera.psf_kernel), method="direct")
     kernel = kernel / kernel.sum()
     return kernel if kernel.size > 1 else None
 
@@ -140,7 +140,7 @@ def split_kernel(camera: Camera, depth_m: float, sigma_px: float = 0.0) -> Split
     parts = np.stack([[in_pixel[n - 1 - i :: n, n - 1 - j :: n] for j in range(n)] for i in range(n)])
     parts = np.maximum(parts, 0.0)
     if camera.psf_kernel is not None:
-        parts = signal.oaconvolve(parts, np.array(camera.psf_kernel)[None, None], mode="full", axes=(2, 3))
+        parts = scipy.signal.oaconvolve(parts, np.array(camera.psf_kernel)[None, None], mode="full", axes=(2, 3))
     return SplitKernel(parts / parts.sum(axis=(2, 3), keepdims=True))
 
 
@@ -150,7 +150,7 @@ def _kernel(camera: Camera, disc_px: float, sigma_px: float, n: int) -> Array:
     line = _normal_line(sigma_px * n)
     if line.size == 1:
         return kernel
-    blurred: Array = np.maximum(signal.oaconvolve(kernel, np.outer(line, line), mode="full"), 0.0)
+    blurred: Array = np.maximum(scipy.signal.oaconvolve(kernel, np.outer(line, line), mode="full"), 0.0)
     return blurred
 
 
@@ -188,7 +188,7 @@ def _blurred_airy(scale_px: float, disc_px: float, n: int) -> Array:
         return _airy(scale_px, n)
     # Where the pattern is narrow, convolve on finer pixels: otherwise the average over a pixel would enter twice.
     finer = 5 if scale_px * n < 3 else 1
-    fine = signal.fftconvolve(_disc(disc_px * n * finer), _airy(scale_px, n * finer))
+    fine = scipy.signal.fftconvolve(_disc(disc_px * n * finer), _airy(scale_px, n * finer))
     radius = int(np.ceil((fine.shape[0] // 2 - finer // 2) / finer))
     padded = np.pad(fine, radius * finer + finer // 2 - fine.shape[0] // 2)
     pixels = 2 * radius + 1
@@ -234,9 +234,9 @@ def blur(image: NDArray[Any], kernel: Array | None, border: str = "zero") -> NDA
         return image
     if border == "edge":
         wide = np.pad(image, kernel.shape[0] // 2, mode="edge").astype(np.float64)
-        blurred = signal.oaconvolve(wide, kernel, mode="valid")
+        blurred = scipy.signal.oaconvolve(wide, kernel, mode="valid")
     else:
-        blurred = signal.oaconvolve(image.astype(np.float64), kernel, mode="full")
+        blurred = scipy.signal.oaconvolve(image.astype(np.float64), kernel, mode="full")
     return np.maximum(blurred, 0.0).astype(image.dtype)
 
 

@@ -26,7 +26,6 @@ from vlcrender.core.warn_once import warn_once
 from vlcrender.light.bake_cache import BakedIlluminance, cache_folder, load, store
 from vlcrender.light.direct_light import RAY_OFFSET_M, led_illuminance_lux
 from vlcrender.light.mitsuba_room import mitsuba_scene
-from vlcrender.scene.furniture import furniture_meshes
 from vlcrender.scene.loader import Scene
 from vlcrender.scene.mesh import Mesh, join, mesh_of_surfaces
 from vlcrender.scene.sources import point_sources
@@ -75,7 +74,11 @@ def room_mesh(scene: Scene) -> Mesh:
 
     The mesh of the latest scene is kept. Raises InputError for furniture that cannot be used.
     """
-    furniture = furniture_meshes(scene, len(scene.surfaces))
+    furniture: list[Mesh] = []
+    if scene.settings.furniture:
+        from vlcrender.scene.furniture import furniture_meshes  # loads trimesh
+
+        furniture = furniture_meshes(scene, len(scene.surfaces))
     texel_m, leds_m = scene.settings.bake.texel_m, scene.leds.centers_m
     return join([mesh_of_surfaces(scene.surfaces, texel_m, furniture, leds_m), *furniture])
 

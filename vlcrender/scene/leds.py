@@ -6,7 +6,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from vlcrender.core.face_profile import FaceProfile
 from vlcrender.core.random_keys import stream
@@ -16,7 +15,7 @@ from vlcrender.scene.diffuser import MIN_DISTANCE_RADII, Diffuser
 from vlcrender.scene.schema import PanelDiffuser, PanelGrid, PanelLeds, SceneSettings
 from vlcrender.scene.surfaces import TOUCH_M, panel_centers_m, panel_opening_m
 
-LEDS_AT_ONCE = 1000
+LEDS_AT_ONCE = 500
 """LEDs whose neighbours are looked up together: bounds the memory where many are at one place."""
 
 
@@ -234,16 +233,19 @@ def _check_leds(leds: Leds, origins: list[str], room_m: NDArray[np.float64], sou
 
 
 def _neighbours(leds: Leds) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    """All pairs of LEDs that may overlap, as indices (n,) and larger indices (n,), in order, for some LEDs at a time.
+    """All pairs of LEDs that may overlap, as indices (n,) and larger indices (n,), for some LEDs at a time.
 
-    An LED's neighbours of its size or smaller have centres within its whole width, along each axis.
+    LEDs are sorted along the longer side of their field; each is paired with those of the next ones that are near
+    enough along this side.
     """
-    tree = cKDTree(leds.centers_m)
+    axis = int(np.argmax(np.ptp(leds.centers_m, axis=0)))
+    order = np.argsort(leds.centers_m[:, axis], kind="stable")
+    along_m = leds.centers_m[order, axis]
+    ends = np.searchsorted(along_m, along_m + leds.half_widths_m[order] + leds.half_widths_m.max())
     for start in range(0, len(leds), LEDS_AT_ONCE):
-        here = slice(start, start + LEDS_AT_ONCE)
-        found = tree.query_ball_point(leds.centers_m[here], 2 * leds.half_widths_m[here], p=np.inf)
-        one = np.repeat(np.arange(start, start + len(found)), list(map(len, found)))
-        another = np.concatenate(found).astype(np.int64)
-        pairs = np.stack([np.minimum(one, another), np.maximum(one, another)], axis=1)
-        pairs = np.unique(pairs[one != another], axis=0)
-        yield pairs[:, 0], pairs[:, 1]
+        here = np.arange(start, min(start + LEDS_AT_ONCE, len(leds)))
+        counts = ends[here] - here - 1
+        one = np.repeat(here, counts)
+        step = np.arange(len(one)) - np.repeat(np.cumsum(counts) - counts, counts)
+        pair = order[one], order[one + 1 + step]
+        yield np.minimum(*pair), np.maximum(*pair)
