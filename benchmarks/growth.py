@@ -3,9 +3,9 @@
     python benchmarks/growth.py [ROUNDS]
 
 Worlds are k x k panels of 25 LEDs with the density of `office`: 7, 20 and 45 panels a side have 1 225, 10 000 and
-50 625 LEDs. Ratios are medians of CPU time, measured in turn in one run. Then the warehouse (`scenes/warehouse.toml`) is
-baked, and frames of an airport of 50 000 LEDs are made, from the scene file to the estimated positions. Exits with 1
-where a figure is larger than wanted.
+50 625 LEDs. Ratios are medians of CPU time, measured in turn in one run. Then the warehouse is baked, and frames of an
+airport of 50 000 LEDs are made, from the scene file to the estimated positions. Exits with 1 where a figure is larger
+than wanted.
 """
 
 import os

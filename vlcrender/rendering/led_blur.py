@@ -21,7 +21,6 @@ from vlcrender.camera.psf import (
     split_kernel,
 )
 from vlcrender.camera.roi import Roi
-from vlcrender.rendering.led_coverage import candidate_leds
 from vlcrender.rendering.led_edges import LedEdges
 from vlcrender.scene.leds import Leds
 
@@ -101,7 +100,7 @@ def led_blur(leds: Leds, posed: PosedCamera) -> LedBlur:
     camera = posed.camera
     if camera.focus_distance_m is None and camera.psf == "none" and camera.off_axis_sigma_um == 0:
         return LedBlur({}, None)
-    near = candidate_leds(posed, leds.centers_m, leds.circumradii_m, BLUR_MARGIN_PX)
+    near = leds.spheres.candidates(posed, BLUR_MARGIN_PX)
     depths_m = np.maximum(posed.focus_depths_m(leds.centers_m[near]), MIN_DEPTH_M)
     sigmas_px = np.zeros(len(near))
     if camera.off_axis_sigma_um > 0:

@@ -21,7 +21,6 @@ from vlcrender.core.planar_shapes import Disc, Rectangle
 from vlcrender.rendering.led_blur import LedBlur
 from vlcrender.rendering.led_coverage import (
     LedFace,
-    candidate_leds,
     coverage_of_led,
     intersections_with_plane,
     outline_roi,
@@ -77,7 +76,7 @@ def led_images(
     overscan = regions is not None and regions.overscan
     margin_px = _overscan_px(camera) if overscan else blurs.radius_px
     imaged = []
-    for i in candidate_leds(posed, leds.centers_m, leds.circumradii_m, margin_px).tolist():
+    for i in leds.spheres.candidates(posed, margin_px).tolist():
         if within is not None:
             outline = outline_roi(posed, face_of_led(leds, i))
             if outline is None or not outline.overlaps(within):

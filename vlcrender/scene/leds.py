@@ -11,6 +11,7 @@ from vlcrender.core.face_profile import FaceProfile
 from vlcrender.core.random_keys import stream
 from vlcrender.errors import InputError
 from vlcrender.modulation.transmission import Transmitter, transmission_of
+from vlcrender.scene.bounding_spheres import BoundingSpheres
 from vlcrender.scene.diffuser import MIN_DISTANCE_RADII, Diffuser
 from vlcrender.scene.schema import PanelDiffuser, PanelGrid, PanelLeds, SceneSettings
 from vlcrender.scene.surfaces import TOUCH_M, panel_centers_m, panel_opening_m
@@ -80,6 +81,11 @@ class Leds:
                 x, y = diffuser.foot_m
                 reaches[i] = np.hypot(max(x - x0, x1 - x), max(y - y0, y1 - y))
         return reaches
+
+    @cached_property
+    def spheres(self) -> BoundingSpheres:
+        """Spheres of the circumradii, n of them."""
+        return BoundingSpheres(self.centers_m, self.circumradii_m)
 
 
 def leds_of(settings: SceneSettings, source: str) -> Leds:
