@@ -28,7 +28,7 @@ def main() -> None:
         job = Job.of(plan, Path(folder))
         for frame in range(frames):
             record = make_frame(job, frame)
-            (Path(folder) / record["device"]["file"]).unlink()
+            (Path(folder) / record.device.file).unlink()
             if frame + 1 in (20, frames):
                 print(f"peak memory after {frame + 1:4d} full frames   {peak_gib():.2f} GiB", flush=True)
 
