@@ -11,7 +11,10 @@ from estimator.errors import EstimationFailure
 from estimator.evaluate.batch import estimate_dataset
 from estimator.io.shared import SharedResults
 from estimator.methods.catalogue import VARIANTS, variant_named
+from estimator.methods.gravity_fit import agreement
 from estimator.methods.variant import DeviceMethod, Estimate, Variant
+from estimator.solvers.observations import Observations
+from estimator.solvers.robust_fit import Consensus
 from estimator.spots.correspondences import find_correspondences
 from estimator.spots.detect import Spot, detect
 
@@ -111,3 +114,19 @@ def test_spots_of_another_frame_are_not_taken(synthetic_set: Path) -> None:
     assert len(found[3]) == 2
     assert not np.array_equal(found[0], found[1])
     assert not np.array_equal(found[0], found[2])
+
+
+def test_the_consensus_of_a_frame_is_found_once(synthetic_set: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    dataset, calls = est.read_dataset(synthetic_set), []
+
+    def counted(observations: Observations) -> Consensus:
+        calls.append(None)
+        return agreement(observations)
+
+    monkeypatch.setattr("estimator.methods.gravity_fit.agreement", counted)
+    variants = [VARIANTS["gravity-fit"], variant_named("gravity-fit:centroid-sigma=0.5"), VARIANTS["self-calibrated"]]
+    rows = estimate_dataset(dataset, variants, lambda: None)
+    assert len(calls) == 2 * len(dataset.frames), "one more for the other standard deviation"
+    alone = estimate_dataset(dataset, variants[1:2], lambda: None)
+    for one, other in zip(rows[variants[1].name], alone[variants[1].name], strict=True):
+        assert one.model_copy(update={"time_s": 0.0}) == other.model_copy(update={"time_s": 0.0})

@@ -31,7 +31,7 @@ from scipy.stats import chi2
 from estimator.camera.pose import POSE_PARAMETERS, Pose
 from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame
-from estimator.methods.gravity_fit import agreement, ambiguous
+from estimator.methods.gravity_fit import agreement_of, ambiguous
 from estimator.methods.up2p import upright_pose
 from estimator.methods.variant import Estimate, Variant
 from estimator.pixels.initial import START_SIGMA_SHARE, Start, gravity_of, start_at_spots
@@ -122,7 +122,7 @@ def ml(frame: DeviceFrame) -> Estimate:
             raise EstimationFailure("position", "too few LEDs identified to fix a position")
         pose = fit(observations, upright).pose
     else:
-        agreed = agreement(observations)
+        agreed = agreement_of(frame, observations)
         pose, inliers = agreed.best.pose, agreed.inliers
         use_gravity, is_ambiguous, unchecked_m2 = agreed.gravity, ambiguous(agreed), agreed.unchecked_m2
         # The centroids of large LEDs have model errors of their own, which the pixels do not have.
