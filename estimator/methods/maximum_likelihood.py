@@ -201,7 +201,9 @@ def _revealed(frame: DeviceFrame, gravity: Gravity, priors: Priors, found: Maxim
     if found.model_is_wrong:
         return START_COMPONENTS
     state = result.nuisances.state(result.pose, frame.camera, priors.only(pixels.index))
-    rendered = pixels.model.render(state, np.arange(IMAGE_PARAMETERS))
+    # A shift of the principal point is one of the image.
+    shift, size = [POSE_PARAMETERS + 2, POSE_PARAMETERS + 3], [SIZE_PARAMETER]
+    rendered = pixels.model.render(state, np.array(shift + size))
     profile = result.nuisances.profile()
     photometry = fit_photometry(pixels, rendered, result.used, Noise.of(frame), result.photometry, profile)
     information, gradient = (one[result.used] for one in score(pixels, rendered, photometry, profile))
@@ -218,9 +220,7 @@ def _revealed(frame: DeviceFrame, gravity: Gravity, priors: Priors, found: Maxim
         total = np.einsum("ni,ni->", g, np.linalg.solve(spread, g[:, :, None])[:, :, 0]) + more
         return bool(total > chi2.isf(REVEALED_PROBABILITY, g.size + freedom))
 
-    # A shift of the principal point is one of the image.
-    shift = [POSE_PARAMETERS + 2, POSE_PARAMETERS + 3]
-    size, of_profile = [SIZE_PARAMETER], [IMAGE_PARAMETERS + k for k in range(PROFILE_PARAMETERS)]
+    of_profile = [IMAGE_PARAMETERS + k for k in range(PROFILE_PARAMETERS)]
     z = result.nuisances.standardized(had.added(priors).only(pixels.index))
     of_priors = gravity.deviance(result.pose.rig_angles(frame.camera)) + float(
         (z.camera**2).sum()
