@@ -17,7 +17,6 @@ from itertools import combinations, islice
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from estimator.camera.pose import Pose
 from estimator.io.device import DeviceFrame
@@ -121,7 +120,7 @@ def _from_triples(observations: Observations) -> list[Pose]:
         except cv2.error:
             continue
         for vector, shift in zip(vectors, shifts, strict=True):
-            R_cam_world = np.asarray(Rotation.from_rotvec(vector.ravel()).as_matrix())
+            R_cam_world = cv2.Rodrigues(vector)[0]
             pose = Pose(-R_cam_world.T @ shift.ravel(), R_cam_world)
             offset = centroid_images(pose, observations.leds_m, observations.lift_m2)[0] - image
             error = float(np.minimum((offset**2).sum(axis=1), gate2).sum())

@@ -34,7 +34,7 @@ from estimator.camera.projection import projection_of
 from estimator.camera.undistort import has_pinhole_image, pinhole_image
 from estimator.io.device import Camera, DeviceFrame
 from estimator.solvers.shutter_motion import ShutterMotion, image_slopes, motion_prior
-from estimator.solvers.uncertainty import Uncertainty, assumed_uncertainty, uncertainty
+from estimator.solvers.uncertainty import Uncertainty, assumed_camera, uncertainty
 from estimator.spots.correspondences import centroids_px, led_positions_m
 from estimator.spots.identify import Correspondence
 
@@ -134,8 +134,7 @@ class Observations:
         """The same spots; a camera that states nothing has the errors of one as sold."""
         if self.camera.uncertainty is not None:
             return self
-        camera = self.camera.model_copy(update={"uncertainty": assumed_uncertainty(self.camera)})
-        return replace(self, uncertainty=self.uncertainty.with_camera(camera))
+        return replace(self, uncertainty=self.uncertainty.with_camera(assumed_camera(self.camera)))
 
     def without_gravity(self) -> "Observations":
         """The same spots without gravity."""

@@ -32,12 +32,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
 from estimator.camera.intrinsics import intrinsic_slopes_px, with_errors
 from estimator.camera.pose import POSE_PARAMETERS, Pose
 from estimator.camera.projection import project
 from estimator.io.device import INTRINSICS, Camera, Led, Luminaire, MapDatum
+from estimator.solvers.chi_square import chi2_limit
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -404,7 +404,7 @@ def _outliers(tests: Sequence[Floats]) -> dict[int, Indices]:
     An outlier pulls the true spots of its frame, and a frame of outliers other frames: both are judged without it. The
     worst frame is left out whole if most of its spots disagree.
     """
-    limit = float(chi2.isf(OUTLIER_PROBABILITY, 2))
+    limit = chi2_limit(OUTLIER_PROBABILITY, 2)
     largest = max(float(test.max()) for test in tests)
     found = {}
     for place, test in enumerate(tests):
@@ -543,6 +543,6 @@ def _ratio(total: float, freedom: float) -> float | None:
     if freedom < MIN_FREEDOM:
         return None
     half = OUTLIER_PROBABILITY / 2
-    if chi2.ppf(half, freedom) <= total <= chi2.isf(half, freedom):
+    if chi2_limit(1 - half, freedom) <= total <= chi2_limit(half, freedom):
         return None
     return float(np.clip(total / freedom, 1 / MAX_RATIO, MAX_RATIO))
