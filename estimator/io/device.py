@@ -316,6 +316,11 @@ class Led(Row):
         """
 
     @property
+    def states_errors(self) -> bool:
+        """Whether the device states a standard deviation of the position, the size or the gradient."""
+        return not (self.sigma_m is None and self.size_sigma_m is None and self.gradient_sigma is None)
+
+    @property
     def shift_by_gradient_m(self) -> float:
         """Shift s^2 / r of the centre of the light by a gradient of 1, with the mean square extent s^2, metres."""
         return self.mean_square_extent_m2 / self.half_width_m if self.has_size else 0.0

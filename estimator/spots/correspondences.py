@@ -1,5 +1,6 @@
 """Correspondences: from a frame's images to spots of identified LEDs, the input of methods that work on spots."""
 
+import weakref
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -28,9 +29,16 @@ def find_correspondences(frame: DeviceFrame, denoiser: Denoiser = RAW) -> list[C
     (`estimator.spots.striped`), without denoising, which would mix lines. Raises EstimationFailure if no LED is
     detected or identified.
     """
-    if has_stripes(frame):
-        return list(identify(_striped(frame), frame.spots, frame.leds, _gate_px(frame, RAW)))
-    return list(identify(_detected(frame, denoiser), frame.spots, frame.leds, _gate_px(frame, denoiser)))
+    striped = has_stripes(frame)
+    if striped:
+        denoiser = RAW
+
+    def identified() -> tuple[Correspondence, ...]:
+        spots = _striped(frame) if striped else _detected(frame, denoiser)
+        return identify(spots, frame.spots, frame.leds, _gate_px(frame, denoiser))
+
+    # The reference does not keep the frame, which holds the results, and no other frame equals it.
+    return list(frame.once(("correspondences", denoiser, weakref.ref(frame)), identified))
 
 
 def _gate_px(frame: DeviceFrame, denoiser: Denoiser) -> float:

@@ -7,6 +7,7 @@ blurred or not, and the background around it cancels. What the sampling by pixel
 (`estimator.spots.sampling`).
 """
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -295,10 +296,10 @@ def _ellipse(core: NDArray[np.bool_], left: int, top: int, stretch: float) -> _E
     u_px, v_px = np.arange(core.shape[1]) + left + 0.5, np.arange(core.shape[0]) + top + 0.5
     centre = np.array([of_columns @ u_px, of_rows @ v_px]) / count
     du, dv = u_px - centre[0], v_px - centre[1]
-    variances, axes = np.linalg.eigh(_second_moments(weights, du, dv) / count)
+    variances, axes = _principal_axes(_second_moments(weights, du, dv) / count)
     # A uniform ellipse has variance a^2 / 4 along its semi-axis a.
     semi_axes_px = 2 * stretch * np.sqrt(np.maximum(variances, 0)) + 0.5
-    columns, rows = np.flatnonzero(of_columns), np.flatnonzero(of_rows)
+    (columns,), (rows,) = of_columns.nonzero(), of_rows.nonzero()
     low_px = np.array([columns[0] + left, rows[0] + top], dtype=np.float64)
     high_px = np.array([columns[-1] + left + 1, rows[-1] + top + 1], dtype=np.float64)
     return _Ellipse(centre, axes, semi_axes_px, low_px, high_px, int(count), stretch)
@@ -378,6 +379,14 @@ def _second_moments(
     return np.array([[weights.sum(axis=0) @ du**2, mixed], [mixed, weights.sum(axis=1) @ dv**2]])
 
 
+def _principal_axes(moments: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Eigenvalues (2,) and, as columns, unit eigenvectors (2, 2) of second moments (2, 2)."""
+    (uu, uv), (_, vv) = moments.tolist()
+    angle, middle, half = math.atan2(2 * uv, uu - vv) / 2, (uu + vv) / 2, math.hypot(uu - vv, 2 * uv) / 2
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([middle + half, middle - half]), np.array([[c, -s], [s, c]])
+
+
 def _light(readout: Readout, ellipse: _Ellipse, others: list[_Ellipse], denoise_radius_px: int) -> _Light:
     """Light in the ellipse and a margin; the background is that of a ring around them."""
     margin_px = MARGIN_PX + max(denoise_radius_px, ellipse.fringe_px)
@@ -443,7 +452,7 @@ def _narrowed(readout: Readout, ellipse: _Ellipse, others: list[_Ellipse]) -> _E
         if light.signal_to_noise < MIN_SIGNAL_FOR_MOMENTS:
             return ellipse
         centroid = light.centroid_px()
-        variances, axes = np.linalg.eigh(light.moments_px2(centroid))
+        variances, axes = _principal_axes(light.moments_px2(centroid))
         semi_axes_px = 2 * ellipse.stretch * np.sqrt(np.maximum(variances, 0)) + 0.5
         if (semi_axes_px >= ellipse.semi_axes_px).any():
             return ellipse
