@@ -186,7 +186,9 @@ def _fit(observations: Observations, start: Pose, whitening: Floats, loss: Liter
         # The lift of an LED, some micrometres, changes these by some millionths.
         if motion is None:
             of_image = cv2.projectPoints(model, x[:3], x[3:], np.eye(3), None)[1][:, :6].reshape(-1, 2, 6)
-            return np.vstack([_whitened(whitening, of_image), _tilt_jacobian(x, observations)])
+            slopes = np.empty((2 * count + 2, POSE_PARAMETERS))
+            slopes[:-2], slopes[-2:] = _whitened(whitening, of_image), _tilt_jacobian(x, observations)
+            return slopes
         of_image = moving_slopes(observations, pose_of(x), x[POSE_PARAMETERS:], x)
         of_priors = np.zeros((2 + MOTION_PARAMETERS, POSE_PARAMETERS + MOTION_PARAMETERS))
         of_priors[:2, :POSE_PARAMETERS] = _tilt_jacobian(x, observations)
