@@ -36,15 +36,17 @@ figures: $(READY)
 
 bench: $(READY)
 	$(BIN)/python benchmarks/full_frame.py
+	$(BIN)/python benchmarks/options.py
 	$(BIN)/python benchmarks/regions.py
 	$(BIN)/python benchmarks/errors.py
 	$(BIN)/python benchmarks/sensor.py
 	$(BIN)/python benchmarks/memory.py
+	$(BIN)/python benchmarks/growth.py
 	$(BIN)/python benchmarks/denoise.py
 	$(BIN)/vlcrender generate datasets/office20.toml --out out/bench/full --set poses.count=8 --set bound=false
 	$(BIN)/vlcrender generate datasets/office200.toml --out out/bench/regions --set poses.count=60 --set bound=false
 	$(BIN)/vlcrender generate datasets/table1.toml --out out/bench/four --set poses.columns=8 --set poses.rows=8
-	$(BIN)/python benchmarks/estimators.py out/bench/four out/bench/regions out/bench/full
+	$(BIN)/python benchmarks/estimators.py out/bench/regions out/bench/full out/bench/four
 
 $(READY): requirements.txt pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \

@@ -11,7 +11,7 @@ from vlcrender.core.backend import dr
 from vlcrender.core.planar_shapes import Disc
 from vlcrender.light.lightmap import Lightmap, bake, illuminance_at
 from vlcrender.rendering import background as background_module
-from vlcrender.rendering.led_coverage import LedFace, candidate_leds, coverage_of_led
+from vlcrender.rendering.led_coverage import LedFace, coverage_of_led
 from vlcrender.rendering.renderer import Renderer
 from vlcrender.scene.loader import Scene, load_scene
 
@@ -87,7 +87,7 @@ def main() -> None:
     )
     worst, pixels = 0.0, 0
     for posed in (PosedCamera(camera, pose) for pose in POSES):
-        for i in candidate_leds(posed, scene.leds.centers_m, scene.leds.half_widths_m):
+        for i in scene.leds.spheres.candidates(posed):
             face = LedFace(scene.leds.centers_m[i], Disc(float(scene.leds.half_widths_m[i])))
             image = coverage_of_led(posed, face)
             if image is None or image.visible_fraction < 1:

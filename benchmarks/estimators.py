@@ -1,20 +1,24 @@
-"""Speed of the estimators: where a frame's time goes, and frames a second of two processes.
+"""Speed of the estimators: ratios beside peers, where a frame's time goes, and frames a second of two processes.
 
-    vlcrender generate datasets/quickstart.toml --out full
-    vlcrender generate datasets/quickstart.toml --out regions --set poses.count=60 \
-        --set 'regions={kind="leds",margin_px=20}'
+    vlcrender generate datasets/office200.toml --out regions --set poses.count=60 --set bound=false
+    vlcrender generate datasets/office20.toml --out full --set poses.count=8 --set bound=false
     python benchmarks/estimators.py regions full
 
-For each dataset and variant, times of one core for a frame in milliseconds (the median over frames, each the best of
-TRIES): to read it, to detect its spots (`detect`, without the denoiser), and the rest; their shares; and the estimate's
-time over the first variant's. Then frames a second, reading included, of WORKERS processes in wall time, which depends
-on the load of the machine. The last line is the time of an 11 x 11 box filter of 12 Mpx. Compare within one run only.
+The ratios are held for the first dataset. They are of processor time on one core, measured in turn, medians over
+frames. Peers that are not installed are skipped.
+
+Then for each dataset and variant, times of one core for a frame in milliseconds (the median over frames, each the best
+of TRIES): to read it, to detect its spots (`detect`, without the denoiser), and the rest; their shares; and the
+estimate's time over the first variant's. At last frames a second, reading included, of WORKERS processes in wall time,
+which depends on the load of the machine: the one number that is no ratio. Compare within one run only.
 """
 
+import statistics
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -22,15 +26,30 @@ from typing import Any
 
 import cv2
 import numpy as np
+from target import Targets, alternating_s, peer, ratio
 
 import estimator.spots.correspondences
-from estimator.evaluate.batch import estimate_frame
-from estimator.io.dataset import read_dataset, read_frame
+from estimator.evaluate.batch import estimate_dataset, estimate_frame
+from estimator.io.dataset import Dataset, read_dataset, read_frame
+from estimator.io.device import DeviceFrame
 from estimator.methods.catalogue import VARIANTS
+from estimator.methods.gravity_fit import fit_correspondences
+from estimator.methods.variant import Variant
+from estimator.spots.correspondences import centroids_px, find_correspondences, led_positions_m
+from estimator.spots.detect import MIN_BLOB_PX, SMOOTHING_PX, THRESHOLD_OF_BRIGHTEST, THRESHOLD_SIGMA, detect
+from estimator.spots.lamps import readouts_of
 
 WORKERS = 2
 TRIES = 3
 MAX_FRAMES = 20
+ROUNDS = 5
+FRAMES_TOGETHER = 8
+"""Frames of a dataset for the ratio of all variants to `ml`."""
+EVERY = 3
+"""Detection is timed in each so manieth frame."""
+MAX_ALL_VARIANTS, MIN_ML_RATE, MAX_FIT, MAX_DETECTION = 1.6, 50.0, 4.0, 0.8
+POSELIB_PX = 3.0
+"""Reprojection error up to which PoseLib's RANSAC counts a spot as an inlier."""
 
 
 class Clock:
@@ -82,12 +101,125 @@ def frames_per_s(folder: Path, name: str, first: int) -> float:
     return len(chosen) / (time.perf_counter() - start)
 
 
+def all_variants(targets: Targets, folder: Path, limit: float | None) -> None:
+    """All variants over `ml` alone, reading counted; printed alone where `limit` is None."""
+    dataset = read_dataset(folder)
+    few = replace(dataset, frames=dataset.frames[:FRAMES_TOGETHER])
+
+    def run(variants: Sequence[Variant]) -> None:
+        estimate_dataset(few, variants, lambda: None)
+
+    everything, ml = list(VARIANTS.values()), [VARIANTS["ml"]]
+    all_s, ml_s = alternating_s([partial(run, everything), partial(run, ml)], ROUNDS, time.process_time)
+    title = f"{folder.name}: all variants / ml alone, reading counted"
+    if limit is None:
+        targets.beside(title, ratio(all_s, ml_s))
+    else:
+        targets.at_most(title, ratio(all_s, ml_s), limit)
+
+
+def fit_beside_peers(targets: Targets, dataset: Dataset) -> None:
+    """`gravity-fit` beyond detection over RANSAC with refinement of PoseLib, and of OpenCV, from the same spots."""
+    poselib = peer("poselib")
+    of_poselib, of_opencv = [], []
+    for record in dataset.frames[:MAX_FRAMES]:
+        frame = read_frame(dataset, record)
+        spots = find_correspondences(frame)
+        pixels, leds_m, K = centroids_px(spots), led_positions_m(spots), frame.camera.matrix()
+        works: list[Callable[[], object]] = [
+            partial(fit_correspondences, frame, spots),
+            partial(cv2.solvePnPRansac, leds_m, pixels, K, None),
+        ]
+        if poselib is not None:
+            size = {"width": frame.camera.width_px, "height": frame.camera.height_px}
+            lens = {"model": "PINHOLE", **size, "params": [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]}
+            options = {"max_reproj_error": POSELIB_PX}
+            works.append(partial(poselib.estimate_absolute_pose, pixels, leds_m, lens, options, {}))
+        fit_s, opencv_s, *poselib_s = alternating_s(works, ROUNDS, time.process_time)
+        of_opencv.append(ratio(fit_s, opencv_s))
+        of_poselib += [ratio(fit_s, one) for one in poselib_s]
+    if of_poselib:
+        name = "gravity-fit beyond detection / PoseLib's RANSAC with refinement"
+        targets.at_most(name, statistics.median(of_poselib), MAX_FIT)
+    targets.beside("gravity-fit beyond detection / cv2.solvePnPRansac", statistics.median(of_opencv))
+
+
+def detection_beside_peers(targets: Targets, folder: Path, held: bool) -> None:
+    """Detection over segmentation by photutils, and over sep, with the same threshold and smoothing in all."""
+    photutils, sep = peer("photutils.segmentation"), peer("sep")
+    dataset = read_dataset(folder)
+    found: dict[str, list[float]] = {}
+    for record in dataset.frames[:MAX_FRAMES:EVERY]:
+        frame = read_frame(dataset, record)
+        works: dict[str, Callable[[], object]] = {"": partial(detected, frame)}
+        if photutils is not None:
+            works["photutils' segmentation"] = partial(segmented, frame, photutils)
+        if sep is not None:
+            works["sep"] = partial(extracted, frame, sep)
+        ours_s, *others_s = alternating_s(list(works.values()), ROUNDS, time.process_time)
+        for name, seconds in zip(list(works)[1:], others_s, strict=True):
+            found.setdefault(name, []).append(ratio(ours_s, seconds))
+    for name, ratios in found.items():
+        title = f"{folder.name}: detection with covariances / {name}"
+        if name == "sep" or not held:
+            targets.beside(title, statistics.median(ratios))
+        else:
+            targets.at_most(title, statistics.median(ratios), MAX_DETECTION)
+
+
+def detected(frame: DeviceFrame) -> object:
+    """Spots as every variant but `huynh2016` has them, before identification."""
+    decoded_px = np.array([(spot.u_px, spot.v_px) for spot in frame.spots])
+    return detect(readouts_of(frame), frame.camera.width_px * frame.camera.height_px, 0, decoded_px)
+
+
+def thresholded(frame: DeviceFrame) -> list[tuple[np.ndarray, np.ndarray, float]]:
+    """Of each region, electrons above the background, the same smoothed, and the threshold of detection, electrons."""
+    regions = []
+    for part in frame.parts:
+        electrons = frame.electrons(part)
+        smooth = cv2.blur(electrons, (SMOOTHING_PX, SMOOTHING_PX))
+        step = max(1, smooth.shape[1] // 500)
+        sample = smooth[::step, ::step]
+        background_e = np.median(sample)
+        noise_e = 1.4826 * float(np.median(np.abs(sample - background_e)))
+        brightest_e = float(smooth.max() - background_e)
+        threshold_e = max(THRESHOLD_SIGMA * noise_e, THRESHOLD_OF_BRIGHTEST * brightest_e)
+        regions.append((electrons - background_e, smooth - background_e, threshold_e))
+    return regions
+
+
+def segmented(frame: DeviceFrame, segmentation: Any) -> list[object]:
+    """Centroids and second moments by photutils."""
+    found: list[object] = []
+    for electrons, smooth, threshold_e in thresholded(frame):
+        segments = segmentation.detect_sources(smooth, threshold_e, MIN_BLOB_PX)
+        if segments is not None:
+            sources = segmentation.SourceCatalog(electrons, segments)
+            found += [sources.centroid, sources.covariance]
+    return found
+
+
+def extracted(frame: DeviceFrame, sep: Any) -> list[object]:
+    """Centroids and second moments by sep."""
+    return [
+        sep.extract(smooth, threshold_e, minarea=MIN_BLOB_PX, filter_kernel=None)
+        for _, smooth, threshold_e in thresholded(frame)
+    ]
+
+
 def main() -> None:
-    """Measure and print."""
+    """Measure and print; exits with 1 where a ratio falls short."""
     cv2.setNumThreads(1)
+    targets, folders = Targets(), [Path(one) for one in sys.argv[1:]]
+    for folder in folders:
+        first = folder == folders[0]
+        all_variants(targets, folder, MAX_ALL_VARIANTS if first else None)
+        detection_beside_peers(targets, folder, held=first)
+    fit_beside_peers(targets, read_dataset(folders[0]))
     with ProcessPoolExecutor(WORKERS, get_context("spawn")) as pool:
-        list(pool.map(read_dataset, map(Path, WORKERS * sys.argv[1:2])))  # modules are loaded
-        for folder in map(Path, sys.argv[1:]):
+        list(pool.map(read_dataset, WORKERS * folders[:1]))  # modules are loaded
+        for folder in folders:
             print(f"\n{folder}: {len(read_dataset(folder).frames)} frames")
             print("variant                  read  detect    rest ms     share of each     estimate/first  frames/s")
             first_ms = None
@@ -99,7 +231,11 @@ def main() -> None:
                 shares = " ".join(f"{100 * part:4.0f}%" for part in parts_ms / parts_ms.sum())
                 numbers = " ".join(f"{part:7.1f}" for part in parts_ms)
                 print(f"{name:22}{numbers}      {shares}   {estimate_ms / first_ms:14.2f}  {rate:8.1f}")
+                if name == "ml" and folder == folders[0]:
+                    ml_rate = rate
     print(f"\n11 x 11 box filter of 12 Mpx: {box_ms():.1f} ms of one core")
+    targets.at_least(f"{folders[0].name}: ml, frames a second of {WORKERS} processes", ml_rate, MIN_ML_RATE)
+    targets.finish()
 
 
 def box_ms() -> float:

@@ -8,6 +8,8 @@ import sys
 import tempfile
 from pathlib import Path
 
+from target import Targets
+
 from vlcrender.dataset.frame_job import EXPECTED, FRAMES, PREVIEWS, Job, make_frame
 from vlcrender.dataset.recipe import load_plan
 
@@ -20,18 +22,22 @@ def peak_gib() -> float:
 def main() -> None:
     """Measure and print."""
     frames = int(sys.argv[1]) if len(sys.argv) > 1 else 60
+    peaks: list[float] = []
     root = Path(__file__).parent.parent
     plan = load_plan(root / "datasets/quickstart.toml", [f"poses.count={frames}"])
     with tempfile.TemporaryDirectory() as folder:
         for name in (FRAMES, EXPECTED, PREVIEWS):
             (Path(folder) / name).mkdir()
-        settings = plan.scene.settings.model_dump_json()
-        job = Job(plan.recipe.model_dump_json(), settings, str(plan.scene.folder), folder)
+        job = Job.of(plan, Path(folder))
         for frame in range(frames):
             record = make_frame(job, frame)
-            (Path(folder) / record["device"]["file"]).unlink()
+            (Path(folder) / record.device.file).unlink()
             if frame + 1 in (20, frames):
-                print(f"peak memory after {frame + 1:4d} full frames   {peak_gib():.2f} GiB", flush=True)
+                peaks.append(peak_gib())
+                print(f"peak memory after {frame + 1:4d} full frames   {peaks[-1]:.2f} GiB", flush=True)
+    targets = Targets()
+    targets.at_most(f"peak memory after {frames} frames / after 20", peaks[-1] / peaks[0], 1.05)
+    targets.finish()
 
 
 if __name__ == "__main__":

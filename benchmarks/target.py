@@ -5,11 +5,13 @@ differ, are shared and change their speed, so seconds are not comparable.
 """
 
 import gc
+import importlib
 import statistics
 import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from types import ModuleType
 
 
 def alternating_s(
@@ -31,6 +33,15 @@ def alternating_s(
     return seconds
 
 
+def peer(name: str) -> ModuleType | None:
+    """A package of the extra `bench`, or None with a line that names it where it is not installed."""
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        print(f"{name} is not installed (extra `bench`): skipped", flush=True)
+        return None
+
+
 def ratio(numerator_s: list[float], denominator_s: list[float]) -> float:
     """Median of the ratios of the rounds."""
     return statistics.median(above / below for above, below in zip(numerator_s, denominator_s, strict=True))
@@ -49,6 +60,10 @@ class Targets:
     def at_least(self, name: str, value: float, limit: float) -> None:
         """Print a ratio or rate that should not be smaller than `limit`."""
         self._print(name, value, f">= {limit:g}", value >= limit)
+
+    def beside(self, name: str, value: float) -> None:
+        """Print a ratio beside a peer of which nothing is wanted."""
+        print(f"{name:72} {value:8.3f}", flush=True)
 
     def finish(self) -> None:
         """Exit with status 1 and the names of what was missed, if anything was."""

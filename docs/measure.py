@@ -26,8 +26,7 @@ from estimator.methods.huynh2016 import SPOTS
 from estimator.solvers.ranging import law_of_sines, led_ranges
 from estimator.solvers.trilateration import position_from_ranges
 from estimator.spots.correspondences import find_correspondences
-from estimator.spots.denoise import DENOISERS, Denoiser
-from estimator.spots.identify import Correspondence
+from estimator.spots.denoise import DENOISERS
 
 Floats = NDArray[np.float64]
 UNITS = ((1e3, "km"), (1.0, "m"), (1e-3, "mm"), (1e-6, "um"))
@@ -293,15 +292,10 @@ def spots_px(folder: Path, denoise: str, spot: str) -> dict[tuple[int, int], Flo
     found = {}
     for record in dataset.frames:
         frame = est.read_frame(dataset, record)
-        correspondences = _correspondences(frame, denoiser)
+        correspondences = find_correspondences(frame, denoiser)
         for one, place_px in zip(correspondences, SPOTS[spot](correspondences), strict=True):
             found[record.frame, one.led.id] = place_px
     return found
-
-
-def _correspondences(frame: est.DeviceFrame, denoiser: Denoiser) -> list[Correspondence]:
-    noise_e = float(np.sqrt(frame.sensor.floor_e2()))
-    return find_correspondences(frame, lambda raw_e: denoiser.apply(raw_e, noise_e), denoiser.radius_px)
 
 
 def _scatter(spots: dict[tuple[int, int], Floats], places: dict[tuple[int, int], Floats]) -> str:

@@ -13,6 +13,7 @@ import json
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +28,8 @@ from estimator.evaluate.score import VariantScore
 LEVELS = ("laboratory", "calibrated", "as_sold")
 FITS = ("gravity-fit", "up2p", "pnp", "huynh2016")
 WRONG_SHARE = 0.1
-SMALL_SPOT_SCALES = (4, 8, 20, 40)
-"""LED images of office200 are some 58 px high at full size, 14 to 1.5 px here."""
+SMALL_SPOT_SCALES = (2, 4, 8, 20, 25)
+"""LED images of office200 are some 58 px high at full size, 29 to 2.3 px here."""
 HEADINGS = ("variant", "failed", "with 4 LEDs or more", "RMSE (95 % interval)", "RMSE / bound", "NEES (99 % interval)")
 
 
@@ -124,10 +125,8 @@ def stated_wrongly(chosen: Chosen) -> None:
     for level in chosen.levels:
         for factor in (3.0, 1 / 3):
             figure("level, stated over true", f"{level}, {factor:.3g}")
-            folder = copied(chosen.dataset(level), f"factor-{factor:.3g}-{level}")
-            device = json.loads((folder / "dataset.json").read_text(encoding="utf-8"))
-            (folder / "dataset.json").write_text(json.dumps(_scaled(device, factor)), encoding="utf-8")
-            chosen.print_scores(folder)
+            name = f"factor-{factor:.3g}-{level}"
+            chosen.print_scores(told(chosen.dataset(level), name, partial(_scaled, factor=factor)))
 
 
 def _scaled(device: dict[str, Any], factor: float) -> dict[str, Any]:
@@ -175,7 +174,10 @@ def hall(chosen: Chosen) -> None:
     """Luminaires of 60 x 60 cm, all exact: full size, and four pixels by four in one."""
     for scale in (1, 4):
         figure("scale", scale)
-        chosen.print_scores(chosen.scaled("hall", scale))
+        folder = chosen.scaled("hall", scale)
+        chosen.print_scores(folder)
+        figure("scale", f"{scale}, camera stated as exact")
+        chosen.print_scores(told(folder, f"exact-{folder.name}", _with_an_exact_camera))
 
 
 def effects(chosen: Chosen) -> None:
@@ -187,10 +189,7 @@ def effects(chosen: Chosen) -> None:
     figure("effect", "gradient of 4 %, stated")
     chosen.print_scores(gradient)
     figure("effect", "gradient of 4 %, nothing stated")
-    silent = copied(gradient, f"silent-{gradient.name}")
-    device = json.loads((silent / "dataset.json").read_text(encoding="utf-8"))
-    (silent / "dataset.json").write_text(json.dumps(_with_nothing_stated(device)), encoding="utf-8")
-    chosen.print_scores(silent)
+    chosen.print_scores(told(gradient, f"silent-{gradient.name}", _with_nothing_stated))
     for scale in SMALL_SPOT_SCALES:
         figure("effect", f"scale {scale}")
         chosen.print_scores(chosen.scaled("office200", scale, count))
@@ -204,6 +203,22 @@ def _with_nothing_stated(device: dict[str, Any]) -> dict[str, Any]:
         led.update({key: None for key in led if "sigma" in key})
     device["accelerometer"].update({"device_error_deg": None, "shot_error_deg": None})
     return {**device, "luminaires": [], "map_datum": None}
+
+
+def _with_an_exact_camera(device: dict[str, Any]) -> dict[str, Any]:
+    """dataset.json of a device that is told that its cameras are exact."""
+    for camera in device["cameras"].values():
+        stated = {"parameters": [], "device_sigma": [], "shot_sigma": []}
+        camera["uncertainty"] = {**stated, "offset_sigma_m": 0.0, "rotation_sigma_deg": 0.0}
+    return device
+
+
+def told(dataset: Path, name: str, change: Callable[[dict[str, Any]], dict[str, Any]]) -> Path:
+    """A copy of a dataset whose device is told something else: `change` maps its dataset.json to another."""
+    folder = copied(dataset, name)
+    device = json.loads((folder / "dataset.json").read_text(encoding="utf-8"))
+    (folder / "dataset.json").write_text(json.dumps(change(device)), encoding="utf-8")
+    return folder
 
 
 def copied(dataset: Path, name: str) -> Path:

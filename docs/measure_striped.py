@@ -14,8 +14,9 @@ from estimator.io.truth import WHOLE, read_truth
 from estimator.receiver.signal import Signal
 from estimator.receiver.tones import fit_tone
 from estimator.solvers.observations import centroid_images
-from estimator.spots.detect import Readout, detect
+from estimator.spots.detect import detect
 from estimator.spots.lamps import lamps_of, light_centre_px
+from estimator.spots.led_light import Readout
 from estimator.spots.striped import find_lamps
 
 Floats = NDArray[np.float64]

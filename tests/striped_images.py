@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
-from estimator.spots.detect import Readout
+from estimator.spots.led_light import Readout
 
 Array = NDArray[np.float64]
 

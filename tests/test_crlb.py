@@ -1,6 +1,6 @@
 """The Cramér-Rao bound against the information of moving edges, and its dependence on light, LEDs and gravity."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -15,8 +15,7 @@ from vlcrender.config.toml_model import check, read_toml
 from vlcrender.dataset.recipe import load_plan
 from vlcrender.errors import InputError
 from vlcrender.rendering import crlb
-from vlcrender.rendering.crlb import MARGIN_PX, position_bound_m2
-from vlcrender.rendering.expected_image import LedPatch
+from vlcrender.rendering.crlb import MARGIN_PX, Render, position_bound_m2
 from vlcrender.rendering.renderer import Renderer
 from vlcrender.scene.loader import build_scene
 from vlcrender.scene.schema import SceneSettings
@@ -51,8 +50,10 @@ def renderer() -> Renderer:
     return room_of_leds()
 
 
-def light_of(renderer: Renderer, led_ids: Sequence[int]) -> Callable[[PosedCamera], list[LedPatch]]:
-    return lambda posed: [patch for patch in renderer.led_patches(posed) if patch.led_id in led_ids]
+def light_of(renderer: Renderer, led_ids: Sequence[int]) -> Render:
+    return lambda posed, changes: [
+        [patch for patch in patches if patch.led_id in led_ids] for patches in renderer.led_slopes(posed, changes)
+    ]
 
 
 def alone(camera: Camera) -> Mounted:

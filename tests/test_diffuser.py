@@ -69,7 +69,7 @@ def test_a_wide_diffuser_transmits_all_light_but_its_dim_rim(order: float) -> No
     light = diffuser.quadrants()[1].sum()
     assert whole * (1 - cosine ** (order + 1)) < light < whole * (1 - corner ** (order + 1))
     # at the circle's rim the diffuser has MIN_RELATIVE_LUMINANCE of the foot's luminance
-    edge = diffuser.luminance(np.array([0.0, diffuser.lit_radius_m]), np.zeros(2))
+    edge = diffuser.at(np.array([0.0, diffuser.lit_radius_m]), np.zeros(2))
     assert edge[1] / edge[0] == pytest.approx(MIN_RELATIVE_LUMINANCE, rel=1e-9)
 
 
@@ -82,7 +82,7 @@ def test_four_points_illuminate_as_the_diffuser_does(diffuser: Diffuser) -> None
     x0, y0, x1, y1 = diffuser.lit_m
     n = 400
     x, y = np.meshgrid(x0 + (np.arange(n) + 0.5) / n * (x1 - x0), y0 + (np.arange(n) + 0.5) / n * (y1 - y0))
-    fine = diffuser.luminance(x, y) * (x1 - x0) * (y1 - y0) / n**2
+    fine = diffuser.at(x, y) * (x1 - x0) * (y1 - y0) / n**2
 
     def lux(sx: np.ndarray, sy: np.ndarray, weight: np.ndarray, place: np.ndarray) -> float:
         d2 = (sx - place[0]) ** 2 + (sy - place[1]) ** 2 + place[2] ** 2
@@ -204,6 +204,6 @@ def test_a_pixel_of_a_diffuser_has_the_mean_luminance_over_its_area(width_shares
     assert diffuser is not None
     inside = (np.arange(24) + 0.5) / 24
     x, y = (((np.arange(8)[:, None] + inside).ravel() - 4) * width_shares * 0.03 + foot for foot in diffuser.foot_m)
-    fine = diffuser.luminance(x[None, :], y[:, None]).reshape(8, 24, 8, 24).mean(axis=(1, 3))
+    fine = diffuser.at(x[None, :], y[:, None]).reshape(8, 24, 8, 24).mean(axis=(1, 3))
     # the points of the comparison err by 24^-2 of the error of the centre alone: 5e-5
     assert pattern == pytest.approx(fine, rel=5e-4)

@@ -10,7 +10,9 @@ from test_estimator_maximum_likelihood import frame_of
 
 from estimator.io.device import DecodedSpot, DeviceFrame, Led, Part, SquareLed
 from estimator.spots.correspondences import centroids_px, find_correspondences, led_positions_m
-from estimator.spots.detect import Readout, detect
+from estimator.spots.denoise import Denoiser
+from estimator.spots.detect import detect
+from estimator.spots.led_light import Readout
 from estimator.spots.sampling import sampling_variance_px2
 
 TARGET = (3.5, 3.6, 3.5)
@@ -78,7 +80,7 @@ def test_a_denoised_image_is_measured_and_the_raw_one_weighs_it() -> None:
     """
     rest_px2 = sampling_variance_px2(np.array([5.0]), square=False)[0]
     frame = rendered()
-    plain, doubled = find_correspondences(frame), find_correspondences(frame, lambda image: 2 * image)
+    plain, doubled = find_correspondences(frame), find_correspondences(frame, Denoiser(lambda raw_e, _: 2 * raw_e, 0))
     np.testing.assert_allclose(centroids_px(doubled), centroids_px(plain), atol=1e-6)
     for one, other in zip(plain, doubled, strict=True):
         np.testing.assert_allclose(4 * other.spot.covariance_px2, one.spot.covariance_px2, rtol=1e-6, atol=4 * rest_px2)

@@ -46,6 +46,14 @@ def test_two_identities_with_one_spot_are_both_left_out(second_u_px: float) -> N
     assert matches(spots, [claim(1, 95, 50), claim(2, second_u_px, 50), claim(3, 300, 50)]) == {3: 300}
 
 
+def test_an_identity_without_a_spot_inside_a_blob_leaves_the_blob_out() -> None:
+    """Three LED images of radius 2 in a row merge: at a gate of 2 px the outer two are beyond it, at 4 px."""
+    blob = Spot(100, 50, np.eye(2), 100, 50, round(3 * np.pi * 2**2), 1000.0, False, saturated=False)
+    inner, outer, further = claim(1, 100, 50), claim(2, 104, 50), claim(4, 107, 50)
+    assert matches([blob, spot(150, 50)], [inner, outer, claim(3, 150, 50)], width_px=200) == {3: 150}
+    assert matches([blob, spot(150, 50)], [inner, further, claim(3, 150, 50)], width_px=200) == {1: 100, 3: 150}
+
+
 def test_an_identity_that_has_its_own_spot_does_not_stand_in_anothers_way() -> None:
     assert matches([spot(100, 50), spot(120, 50)], [claim(1, 106, 50), claim(2, 119, 50)]) == {1: 100, 2: 120}
 

@@ -18,7 +18,9 @@ def camera(**changes: object) -> Camera:
     return Camera.model_validate_json(json.dumps({**made, **changes}))
 
 
-@pytest.mark.parametrize("angles_deg", [(0, 0, 0), (33, -47, 0), (-60, 60, 170), (80, 20, -120), (5, 89, 10)])
+@pytest.mark.parametrize(
+    "angles_deg", [(0, 0, 0), (33, -47, 0), (-60, 60, 170), (80, 20, -120), (5, 89, 10), (30, -90, 0)]
+)
 def test_the_rotation_is_the_format_s_and_its_angles_come_back(angles_deg: tuple[float, float, float]) -> None:
     view = View(400, 300, 1500.0, (0, 0, 0), *angles_deg)
     matrix = rotation(*np.radians(angles_deg))

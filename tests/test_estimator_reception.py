@@ -17,8 +17,10 @@ from estimator.errors import EstimationFailure, InputError
 from estimator.evaluate.batch import bursts, estimate_dataset
 from estimator.evaluate.identities import score_identities
 from estimator.io.truth import read_true_map, read_truth
+from estimator.methods.catalogue import VARIANTS
 from estimator.methods.variant import DeviceMethod, Estimate, Variant
 from estimator.receiver.receive import receive, receive_frames, with_identities
+from estimator.spots.striped import Lamp, find_lamps
 
 ROW_TIME_S, EXPOSURE_S = 10e-6, 40e-6
 CENTRE_M = (3.5, 3.6, 3.5)
@@ -170,6 +172,27 @@ def test_frames_of_a_burst_share_the_time_of_their_reception(by_codes: Path) -> 
         # The variants do nothing: their time is that of the reception, which takes milliseconds for each LED image.
         assert all(row.time_s > 0.01 for row in of_variant)
     assert len(steps) == 8
+
+
+@pytest.mark.slow
+def test_led_images_are_found_once_for_the_receiver_and_all_variants(
+    by_codes: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Their time is that of the reception, and counts once: the clock advances by 5 s where they are searched."""
+    dataset, clock = est.read_dataset(by_codes), [0.0]
+
+    def counted(*arguments: object) -> tuple[Lamp, ...]:
+        clock[0] += 5.0
+        return find_lamps(*arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr("time.perf_counter", lambda: clock[0])
+    monkeypatch.setattr("estimator.spots.lamps.find_lamps", counted)
+    rows = estimate_dataset(dataset, [VARIANTS["gravity-fit"], VARIANTS["pnp"]], lambda: None)
+    assert {row.time_s for of_variant in rows.values() for row in of_variant} == {5.0}
+    assert clock[0] == 5.0 * len(dataset.frames)
+    clock[0] = 0.0
+    est.estimate(est.read_frame(dataset, 0), "gravity-fit")
+    assert clock[0] == 5.0
 
 
 @pytest.mark.slow

@@ -7,7 +7,8 @@ import pytest
 from estimator_synthetic import Array
 from test_estimator_device import CAMERA
 
-from estimator.spots.detect import Readout, detect
+from estimator.spots.detect import detect
+from estimator.spots.led_light import Readout
 from estimator.spots.sampling import SHARP, LensBlur, lens_blur, sampling_error, sampling_variance_px2
 
 POSITIONS_PX = np.linspace(20.0, 21.0, 41)
@@ -93,9 +94,10 @@ def test_an_uncertain_size_leaves_the_centroid_as_it_is() -> None:
     np.testing.assert_allclose(found.variance_px2, 2 * sampling_variance_px2(np.full(2, 3.0), False), rtol=0.05)
 
 
-@pytest.mark.parametrize("half_px", [0.3, 0.5])
-def test_light_in_a_pixel_or_two_is_not_corrected(half_px: float) -> None:
-    centroid, moments = sampled(half_px, 20.5)
+@pytest.mark.parametrize(("half_px", "centre_px"), [(0.3, 20.5), (0.5, 20.5), (0.8, 20.85), (0.9, 20.95)])
+def test_light_in_a_pixel_or_two_is_not_corrected(half_px: float, centre_px: float) -> None:
+    """Two columns tell one number, the share of one of them: not both position and half extent."""
+    centroid, moments = sampled(half_px, centre_px)
     found = sampling_error(centroid, moments, NO_NOISE)
     np.testing.assert_array_equal(found.error_px, 0.0)
     # 1/12 px^2 is the variance of a point's position in its pixel.

@@ -15,14 +15,8 @@ from estimator.camera.pose import Pose
 from estimator.camera.projection import project
 from estimator.evaluate.statistics import Groups, nees
 from estimator.io.device import INTRINSICS, Camera, DiscLed, Luminaire, MapDatum
-from estimator.solvers.self_calibration import (
-    Adjusted,
-    Adjustment,
-    DeviceView,
-    Unknowns,
-    _Frame,
-    adjust,
-)
+from estimator.solvers.device_equations import DeviceEquations, DeviceView, Unknowns
+from estimator.solvers.self_calibration import Adjusted, Adjustment, adjust
 
 SIZE = (1600, 1200, 3000.0)
 SIGMA_PX = 0.02
@@ -174,7 +168,7 @@ def test_slopes_by_every_unknown_are_differences_of_the_residuals(rng: np.random
     view = replace(view, datum=MapDatum(sigma_m=(1e-3, 1e-3, 1e-3), scale_sigma_ppm=200.0))
     other = replace(other, leds=view.leds, centroids_px=view.centroids_px, covariance_px2=view.covariance_px2)
     unknowns = Unknowns([view, other], {})
-    frame = _Frame(view, unknowns)
+    frame = DeviceEquations(view, unknowns)
     shot = 0.5 * np.array(SHOT)
     common = 0.3 * rng.standard_normal(unknowns.count)
     line = frame.linear(view.pose, shot, common)
@@ -211,7 +205,7 @@ def test_a_frame_by_itself_has_the_covariance_of_generalised_least_squares(rng: 
     found = adjust([view]).frames[0]
     assert found is not None
     twice = Unknowns([view, view], {})  # so that each LED is an unknown
-    frame = _Frame(replace(view, pose=found.pose), twice)
+    frame = DeviceEquations(replace(view, pose=found.pose), twice)
     at = project(frame.told_m, found.pose, view.camera)
     by_camera = intrinsic_slopes_px(at.p_cam, view.camera.normalized(at.pixels), view.camera)
     n = len(view.leds)
@@ -236,7 +230,7 @@ def test_two_frames_have_the_covariance_of_one_dense_system(rng: np.random.Gener
     total = np.diag([*np.zeros(18), *np.ones(unknowns.count)])
     for k, (view, one) in enumerate(zip(views, found.frames, strict=True)):
         assert one is not None
-        frame = _Frame(replace(view, pose=one.pose), unknowns)
+        frame = DeviceEquations(replace(view, pose=one.pose), unknowns)
         at = project(frame.told_m, one.pose, view.camera)
         by_camera = intrinsic_slopes_px(at.p_cam, view.camera.normalized(at.pixels), view.camera)
         n = len(view.leds)

@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import chi2
 from striped_images import Array, code, coverage, gains, readout
 
-from estimator.spots.detect import Readout
+from estimator.spots.led_light import Readout
 from estimator.spots.outlines import EdgeEllipse, EdgeParallelogram
 from estimator.spots.striped import Lamp, find_lamps
 

@@ -141,9 +141,7 @@ def test_the_literal_algorithm_1_shifts_every_spot_up_and_left(noisy: Path) -> N
     truth = pq.read_table(noisy / "truth.parquet", columns=["leds"]).to_pylist()
     literal = DENOISERS["literal"]
     for record, true in zip(dataset.frames, truth, strict=True):
-        seen = find_correspondences(
-            read_frame(dataset, record), lambda raw_e: literal.apply(raw_e, 0.0), literal.radius_px
-        )
+        seen = find_correspondences(read_frame(dataset, record), literal)
         exact = {led["led"]: (led["u_px"], led["v_px"]) for led in true["leds"]}
         off = centroids_px(seen) - [exact[correspondence.led.id] for correspondence in seen]
         assert len(off) > 10

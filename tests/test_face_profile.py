@@ -289,11 +289,11 @@ def test_the_bound_does_not_depend_on_the_step_of_its_differences(monkeypatch: p
     mean = [RegionImage(p.roi, p.expected_electrons(1e-6)) for p in expected.parts]
     variance = [RegionImage(roi, variance_e2(Sensor(full_well_e=4e6), image, 1e-6)) for roi, image in mean]
     bounds = []
-    for step in (1e-5, 4e-5):
+    for step in (1e-4, 1e-2):
         monkeypatch.setattr("vlcrender.rendering.crlb.STEP_PX", step)
-        bounds.append(position_bound_m2(mounted, pose, renderer.led_patches, 1e-6, variance, 2.0, (0.1, 0.1)))
-    # slopes to 1e-7, and kinks crossed by the larger step in some 4e-5 of the edge pixels
-    assert bounds[0] == pytest.approx(bounds[1], rel=2e-4)
+        bounds.append(position_bound_m2(mounted, pose, renderer.led_slopes, 1e-6, variance, 2.0, (0.1, 0.1)))
+    # Projections err by 1e-12 px of 1e-4 px; the larger step of 1e-2 px by (1e-2 / focal length)^2 of itself.
+    assert bounds[0] == pytest.approx(bounds[1], rel=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,8 @@ from conftest import ROOT, SMALL
 import vlcrender as vr
 from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.roi import RegionImage, Roi
-from vlcrender.dataset.frame_job import _white_balance
+from vlcrender.dataset import frame_job
+from vlcrender.dataset.frame_job import Job, _white_balance
 from vlcrender.dataset.generate import generate
 from vlcrender.dataset.recipe import Plan, load_plan
 from vlcrender.dataset.schema import FrameRow, TruthRow
@@ -100,7 +101,7 @@ def test_the_bound_of_a_frame_is_that_of_its_noise_and_its_accelerometer(tmp_pat
     bound = position_bound_m2(
         mounted,
         pose,
-        renderer.led_patches,
+        renderer.led_slopes,
         1.6e-6,
         [variance],
         float(np.median(np.linalg.norm(plan.scene.leds.centers_m - truth.position_m, axis=1))),
@@ -138,3 +139,17 @@ def test_white_balance_multiplies_the_weaker_colours_and_leaves_a_blind_one() ->
     scene = load_scene(ROOT / "scenes/table1.toml")
     assert _white_balance(Camera(), sensor, scene) == pytest.approx((2.0, 1.0, 1.0))
     assert _white_balance(Camera(), Sensor(), scene) == (1.0, 1.0, 1.0)
+
+
+def test_frames_have_the_scene_that_their_process_has_loaded(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A plan's scene is loaded once in the process that makes the plan; another process builds it from the job."""
+    plan = plan_of("poses.count=1", "seed=987")
+    job = Job.of(plan, tmp_path)
+    parts = job.recipe_json, job.scene_json, job.scene_folder
+    _, renderer = frame_job._renderer(*parts)
+    assert renderer.scene is plan.scene
+    monkeypatch.setattr(frame_job, "_loaded", {})
+    frame_job._renderer.cache_clear()
+    _, elsewhere = frame_job._renderer(*parts)
+    assert elsewhere.scene is not plan.scene
+    assert np.array_equal(elsewhere.scene.leds.centers_m, plan.scene.leds.centers_m)

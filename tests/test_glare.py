@@ -190,7 +190,7 @@ def test_the_information_of_an_led_includes_its_halo() -> None:
     mean = renderer.expected_image(PosedCamera(camera, pose)).expected_electrons(1e-6)
     variance = [RegionImage(sensor, variance_e2(Sensor(full_well_e=4e6), mean, 1e-6))]
     known, unknown = (
-        position_bound_m2(mounted, pose, renderer.led_patches, 1e-6, variance, 2.0, (0.0, 0.0), halo_of=halo_of)
+        position_bound_m2(mounted, pose, renderer.led_slopes, 1e-6, variance, 2.0, (0.0, 0.0), halo_of=halo_of)
         for halo_of in (renderer.halo_of(camera), None)
     )
     assert known is not None

@@ -150,7 +150,7 @@ def test_each_led_near_the_focus_has_its_own_kernel(table1: Scene) -> None:
     leds, camera = table1.leds, Camera(focus_distance_m=2.5)
     pose = Pose((float(leds.centers_m[0, 0]), float(leds.centers_m[0, 1]), 0.98))
     lower = Pose((pose.position_m[0], pose.position_m[1], 0.982))
-    one, other = (led_blur(leds, PosedCamera(camera, at)).kernels[0].parts for at in (pose, lower))
+    one, other = (led_blur(leds, PosedCamera(camera, at)).kernel(0).parts for at in (pose, lower))
     assert one is not None
     assert other is not None
     expected = split_kernel(camera, float(leds.centers_m[0, 2]) - 0.98)
@@ -188,7 +188,7 @@ def test_the_kernel_of_an_led_is_within_a_step_of_depth_of_its_own(table1: Scene
     camera = Camera(focus_distance_m="infinity", width_px=400, height_px=300, pixel_pitch_um=3.0)
     x, y, z = table1.leds.centers_m[1].tolist()
     for depth_m in np.linspace(0.16, 0.3, 8):
-        kernel = led_blur(table1.leds, PosedCamera(camera, Pose((x, y, z - float(depth_m))))).kernels[1].whole
+        kernel = led_blur(table1.leds, PosedCamera(camera, Pose((x, y, z - float(depth_m))))).kernel(1).whole
         assert kernel is not None
         assert split_for(camera, float(depth_m)) == 1  # LEDs under a narrower blur have kernels of their own
         area = np.pi / 4 * float(defocus_diameter_px(camera, depth_m)) ** 2

@@ -9,7 +9,8 @@ from vlcrender.camera.distortion import Distortion
 from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.core.planar_shapes import Disc, Rectangle, circle_polygon_area, rectangle_polygon_area
-from vlcrender.rendering.led_coverage import LedCoverage, LedFace, candidate_leds, coverage_of_led
+from vlcrender.rendering.led_coverage import LedCoverage, LedFace, coverage_of_led
+from vlcrender.scene.bounding_spheres import BoundingSpheres
 
 SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 
@@ -296,7 +297,7 @@ def test_candidates_include_every_led_that_lights_a_pixel(camera: Camera, rng: n
     false_candidates = 0
     for _ in range(8):
         pose = Pose((3.0, 3.0, 1.0), *rng.uniform(-40, 40, 2), rng.uniform(-180, 180))
-        candidates = candidate_leds(PosedCamera(camera, pose), centers, radii, margin_px=5.0)
+        candidates = BoundingSpheres(centers, radii).candidates(PosedCamera(camera, pose), margin_px=5.0)
         images = [image_of_disc(camera, pose, c, float(r), 5) for c, r in zip(centers, radii, strict=True)]
         seen = [i for i, image in enumerate(images) if image is not None]
         assert set(seen) <= set(candidates.tolist())

@@ -18,7 +18,8 @@ from vlcrender.core.warn_once import warn_once
 from vlcrender.errors import InputError
 from vlcrender.light import bake_cache, lightmap
 from vlcrender.light.bake_cache import BakedIlluminance
-from vlcrender.light.lightmap import bake, illuminance_at, led_illuminance_lux, path_traced_lux, room_mesh
+from vlcrender.light.direct_light import led_illuminance_lux
+from vlcrender.light.lightmap import bake, illuminance_at, path_traced_lux, room_mesh
 from vlcrender.light.mitsuba_room import mitsuba_scene
 from vlcrender.scene.fresnel import glazing_reflectance
 from vlcrender.scene.leds import Leds

@@ -12,6 +12,7 @@ from scipy import stats
 from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.config.toml_model import check, read_toml
+from vlcrender.core.random_keys import stream
 from vlcrender.dataset import pose_sampling
 from vlcrender.dataset.pose_sampling import AimedPoses, GridPoses, ListedPoses, PoseEntry, pose_of_frame
 from vlcrender.errors import InputError
@@ -149,6 +150,20 @@ def test_every_led_is_a_target() -> None:
 def test_a_pose_depends_on_seed_and_frame_alone(drawn: list[Pose], central: Scene) -> None:
     assert pose_of_frame(OPEN, 150, 7, NARROW, central) == drawn[150]
     assert not set(drawn) & set(poses_of(OPEN, central, seed=8, count=20))
+
+
+def test_the_poses_of_a_set_share_their_two_permutations(central: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A pose costs the same in a set of any size: no work in proportion to `count` is done again."""
+    drawn_keys = []
+
+    def counted(*parts: int | str) -> np.random.Generator:
+        drawn_keys.append(str(parts[-1]))
+        return stream(*parts)
+
+    monkeypatch.setattr(pose_sampling, "stream", counted)
+    poses_of(OPEN, central, seed=991, count=10)
+    assert drawn_keys.count("aim") == 10
+    assert sorted(key for key in drawn_keys if "strata" in key) == ["tilt-x-strata", "tilt-y-strata"]
 
 
 def test_positions_keep_the_distance_from_the_walls() -> None:

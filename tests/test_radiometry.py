@@ -19,6 +19,7 @@ from vlcrender.sensor.radiometry import (
     spectral_radiance,
 )
 from vlcrender.sensor.silicon import silicon_absorption_per_m
+from vlcrender.sensor.spectra import LED_FIRST_NM, LED_SPECTRA, LED_STEP_NM
 
 
 def test_luminance_of_a_spectral_radiance_is_what_was_asked_for() -> None:
@@ -30,6 +31,22 @@ def test_luminance_of_a_spectral_radiance_is_what_was_asked_for() -> None:
 def test_photopic_efficiency_peaks_at_555_nm() -> None:
     assert WAVELENGTHS_NM[np.argmax(luminous_efficiency())] == 555
     assert luminous_efficiency().max() == 1.0
+
+
+def test_the_tables_are_those_of_colour_science() -> None:
+    """Every number, as colour-science 0.4.7 has it: constants are copied, so that no tolerance is needed."""
+    wavelengths_nm = LED_FIRST_NM + LED_STEP_NM * np.arange(81)
+    assert set(LED_SPECTRA) == {
+        name for name in colour.SDS_ILLUMINANTS if name.startswith("LED-") and "RGB" not in name
+    }
+    for name, spectrum in LED_SPECTRA.items():
+        table = colour.SDS_ILLUMINANTS[name]
+        assert np.array_equal(table.wavelengths, wavelengths_nm)
+        assert np.array_equal(table.values, spectrum)
+    table = colour.SDS_LEFS["CIE 1924 Photopic Standard Observer"]
+    visible = np.isin(table.wavelengths, WAVELENGTHS_NM)
+    assert np.array_equal(table.values[visible], luminous_efficiency())
+    assert np.count_nonzero(visible) == len(WAVELENGTHS_NM)
 
 
 def test_the_white_led_has_a_blue_peak_and_a_phosphor() -> None:

@@ -4,9 +4,11 @@ import hashlib
 
 import numpy as np
 
+from vlcrender.camera.roi import Roi
 from vlcrender.core.backend import dr, exact_math, mi
-from vlcrender.core.philox import PHILOX, kernel_seed, normals, pixel_indices
+from vlcrender.core.philox import PHILOX, kernel_seed, normals
 from vlcrender.core.random_keys import random_key, stream
+from vlcrender.sensor.pixel_indices import pixel_indices
 
 
 def blake2(text: str, size: int) -> int:
@@ -31,7 +33,7 @@ def test_a_key_may_be_part_of_a_longer_one() -> None:
 def test_normal_numbers_are_box_and_mullers_of_two_uniforms() -> None:
     """In float64 by NumPy: float32 has 2^-24 = 6e-8 an operation, on numbers up to 5.8, through a dozen operations."""
     with exact_math():
-        column, row = pixel_indices((300, 400), -20, 5)
+        column, row = pixel_indices([Roi(-20, 5, 300, 400)])
         seed = kernel_seed("normals")
         drawn = [number.numpy() for number in normals(seed, column, row)]
         u = PHILOX(seed, column, row, mi.UInt32(0), iterations=10).next_float32x4()
@@ -43,6 +45,10 @@ def test_normal_numbers_are_box_and_mullers_of_two_uniforms() -> None:
 
 
 def test_pixel_indices_count_from_the_region_and_wrap_at_2_to_the_32() -> None:
-    column, row = (index.numpy().reshape(2, 3).tolist() for index in pixel_indices((2, 3), -1, 7))
-    assert column == [[7, 8, 9], [7, 8, 9]]
-    assert row == [[2**32 - 1] * 3, [0] * 3]
+    regions = [Roi(-1, 7, 2, 3), Roi(4, -1, 2, 1)]
+    column, row = (index.numpy().tolist() for index in pixel_indices(regions[:1]))
+    assert column == [7, 8, 9, 7, 8, 9]
+    assert row == [2**32 - 1] * 3 + [0] * 3
+    columns, rows = (index.numpy().tolist() for index in pixel_indices(regions))
+    assert columns == [*column, 2**32 - 1, 2**32 - 1]
+    assert rows == [*row, 4, 5]

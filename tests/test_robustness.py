@@ -23,7 +23,8 @@ from estimator.io.device import Accelerometer, Camera, DecodedSpot, DeviceFrame,
 from estimator.io.estimates import EstimateRow
 from estimator.methods.catalogue import VARIANTS
 from estimator.spots.correspondences import find_correspondences
-from estimator.spots.detect import Readout, detect
+from estimator.spots.detect import detect
+from estimator.spots.led_light import Readout
 from vlcrender.dataset.generate import generate
 from vlcrender.dataset.recipe import load_plan
 

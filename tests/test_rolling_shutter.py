@@ -1,7 +1,7 @@
 """Rolling shutters: gains of lines against sums over time, the room's flicker, lines of a moving camera, bursts."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,6 +30,7 @@ from vlcrender.modulation.transmission import led_waves
 from vlcrender.modulation.wave import CosineWave, TwoLevelWave, Wave
 from vlcrender.rendering.crlb import position_bound_m2
 from vlcrender.rendering.expected_image import LedPatch, gain_in
+from vlcrender.rendering.led_slopes import Cameras
 from vlcrender.rendering.readout import RollingPoses
 from vlcrender.rendering.renderer import Renderer
 from vlcrender.scene.loader import Scene, load_scene
@@ -594,14 +595,22 @@ def test_the_bound_of_striped_leds_is_that_of_their_lit_lines(tmp_path: Path) ->
         gains = LineGains(waves, starts_s, exposure_s)
         renderer = Renderer(plan.scene)
 
-        def striped(posed: PosedCamera, gains: LineGains = gains, renderer: Renderer = renderer) -> list[LedPatch]:
-            return [
-                replace(
-                    patch,
-                    electrons_per_s=patch.electrons_per_s * gains[patch.led_id][patch.row : patch.roi.end_row],
+        def striped(
+            posed: PosedCamera,
+            changes: Sequence[Cameras],
+            gains: LineGains = gains,
+            renderer: Renderer = renderer,
+        ) -> tuple[tuple[LedPatch, ...], ...]:
+            return tuple(
+                tuple(
+                    replace(
+                        patch,
+                        electrons_per_s=patch.electrons_per_s * gains[patch.led_id][patch.row : patch.roi.end_row],
+                    )
+                    for patch in patches
                 )
-                for patch in renderer.led_patches(posed)
-            ]
+                for patches in renderer.led_slopes(posed, changes)
+            )
 
         variance = RegionImage(Roi.of_sensor(mounted.camera), pixels(tmp_path / f"set/expected/{number:06d}.exr"))
         distance_m = float(np.median(np.linalg.norm(plan.scene.leds.centers_m - row.position_m, axis=1)))

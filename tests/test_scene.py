@@ -14,6 +14,7 @@ from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.config.toml_model import RENAMED_KEYS, check
 from vlcrender.errors import InputError
+from vlcrender.scene.leds import Leds, _neighbours
 from vlcrender.scene.loader import Scene, build_scene, load_scene
 from vlcrender.scene.schema import SceneSettings
 from vlcrender.scene.visibility import leds_in_view, level_visibility
@@ -276,3 +277,27 @@ def test_leds_in_descending_order_of_id_keep_their_own_values() -> None:
     assert behind.foot_m == (3.0, 3.0)
     assert (behind.distance_m, behind.order) == (0.07, leds.orders[1])
     assert behind.area_m2 == pytest.approx(np.pi * 0.02**2)
+
+
+def test_every_pair_of_leds_that_overlap_is_looked_at() -> None:
+    """LEDs of very different sizes at random places, against all pairs."""
+    rng, count = np.random.default_rng(3), 1300
+    centers = rng.uniform(0, (30.0, 20.0, 0.2), (count, 3))
+    half_widths = np.where(rng.uniform(size=count) < 0.02, 0.8, 0.05)
+    even = {"face_gradients": np.zeros((count, 2)), "face_falloffs": np.ones(count)}
+    leds = Leds(
+        np.arange(count),
+        centers,
+        half_widths,
+        np.ones(count),
+        np.ones(count),
+        np.zeros(count, bool),
+        (None,) * count,
+        **even,
+    )
+    apart = np.linalg.norm(centers[:, None] - centers, axis=2)
+    overlap = np.argwhere(np.triu(apart < half_widths[:, None] + half_widths, 1))
+    found = [(int(i), int(j)) for one, other in _neighbours(leds) for i, j in zip(one, other, strict=True)]
+    assert len(overlap) > 100
+    assert set(map(tuple, overlap.tolist())) <= set(found)
+    assert len(set(found)) == len(found) < count**2 / 8

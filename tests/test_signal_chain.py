@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from vlcrender.camera.roi import RegionImage, Roi
 from vlcrender.sensor.sensor import Sensor
-from vlcrender.sensor.signal_chain import expose, variance_e2
+from vlcrender.sensor.signal_chain import expose, expose_regions, variance_e2
 
 ROWS, COLUMNS = 500, 800
 N = ROWS * COLUMNS
@@ -260,6 +261,19 @@ def test_a_region_gets_the_noise_of_the_whole_frame(rng: np.random.Generator) ->
     assert np.array_equal(part, frame[20:31, 5:70])
     beyond = expose(EVERYTHING, np.pad(means, 7, mode="edge"), "frame", -7, -7, exposure_s=0.1)
     assert np.array_equal(beyond[7:-7, 7:-7], frame)
+
+
+@pytest.mark.parametrize("noise", ["full", "shot", "none"])
+def test_several_regions_get_the_noise_of_the_whole_frame(rng: np.random.Generator, noise: str) -> None:
+    sensor = EVERYTHING.model_copy(update={"noise": noise})
+    means = rng.uniform(0, 3000, (60, 80)).astype(np.float32)
+    frame = RegionImage(Roi(0, 0, 60, 80), expose(sensor, means, "frame", exposure_s=0.1))
+    rois = [Roi(20, 5, 11, 65), Roi(2, 3, 1, 2), Roi(40, 70, 20, 10)]
+    parts = [RegionImage(roi, means[frame.roi.slices(roi)]) for roi in rois]
+    exposed = expose_regions(sensor, parts, "frame", exposure_s=0.1)
+    assert [roi for roi, _ in exposed] == rois
+    for roi, image in exposed:
+        assert np.array_equal(image, frame.image[frame.roi.slices(roi)])
 
 
 @pytest.mark.slow

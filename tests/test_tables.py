@@ -9,6 +9,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from vlcrender.dataset import tables
 from vlcrender.dataset.schema import (
     FRAMES_SCHEMA,
     TRUTH_SCHEMA,
@@ -194,12 +195,22 @@ def test_a_table_that_cannot_be_written_leaves_the_old_one(
     path = tmp_path / "frames.parquet"
     path.write_bytes(b"old")
 
-    def full(_table: object, partial: Path) -> None:
-        partial.write_bytes(b"half")
+    def full(writer: pq.ParquetWriter, _table: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(pq, "write_table", full)
+    monkeypatch.setattr(pq.ParquetWriter, "write_table", full)
     with pytest.raises(InputError, match=r"frames\.parquet: cannot be written: No space left on device"):
         write_table(path, [record(rng, bound=True).device], FrameRow)
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("count", [0, 1, 3, 4])
+def test_a_table_of_several_groups_holds_all_rows_in_order(
+    count: int, tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tables, "ROWS_AT_ONCE", 2)
+    rows = [record(rng, bound=True).truth for _ in range(count)]
+    write_table(tmp_path / "truth.parquet", iter(rows), TruthRow)
+    assert read_table(tmp_path / "truth.parquet", TruthRow) == rows
+    assert pq.ParquetFile(tmp_path / "truth.parquet").num_row_groups == (count + 1) // 2

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.posed_camera import PosedCamera
-from vlcrender.camera.roi import LedRegions, Roi
+from vlcrender.camera.roi import LedRegions, RegionImage, Roi
 from vlcrender.config.packaged import find_file
 from vlcrender.errors import InputError
 from vlcrender.rendering.expected_image import ExpectedImage, Gain, Gains, Image
@@ -233,7 +233,7 @@ def expose(
     from vlcrender.core.random_keys import random_key, stream
     from vlcrender.dataset.downlink import decoded_spots
     from vlcrender.sensor.accelerometer import TiltError
-    from vlcrender.sensor.signal_chain import expose as digital_numbers
+    from vlcrender.sensor.signal_chain import expose_regions
 
     exposure_s = float(exposure_s)
     if not (isfinite(exposure_s) and 0 < exposure_s <= MAX_EXPOSURE_S):
@@ -251,20 +251,8 @@ def expose(
     device = accelerometer or TiltError()
     noise = random_key(int(seed), int(frame), "shot-noise")
     gains, room_gain = _gains(mean, exposure_s, int(seed), start_s)
-    parts = tuple(
-        RawRegion(
-            part.roi,
-            digital_numbers(
-                sensor,
-                part.expected_electrons(exposure_s, gains, room_gain),
-                noise,
-                part.roi.row,
-                part.roi.column,
-                exposure_s=exposure_s,
-            ),
-        )
-        for part in mean.parts
-    )
+    expected = [RegionImage(part.roi, part.expected_electrons(exposure_s, gains, room_gain)) for part in mean.parts]
+    parts = tuple(RawRegion(*part) for part in expose_regions(sensor, expected, noise, exposure_s=exposure_s))
     spots: tuple[SpotRow, ...] = ()
     if demodulation == "given":
         spots = decoded_spots(mean.parts, mean.camera.width_px, stream(int(seed), int(frame), "demodulator"))

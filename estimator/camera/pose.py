@@ -1,10 +1,10 @@
 """Pose of a camera, and rotations by the tilts and yaw of the format (datasets/FORMAT.md, Tilt)."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from estimator.io.device import Camera
 
@@ -14,15 +14,33 @@ POSE_PARAMETERS = 6
 """Position x, y, z in metres, then the rig's tilt_x, tilt_y and yaw in radians: order of all pose derivatives."""
 
 
+# Cosine of tilt_y below which tilt_x and yaw turn about one axis, to rounding.
+MIN_COSINE = 1e-7
+
+
 def rotation(tilt_x: float, tilt_y: float, yaw: float = 0.0) -> Floats:
     """`Rx(tilt_x) Ry(tilt_y) Rz(yaw)`, (3, 3), for angles in radians."""
-    # The format turns the axes, SciPy the points: opposite signs.
-    return np.asarray(Rotation.from_euler("XYZ", [-tilt_x, -tilt_y, -yaw]).as_matrix(), dtype=np.float64)
+    (sx, cx), (sy, cy), (sz, cz) = ((math.sin(angle), math.cos(angle)) for angle in (tilt_x, tilt_y, yaw))
+    return np.array(
+        [
+            [cy * cz, cy * sz, -sy],
+            [sx * sy * cz - cx * sz, sx * sy * sz + cx * cz, sx * cy],
+            [cx * sy * cz + sx * sz, cx * sy * sz - sx * cz, cx * cy],
+        ]
+    )
 
 
 def rotation_angles(matrix: Floats) -> Floats:
-    """The (tilt_x, tilt_y, yaw) of a rotation matrix (3, 3), radians: the inverse of `rotation`."""
-    return np.asarray(-Rotation.from_matrix(matrix).as_euler("XYZ"), dtype=np.float64)
+    """The (tilt_x, tilt_y, yaw) of a rotation matrix (3, 3), radians: the inverse of `rotation`.
+
+    With a tilt_y of 90 deg the matrix determines the difference of tilt_x and yaw alone, or their sum: yaw is then 0.
+    """
+    (xx, xy, xz), (_, yy, yz), (_, zy, zz) = matrix.tolist()
+    cos_tilt_y = math.hypot(yz, zz)
+    tilt_y = math.atan2(-xz, cos_tilt_y)
+    if cos_tilt_y < MIN_COSINE:
+        return np.array([math.atan2(-zy, yy), tilt_y, 0.0])
+    return np.array([math.atan2(yz, zz), tilt_y, math.atan2(xy, xx)])
 
 
 @dataclass(frozen=True, eq=False)

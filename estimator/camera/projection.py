@@ -162,15 +162,13 @@ def _distorted(plane: Floats, distortion: Distortion) -> tuple[Floats, Floats]:
 class ProjectedPoints:
     """Images of n points: `pixels` (n, 2), NaN outside the lens's valid range; `slopes` (n, 2, 6) by the pose.
 
-    `p_cam` (n, 3) are the points in camera axes, metres. `relative_illumination` (n,) is the irradiance of the sensor
-    there by a surface of uniform luminance, up to a factor common to the whole sensor. `motion_slopes` (n, 2, 6) are
-    the derivatives by the velocity of a camera with a rolling shutter; None without.
+    `p_cam` (n, 3) are the points in camera axes, metres. `motion_slopes` (n, 2, 6) are the derivatives by the velocity
+    of a camera with a rolling shutter; None without.
     """
 
     pixels: Floats
     slopes: Floats
     p_cam: Floats
-    relative_illumination: Floats
     motion_slopes: Floats | None = None
 
 
@@ -186,29 +184,22 @@ def project(points_m: Floats, pose: Pose, camera: Camera) -> ProjectedPoints:
     for column, rotation_slope in enumerate(rotation_slopes(pose, camera), start=3):
         rotated = offset @ rotation_slope.T
         slopes[:, :, column] = (to_pixels * rotated[:, None]).sum(axis=2)
-    return ProjectedPoints(camera.to_pixels(image), slopes, p_cam, relative_illumination_of(p_cam, jacobian))
+    return ProjectedPoints(camera.to_pixels(image), slopes, p_cam)
 
 
 def relative_illumination(pixels: Floats, camera: Camera) -> Floats:
     """Irradiance (n,) of the sensor at pixels (n, 2) by a surface of uniform luminance, up to a common factor.
 
-    NaN outside the lens's valid range. At the image of a point it equals `ProjectedPoints.relative_illumination`.
+    NaN outside the lens's valid range. It is cos(theta), by which the pupil is foreshortened, times the solid angle
+    that an area of the sensor subtends: 1 / |(m1 x m2) . p| with the rows m1, m2 of the projection's Jacobian at the
+    unit vector p. For a pinhole the product is cos^4(theta).
     """
     projection = projection_of(camera)
     rays = projection.unproject(camera.normalized(pixels))
-    return relative_illumination_of(rays, projection.project(rays)[1])
-
-
-def relative_illumination_of(p_cam: Floats, jacobian: Floats) -> Floats:
-    """cos(theta), by which the pupil is foreshortened, times the solid angle that an area of the sensor subtends.
-
-    With the rows m1, m2 of the Jacobian, an area across the ray is magnified by (m1 x m2) . p / |p|, and a solid angle
-    is area over |p|^2. For a pinhole this is cos^4(theta).
-    """
-    distance = np.linalg.norm(p_cam, axis=1)
+    jacobian = projection.project(rays)[1]
     with np.errstate(all="ignore"):
-        area = np.abs((np.cross(jacobian[:, 0], jacobian[:, 1]) * p_cam).sum(axis=1)) * distance
-        return np.asarray(np.maximum(p_cam[:, 2], 0.0) / distance / area)
+        area = np.abs((np.cross(jacobian[:, 0], jacobian[:, 1]) * rays).sum(axis=1))
+        return np.asarray(np.maximum(rays[:, 2], 0.0) / area)
 
 
 def rotation_slopes(pose: Pose, camera: Camera) -> tuple[Floats, Floats, Floats]:

@@ -15,7 +15,6 @@ from estimator.camera.projection import (
     ProjectedPoints,
     project,
     projection_of,
-    relative_illumination_of,
     rotation_slopes,
 )
 from estimator.io.device import Camera
@@ -62,6 +61,5 @@ def project_rolling(points_m: Floats, pose: Pose, camera: Camera, velocity: Floa
         camera.to_pixels(image),
         slopes[:, :, :POSE_PARAMETERS],
         seen.p_cam,
-        relative_illumination_of(seen.p_cam, jacobian),
         slopes[:, :, POSE_PARAMETERS:],
     )

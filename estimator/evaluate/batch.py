@@ -16,6 +16,7 @@ from estimator.io.dataset import Dataset, FrameRecord, read_frame
 from estimator.io.device import DeviceFrame, Identity, Led
 from estimator.io.estimates import EstimateRow, LedRange
 from estimator.io.records import MAX_NUMBER, is_covariance
+from estimator.io.shared import SharedResults
 from estimator.methods.variant import DeviceMethod, Estimate, Variant
 from estimator.receiver.receive import receive_frames
 
@@ -114,14 +115,16 @@ def estimate_burst(dataset: Dataset, records: Sequence[FrameRecord], variants: S
     """Rows for the frames of one burst, or shot, and the frames observed for variants that use all of a device.
 
     Where identities are not given, the frames of each camera are received together, and a frame's share of that time
-    counts as its own.
+    counts as its own. Variants share what they compute alike of an image, such as its spots.
     """
-    read = [(record, _read(dataset, record)) for record in records]
+    shared = SharedResults()
+    read = [(record, _read(dataset, record, shared)) for record in records]
     time_s = 0.0
     if receives(dataset):
         start = time.perf_counter()
         read = _received(read)
         time_s = (time.perf_counter() - start) / len(read)
+        shared.settle()
     result = ShotResult({}, {})
     for _, shot in groupby(read, lambda one: one[0].shot):
         _estimate_shot(result, tuple(shot), variants, dataset.leds, time_s)
@@ -186,7 +189,7 @@ def estimate_device(dataset: Dataset, observed: Mapping[str, Sequence[Observed]]
 
 
 def _observed(method: DeviceMethod, frame: DeviceFrame | EstimationFailure, record: FrameRecord) -> Observed:
-    start = time.perf_counter()
+    start = _now_s(frame)
     value: object | EstimationFailure = frame
     if isinstance(frame, DeviceFrame):
         try:
@@ -195,7 +198,7 @@ def _observed(method: DeviceMethod, frame: DeviceFrame | EstimationFailure, reco
             value = failure
         except (Exception, SystemExit) as error:
             value = _crash(error)
-    return Observed(record.frame, record.device, value, time.perf_counter() - start)
+    return Observed(record.frame, record.device, value, _now_s(frame) - start)
 
 
 def _solved(method: DeviceMethod, observed: Sequence[Observed], leds: Mapping[int, Led]) -> list[EstimateRow]:
@@ -232,7 +235,7 @@ def _crash(error: BaseException) -> EstimationFailure:
     return EstimationFailure("variant", f"crashed ({type(error).__name__})")
 
 
-def _read(dataset: Dataset, record: FrameRecord) -> DeviceFrame | EstimationFailure:
+def _read(dataset: Dataset, record: FrameRecord, shared: SharedResults) -> DeviceFrame | EstimationFailure:
     try:
         frame = read_frame(dataset, record, with_other_cameras=False)
     except InputError as error:
@@ -240,23 +243,30 @@ def _read(dataset: Dataset, record: FrameRecord) -> DeviceFrame | EstimationFail
     for part in frame.parts:
         # Variants share the image: one that changes it in place must fail.
         part.image_dn.setflags(write=False)
-    return frame
+    return replace(frame, shared=shared)
 
 
 def estimate_frame(variant: Variant, frame: DeviceFrame, index: int) -> EstimateRow:
     """Row of one variant for one frame; `time_s` is wall time from the digital numbers to the position.
 
+    What another variant of the frame has computed before, such as the spots, counts with the time that it took then.
     The frame fails on any exception, a result that is not an Estimate, numbers that are not finite, a covariance that
     is not positive definite, and a range to an LED that is not on the map.
     """
-    start = time.perf_counter()
+    start = _now_s(frame)
     try:
         estimate = variant.estimate(frame)
-        return _ok(index, estimate, frame.leds, time.perf_counter() - start)
+        return _ok(index, estimate, frame.leds, _now_s(frame) - start)
     except EstimationFailure as failure:
-        return _failed(index, failure, frame.leds, time.perf_counter() - start)
+        return _failed(index, failure, frame.leds, _now_s(frame) - start)
     except (Exception, SystemExit) as error:
-        return _failed(index, _crash(error), frame.leds, time.perf_counter() - start)
+        return _failed(index, _crash(error), frame.leds, _now_s(frame) - start)
+
+
+def _now_s(frame: DeviceFrame | EstimationFailure) -> float:
+    """Wall time, to which results found in place of computed ones add the time that they took."""
+    shared = frame.shared if isinstance(frame, DeviceFrame) else None
+    return time.perf_counter() + (0.0 if shared is None else shared.spared_s)
 
 
 def _ok(index: int, estimate: object, leds: Mapping[int, Led], time_s: float) -> EstimateRow:

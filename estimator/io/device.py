@@ -2,9 +2,9 @@
 
 import json
 from abc import abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal, Protocol, Self
+from typing import Annotated, Any, Literal, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,9 +23,11 @@ from estimator.io.records import (
     Triple,
     first_problem,
 )
+from estimator.io.shared import SharedResults
 from estimator.io.shutter import GLOBAL, Gyroscope, Shutter
 
 Floats = NDArray[np.float64]
+T = TypeVar("T")
 
 MAX_SENSOR_AREAS = 16
 """Upper limit of the pixels in all regions of a frame, in sensor areas; regions may extend beyond the sensor."""
@@ -314,6 +316,11 @@ class Led(Row):
         """
 
     @property
+    def states_errors(self) -> bool:
+        """Whether the device states a standard deviation of the position, the size or the gradient."""
+        return not (self.sigma_m is None and self.size_sigma_m is None and self.gradient_sigma is None)
+
+    @property
     def shift_by_gradient_m(self) -> float:
         """Shift s^2 / r of the centre of the light by a gradient of 1, with the mean square extent s^2, metres."""
         return self.mean_square_extent_m2 / self.half_width_m if self.has_size else 0.0
@@ -549,6 +556,17 @@ class DeviceFrame:
     """What a receiver decoded; None where it has not been asked."""
     gains: Mapping[int, LineGains] = field(default_factory=dict)
     """Gain of an LED, by id, at each line, as its signal was decoded; without an entry an LED counts as steady."""
+    shared: SharedResults | None = None
+    """Results that the variants of the frame share; None where each computes its own."""
+
+    def once(self, key: tuple[Hashable, ...], compute: Callable[[], T]) -> T:
+        """Result of a computation on the frame's images, once for all variants; raises its EstimationFailure.
+
+        `key` names the computation and holds all that it uses beside `parts`, `camera` and `sensor`.
+        """
+        if self.shared is None:
+            return compute()
+        return self.shared.once((self.parts, self.camera, self.sensor, *key), compute)
 
     def electrons(self, part: Part) -> NDArray[np.float32]:
         """Electrons above the black level of a part, (rows, columns)."""

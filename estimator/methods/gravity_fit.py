@@ -10,13 +10,13 @@ consensus. With a rolling shutter the velocity of the camera is fitted as well, 
 motion as a prior (`estimator.solvers.shutter_motion`).
 """
 
+import weakref
 from collections.abc import Sequence
 from itertools import combinations, islice
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from estimator.camera.pose import Pose
 from estimator.io.device import DeviceFrame
@@ -47,14 +47,18 @@ def gravity_fit(frame: DeviceFrame, centroid_sigma_px: float = 0.0) -> Estimate:
 
     `centroid_sigma_px` is the standard deviation of centroids by errors that the device does not state.
     """
-    return fit_correspondences(frame, find_correspondences(frame), centroid_sigma_px)
+    observations = observe(frame, find_correspondences(frame), centroid_sigma_px)
+    return _estimate(agreement_of(frame, observations, centroid_sigma_px))
 
 
 def fit_correspondences(
     frame: DeviceFrame, correspondences: Sequence[Correspondence], centroid_sigma_px: float = 0.0
 ) -> Estimate:
     """The estimate from identified spots; of the frame, camera, accelerometer and map are used."""
-    agreed = agreement(observe(frame, correspondences, centroid_sigma_px))
+    return _estimate(agreement(observe(frame, correspondences, centroid_sigma_px)))
+
+
+def _estimate(agreed: Consensus) -> Estimate:
     return Estimate(agreed.best.pose.position_m, covariance_m2=agreed.covariance_m2, ambiguous=ambiguous(agreed))
 
 
@@ -66,6 +70,13 @@ def agreement(observations: Observations) -> Consensus:
 
     gravity_optional = determine_orientation(observations.leds_m)
     return consensus(observations, initial_poses(observations), more_starts, gravity_optional)
+
+
+def agreement_of(frame: DeviceFrame, observations: Observations, centroid_sigma_px: float = 0.0) -> Consensus:
+    """`agreement` of a frame's own spots, as observed with `centroid_sigma_px`, once for all variants of the frame."""
+    # The reference does not keep the frame, which holds the results, and no other frame equals it.
+    key = "agreement", weakref.ref(frame), centroid_sigma_px
+    return frame.once(key, lambda: agreement(observations))
 
 
 def ambiguous(agreed: Consensus) -> bool:
@@ -109,7 +120,7 @@ def _from_triples(observations: Observations) -> list[Pose]:
         except cv2.error:
             continue
         for vector, shift in zip(vectors, shifts, strict=True):
-            R_cam_world = np.asarray(Rotation.from_rotvec(vector.ravel()).as_matrix())
+            R_cam_world = cv2.Rodrigues(vector)[0]
             pose = Pose(-R_cam_world.T @ shift.ravel(), R_cam_world)
             offset = centroid_images(pose, observations.leds_m, observations.lift_m2)[0] - image
             error = float(np.minimum((offset**2).sum(axis=1), gate2).sum())

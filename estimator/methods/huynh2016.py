@@ -68,8 +68,7 @@ class Huynh2016:
 
     def __call__(self, frame: DeviceFrame) -> Estimate:
         """Denoise, detect, undistort, level, ranges, position. Raises EstimationFailure."""
-        denoiser, noise_e = DENOISERS[self.denoise], float(np.sqrt(frame.sensor.floor_e2()))
-        correspondences = find_correspondences(frame, lambda raw_e: denoiser.apply(raw_e, noise_e), denoiser.radius_px)
+        correspondences = find_correspondences(frame, DENOISERS[self.denoise])
         K, leds_m = frame.camera.matrix(), led_positions_m(correspondences)
         tilt = LEVELS[self.level](*tilt_from_gravity(frame.accelerometer_m_s2))
         level_px = level(pinhole_pixels(SPOTS[self.spot](correspondences), frame.camera), K, tilt)

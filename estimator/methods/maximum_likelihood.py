@@ -31,7 +31,7 @@ from scipy.stats import chi2
 from estimator.camera.pose import POSE_PARAMETERS, Pose
 from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame
-from estimator.methods.gravity_fit import agreement, ambiguous
+from estimator.methods.gravity_fit import agreement_of, ambiguous
 from estimator.methods.up2p import upright_pose
 from estimator.methods.variant import Estimate, Variant
 from estimator.pixels.initial import START_SIGMA_SHARE, Start, gravity_of, start_at_spots
@@ -122,7 +122,7 @@ def ml(frame: DeviceFrame) -> Estimate:
             raise EstimationFailure("position", "too few LEDs identified to fix a position")
         pose = fit(observations, upright).pose
     else:
-        agreed = agreement(observations)
+        agreed = agreement_of(frame, observations)
         pose, inliers = agreed.best.pose, agreed.inliers
         use_gravity, is_ambiguous, unchecked_m2 = agreed.gravity, ambiguous(agreed), agreed.unchecked_m2
         # The centroids of large LEDs have model errors of their own, which the pixels do not have.
@@ -201,7 +201,9 @@ def _revealed(frame: DeviceFrame, gravity: Gravity, priors: Priors, found: Maxim
     if found.model_is_wrong:
         return START_COMPONENTS
     state = result.nuisances.state(result.pose, frame.camera, priors.only(pixels.index))
-    rendered = pixels.model.render(state, np.arange(IMAGE_PARAMETERS))
+    # A shift of the principal point is one of the image.
+    shift, size = [POSE_PARAMETERS + 2, POSE_PARAMETERS + 3], [SIZE_PARAMETER]
+    rendered = pixels.model.render(state, np.array(shift + size))
     profile = result.nuisances.profile()
     photometry = fit_photometry(pixels, rendered, result.used, Noise.of(frame), result.photometry, profile)
     information, gradient = (one[result.used] for one in score(pixels, rendered, photometry, profile))
@@ -218,9 +220,7 @@ def _revealed(frame: DeviceFrame, gravity: Gravity, priors: Priors, found: Maxim
         total = np.einsum("ni,ni->", g, np.linalg.solve(spread, g[:, :, None])[:, :, 0]) + more
         return bool(total > chi2.isf(REVEALED_PROBABILITY, g.size + freedom))
 
-    # A shift of the principal point is one of the image.
-    shift = [POSE_PARAMETERS + 2, POSE_PARAMETERS + 3]
-    size, of_profile = [SIZE_PARAMETER], [IMAGE_PARAMETERS + k for k in range(PROFILE_PARAMETERS)]
+    of_profile = [IMAGE_PARAMETERS + k for k in range(PROFILE_PARAMETERS)]
     z = result.nuisances.standardized(had.added(priors).only(pixels.index))
     of_priors = gravity.deviance(result.pose.rig_angles(frame.camera)) + float(
         (z.camera**2).sum()

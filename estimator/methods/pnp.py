@@ -11,7 +11,6 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from estimator.camera.motion import turned_back
 from estimator.camera.pose import Pose
@@ -132,7 +131,7 @@ def candidates(model: Floats, image: Floats, method: int, refined: bool) -> list
         for vector, shift in zip(vectors, shifts, strict=True):
             if refined:
                 vector, shift = cv2.solvePnPRefineLM(model, image, eye, None, vector, shift, criteria)
-            poses.append((np.asarray(Rotation.from_rotvec(vector.ravel()).as_matrix()), shift.ravel()))
+            poses.append((cv2.Rodrigues(vector)[0], shift.ravel()))
     except cv2.error:
         return []
     return poses

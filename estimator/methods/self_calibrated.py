@@ -9,8 +9,9 @@ stated, and its spots show some), its camera has a rolling shutter, whose motion
 few of its spots agree with the device's other frames; the last is reported as ambiguous.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -18,11 +19,12 @@ from estimator.camera.leveling import MIN_TILT_SIGMA_DEG, tilt_from_gravity, til
 from estimator.camera.undistort import has_pinhole_image
 from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame
-from estimator.methods.gravity_fit import agreement, ambiguous
+from estimator.methods.gravity_fit import agreement, agreement_of, ambiguous
 from estimator.methods.variant import DeviceMethod, Estimate, Variant
-from estimator.solvers.observations import MIN_CENTROID_SIGMA_PX, observe
+from estimator.solvers.device_equations import DeviceView
+from estimator.solvers.observations import MIN_CENTROID_SIGMA_PX, Observations, observe
 from estimator.solvers.robust_fit import Consensus
-from estimator.solvers.self_calibration import DeviceView, adjust
+from estimator.solvers.self_calibration import adjust
 from estimator.spots.correspondences import centroids_px, find_correspondences
 from estimator.spots.identify import Correspondence
 
@@ -42,16 +44,20 @@ class FittedFrame:
 
 def fit_frame(frame: DeviceFrame) -> FittedFrame:
     """Fit a frame by itself; raises EstimationFailure."""
-    return fit_correspondences(frame, find_correspondences(frame))
+    return fit_correspondences(frame, find_correspondences(frame), partial(agreement_of, frame))
 
 
-def fit_correspondences(frame: DeviceFrame, correspondences: Sequence[Correspondence]) -> FittedFrame:
+def fit_correspondences(
+    frame: DeviceFrame,
+    correspondences: Sequence[Correspondence],
+    agree: Callable[[Observations], Consensus] = agreement,
+) -> FittedFrame:
     """The same from identified spots; of the frame, camera, accelerometer, luminaires and datum are used."""
     usable = has_pinhole_image(centroids_px(correspondences), frame.camera)
     if usable.any():
         correspondences = [one for one, use in zip(correspondences, usable, strict=True) if use]
     observations = observe(frame, correspondences)
-    agreed = agreement(observations)
+    agreed = agree(observations)
     estimate = Estimate(agreed.best.pose.position_m, covariance_m2=agreed.covariance_m2, ambiguous=ambiguous(agreed))
     model = agreed.model
     # The second: a focal length that nothing vouches for counts in the covariance of the frame alone.

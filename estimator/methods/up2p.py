@@ -23,7 +23,7 @@ from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame
 from estimator.methods.centroid_sigma import with_centroid_sigma
 from estimator.methods.variant import Estimate, Variant
-from estimator.solvers.observations import Observations, centroid_images, observe
+from estimator.solvers.observations import Observations, observe
 from estimator.solvers.robust_fit import consensus
 from estimator.solvers.trilateration import determine_orientation
 from estimator.spots.correspondences import find_correspondences
@@ -80,16 +80,21 @@ def _from_pairs(observations: Observations) -> list[Pose]:
         generator = np.random.Generator(np.random.Philox(key=len(pairs)))
         pairs = [pairs[k] for k in generator.choice(len(pairs), MAX_PAIRS, replace=False)]
     gate = GATE_SIGMA * float(observations.tilt_sigma_rad.max()) + GATE_PX * observations.camera.pixel_angle_rad
-    ranked: list[tuple[float, int, Pose]] = []
-    for pair in pairs:
-        found = poselib.up2p(level[list(pair)] @ Y_UP.T, observations.leds_m[list(pair)] @ Y_UP.T)
-        for upright in found:
+    level_up, leds_up = level @ Y_UP.T, observations.leds_m @ Y_UP.T
+    poses = []
+    for pair in map(list, pairs):
+        for upright in poselib.up2p(level_up[pair], leds_up[pair]):
             yaw = Y_UP.T @ upright.R @ Y_UP
-            pose = Pose(Y_UP.T @ upright.center(), tilt @ yaw)
-            image, depth = centroid_images(pose, observations.leds_m, observations.lift_m2)
-            error2 = np.where(depth > 0, ((image - observations.still_image) ** 2).sum(axis=1), np.inf)
-            ranked.append((float(np.minimum(error2, gate**2).sum()), len(ranked), pose))
-    return [pose for *_, pose in sorted(ranked, key=lambda one: one[:2])[:MAX_PAIR_STARTS]]
+            poses.append(Pose(Y_UP.T @ upright.center(), tilt @ yaw))
+    if not poses:
+        return []
+    # The eccentricity of centroids is far below the gate.
+    p_cam = np.stack([pose.in_camera(observations.leds_m) for pose in poses])
+    depth = p_cam[:, :, 2]
+    image = p_cam[:, :, :2] / np.where(depth > 0, depth, 1.0)[:, :, None]
+    error2 = np.where(depth > 0, ((image - observations.still_image) ** 2).sum(axis=2), np.inf)
+    order = np.minimum(error2, gate**2).sum(axis=1).argsort(kind="stable")
+    return [poses[k] for k in order[:MAX_PAIR_STARTS].tolist()]
 
 
 def upright_pose(observations: Observations) -> Pose | None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from estimator.photo.pictures import Picture
 from estimator.receiver.signal import Signal
 from estimator.receiver.tones import ToneFit, ToneMatch, band_hz, envelope_of, fit_tone, match_tone
-from estimator.spots.detect import Readout
+from estimator.spots.led_light import Readout
 from estimator.spots.striped import Lamp, find_lamps
 from estimator.spots.striped_blobs import Along
 

@@ -20,8 +20,9 @@ from estimator.photo.overlay import Mark
 from estimator.photo.pictures import Orientation, Picture, Tone, read_picture
 from estimator.photo.save import digital_numbers, photograph_sensor
 from estimator.photo.solve import Centre, Solved, solve
-from estimator.spots.detect import Readout, Spot, detect
+from estimator.spots.detect import Spot, detect
 from estimator.spots.identify import gate_px
+from estimator.spots.led_light import Readout
 from estimator.spots.striped_blobs import Along
 
 Floats = NDArray[np.float64]

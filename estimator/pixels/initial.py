@@ -29,6 +29,7 @@ from estimator.pixels.nuisances import (
     Solution,
     solve,
 )
+from estimator.solvers.observations import light_centres_m
 from estimator.spots.identify import Correspondence
 
 Floats = NDArray[np.float64]
@@ -96,8 +97,7 @@ def start_at_spots(
         camera = with_errors(frame.camera, nuisances.camera)
         points_m = of_spots.positions_m + nuisances.shifts_m(of_spots)
         offset_m = points_m - pose.position_m
-        # See `estimator.solvers.observations` on the eccentricity of a centroid.
-        points_m[:, 2] += lift_m2 * offset_m[:, 2] / (offset_m**2).sum(axis=1)
+        points_m = light_centres_m(points_m, lift_m2, pose.position_m)
         points_m[:, :2] += by_gradient_m[:, None] * nuisances.profile()[:, :2]
         images = nuisances.state(pose, frame.camera, of_spots).project(points_m)
         radius_px = np.sqrt(lift_m2) / np.linalg.norm(offset_m, axis=1) / camera.pixel_angle_rad

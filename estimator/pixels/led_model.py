@@ -75,6 +75,13 @@ class ImageState:
         """LEDs as in the map."""
         return ImageState(pose, camera, np.zeros((leds, 3)), np.ones(leds), np.zeros((leds, 2)))
 
+    def same_as(self, other: "ImageState") -> bool:
+        """Whether two states of the same LEDs give the same images."""
+        if self.pose is not other.pose or self.camera != other.camera:
+            return False
+        arrays = "shifts_m", "sizes", "tilts", "velocity"
+        return all(np.array_equal(getattr(self, name), getattr(other, name)) for name in arrays)
+
     def of(self, chosen: NDArray[np.bool_] | Ints) -> "ImageState":
         """The state of the chosen LEDs."""
         of_leds = self.shifts_m[chosen], self.sizes[chosen], self.tilts[chosen]
@@ -272,7 +279,7 @@ class LedImageModel:
         lens, factors = self._lens, self._lens.factors[self._led, None]
         offsets_m = state.of(self._led).rims_m(self._rims_m[:, None])[:, 0]
         rims = state.project(self._centres_m[self._led] + state.shifts_m[self._led] + offsets_m)
-        slopes = _slopes(rims, offsets_m, state.camera)[:, :, parameters]
+        slopes = _slopes(rims, offsets_m, state.camera, parameters)
         outlines = Outlines(rims.pixels * factors, self._following, self._led, slopes * factors[:, None])
         covered, pieces = cover(self._fine, outlines)
         light = covered * self._fine_fall_off
@@ -282,22 +289,21 @@ class LedImageModel:
         return RenderedLeds(light, parameters, self.rois, pieces, lens)
 
 
-def _slopes(rims: ProjectedPoints, offsets_m: Floats, camera: Camera) -> Floats:
-    """Derivatives (n, 2, p) of points of rims by the IMAGE_PARAMETERS; `offsets_m` (n, 3) are from their centres.
-
-    With a rolling shutter the MOTION_COLUMNS follow, behind empty ones of the profile.
-    """
-    slopes = np.zeros((len(offsets_m), 2, IMAGE_PARAMETERS))
-    slopes[:, :, :POSE_PARAMETERS] = rims.slopes
-    slopes[:, :, POSE_PARAMETERS:-FACE_PARAMETERS] = intrinsic_slopes_px(
-        rims.p_cam, camera.normalized(rims.pixels), camera
-    )
+def _slopes(rims: ProjectedPoints, offsets_m: Floats, camera: Camera, parameters: Ints) -> Floats:
+    """Derivatives (n, 2, p) of points of rims by parameters (p,); `offsets_m` (n, 3) are from their LEDs' centres."""
     # A point of the face moves its image as much as the camera moves it by the opposite way.
-    slopes[:, :, -FACE_PARAMETERS] = -np.einsum("nij,nj->ni", rims.slopes[:, :, :3], offsets_m)
-    slopes[:, :, -FACE_PARAMETERS + 1 :] = -rims.slopes[:, :, 2:3] * offsets_m[:, None, :2]
-    if rims.motion_slopes is None:
-        return slopes
-    return np.concatenate([slopes, np.zeros((len(slopes), 2, PROFILE_PARAMETERS)), rims.motion_slopes], axis=2)
+    by_size = -np.einsum("nij,nj->ni", rims.slopes[:, :, :3], offsets_m)[:, :, None]
+    by_tilts = -rims.slopes[:, :, 2:3] * offsets_m[:, None, :2]
+    blocks = {0: rims.slopes, SIZE_PARAMETER: by_size, SIZE_PARAMETER + 1: by_tilts}
+    if ((parameters >= POSE_PARAMETERS) & (parameters < SIZE_PARAMETER)).any():
+        blocks[POSE_PARAMETERS] = intrinsic_slopes_px(rims.p_cam, camera.normalized(rims.pixels), camera)
+    if rims.motion_slopes is not None:
+        blocks[LOCAL_PARAMETERS] = rims.motion_slopes
+    slopes = np.zeros((len(offsets_m), 2, len(parameters)))
+    for first, block in blocks.items():
+        wanted = (parameters >= first) & (parameters < first + block.shape[2])
+        slopes[:, :, wanted] = block[:, :, parameters[wanted] - first]
+    return slopes
 
 
 def _blurred(image: Floats, fine: RoiStack, rois: RoiStack, lens: LensBlur, kernels: Sequence[Floats]) -> Floats:

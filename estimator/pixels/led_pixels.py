@@ -9,6 +9,7 @@ the gain of the pixel's line, as decoded (`DeviceFrame.gains`). Its blocks are o
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -91,7 +92,7 @@ class LedPixels:
     more: bool
     gains: "ReadingGains | None" = None
 
-    @property
+    @cached_property
     def group(self) -> Ints:
         """Group of each reading, (m,)."""
         return np.repeat(np.arange(len(self.led)), np.diff(self.starts))
@@ -175,7 +176,7 @@ def gather_led_pixels(frame: DeviceFrame, view: LedsInView, parameters: Ints = P
     with np.errstate(all="ignore"):
         shares = [np.nan_to_num(rois.roi(rendered.light, k) / fall_offs[k]) for k in range(len(leds))]
     masks = [_edge_and_lit(share) for share in shares]
-    readings = [_readings(frame, rois, k) for k in range(len(leds))]
+    readings = _readings(frame, rois)
     saturated = np.array([_mostly_saturated(share, known) for share, (_, known) in zip(shares, readings, strict=True)])
     groups: list[_Readings] = []
     led_of_group: list[int] = []
@@ -183,8 +184,10 @@ def gather_led_pixels(frame: DeviceFrame, view: LedsInView, parameters: Ints = P
         electrons, known = readings[k]
         if saturated[k] and not saturated.all():
             continue
-        for other in rois.overlapping(k):
-            own_slices, other_slices = rois.intersection(k, other)
+        for other in rois.meeting(rois, k):
+            if other == k:
+                continue
+            own_slices, other_slices = rois.intersection(k, rois, other)
             known[own_slices] &= ~masks[other].lit[other_slices]
         rows = np.arange(rois.rows[k], rois.rows[k] + rois.heights[k])[:, None]
         columns = np.arange(rois.columns[k], rois.columns[k] + rois.widths[k])
@@ -381,21 +384,20 @@ def _edge_and_lit(share: Floats) -> _Masks:
     return _Masks(edge, near_lit, near)
 
 
-def _readings(frame: DeviceFrame, rois: RoiStack, k: int) -> tuple[Floats, Mask]:
-    """Electrons in region k, (rows, columns), and which of them are known: read out and not saturated."""
-    top, left = int(rois.rows[k]), int(rois.columns[k])
-    bottom, right = top + int(rois.heights[k]), left + int(rois.widths[k])
-    electrons, known = np.zeros((bottom - top, right - left)), np.zeros((bottom - top, right - left), dtype=bool)
-    for part in frame.parts:
-        height, width = part.image_dn.shape
-        v0, v1 = max(top, part.row), min(bottom, part.row + height)
-        u0, u1 = max(left, part.column), min(right, part.column + width)
-        if v0 < v1 and u0 < u1:
-            piece = Part(v0, u0, part.image_dn[v0 - part.row : v1 - part.row, u0 - part.column : u1 - part.column])
-            target = np.s_[v0 - top : v1 - top, u0 - left : u1 - left]
+def _readings(frame: DeviceFrame, rois: RoiStack) -> list[tuple[Floats, Mask]]:
+    """Electrons in each region, (rows, columns), and which of them are known: read out and not saturated."""
+    shapes = zip(rois.heights.tolist(), rois.widths.tolist(), strict=True)
+    readings = [(np.zeros(shape), np.zeros(shape, dtype=bool)) for shape in shapes]
+    first = np.array([(part.row, part.column) for part in frame.parts])
+    parts = RoiStack(*first.T, *np.array([part.image_dn.shape for part in frame.parts]).T)
+    for k, (electrons, known) in enumerate(readings):
+        for number in parts.meeting(rois, k):
+            part = frame.parts[number]
+            source, target = parts.intersection(number, rois, k)
+            piece = Part(0, 0, part.image_dn[source])
             electrons[target] = frame.electrons(piece)
             known[target] = ~frame.clipped(piece)
-    return electrons, known
+    return readings
 
 
 def _mostly_saturated(share: Floats, known: Mask) -> bool:

@@ -18,6 +18,7 @@ With `sensor.noise` "full" the variance is shot noise plus the data sheet's dark
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,7 @@ from estimator.pixels.led_model import IMAGE_PARAMETERS, LOCAL_PARAMETERS, PROFI
 from estimator.pixels.led_pixels import LedPixels
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 # Expected distance from saturation, in standard deviations, below which a pixel is not used. The expectation decides,
@@ -123,35 +125,31 @@ def fit_photometry(
     weight = of_used_led / n if before is None else before.weight
     level = np.maximum.reduceat(y / n, pixels.starts[:-1]) if before is None else before.level
     count = COEFFICIENTS if phase is None else COEFFICIENTS + 1
-    pairs = [(i, j) for i in range(count) for j in range(i, count)]
-    normal = np.zeros((len(pixels.led), count, count))
     basis = np.column_stack([pixels.background, light])
-    products = _products(basis, y, pairs) if phase is None else np.zeros((0, 0))
     # Without variances of a previous fit, iterate: the first weights are a guess.
     for _ in range(3 if before is None else 1):
         if pixels.gains is not None and phase is not None:
             gain, by_phase = pixels.gains.at(phase)
             basis = np.column_stack([pixels.background, light * gain, light * by_phase])
-            products = _products(basis, y, pairs)
-        sums = pixels.sum_by_group(products * weight)
-        for (i, j), values in zip(pairs, sums, strict=False):
-            normal[:, i, j] = normal[:, j, i] = values
+        normal, right = _normal_equations(pixels.starts, basis, y, weight)
         of_background, of_light = normal[:, 0, 0], normal[:, AMPLITUDE, AMPLITUDE]
         determinant = of_background * of_light - normal[:, 0, AMPLITUDE] ** 2
         determined = determinant > MIN_DETERMINANT * of_background * of_light
         prior = np.maximum(np.outer(level, BACKGROUND_SIGMAS), MIN_VARIANCE_E2) ** -2.0
-        total = normal.copy()
         slopes = range(1, AMPLITUDE)
-        total[:, slopes, slopes] += prior
+        normal[:, slopes, slopes] += prior
         if phase is not None:
             # The prior is that of the phase, of which the coefficient changes `phase` by its ratio to the amplitude.
             bright = np.maximum(level if before is None else before.amplitude, MIN_VARIANCE_E2)
             of_phase = (PHASE_SIGMA_LINES * bright) ** -2.0
-            total[:, -1, -1] += of_phase
-            sums[len(pairs) + count - 1] -= of_phase * bright * phase
-        total[~determined] = np.eye(count)
-        covariance = _inverse(total) * determined[:, None, None]
-        coefficients = np.einsum("gij,jg->gi", covariance, sums[len(pairs) :])
+            normal[:, -1, -1] += of_phase
+            right[:, -1] -= of_phase * bright * phase
+        normal[~determined] = np.eye(count)
+        # Few unsaturated pixels may determine background and amplitude, and not the background's slopes beside them.
+        determined &= np.linalg.det(_of_equal_size(normal)[0]) > MIN_DETERMINANT
+        normal[~determined] = np.eye(count)
+        covariance = _inverse(normal) * determined[:, None, None]
+        coefficients = np.einsum("gij,gj->gi", covariance, right)
         expected = np.einsum("mi,mi->m", basis, coefficients[group])
         per_pixel = np.maximum(expected / n, 0.0)
         variance = np.maximum(per_pixel + noise.dark_e2 + noise.prnu2 * per_pixel**2, MIN_VARIANCE_E2)
@@ -165,7 +163,8 @@ def fit_photometry(
     amplitude = coefficients[:, AMPLITUDE]
     sigma = np.sqrt(covariance[:, AMPLITUDE, AMPLITUDE])
     signal_to_noise = np.divide(amplitude, sigma, out=np.zeros_like(sigma), where=sigma > 0)
-    deviance = _mean_deviance(y[weight > 0], expected[weight > 0], n[weight > 0] * noise.dark_e2)
+    weighed = weight > 0
+    deviance = _mean_deviance(y[weighed], expected[weighed], n[weighed] * noise.dark_e2)
     return PhotometricFit(
         basis,
         amplitude,
@@ -181,15 +180,25 @@ def fit_photometry(
     )
 
 
-def _products(basis: Floats, y: Floats, pairs: list[tuple[int, int]]) -> Floats:
-    """Products (p + c, m) of pairs of the c columns of a basis (m, c), and of each column with y (m,)."""
-    return np.stack([basis[:, i] * basis[:, j] for i, j in pairs] + [column * y for column in basis.T])
+def _normal_equations(starts: Ints, basis: Floats, y: Floats, weight: Floats) -> tuple[Floats, Floats]:
+    """Normal equations (g, c, c) and right-hand sides (g, c) of readings (m,) by a basis (m, c), weighted (m,)."""
+    columns = np.column_stack([basis, y])
+    weighted = columns * weight[:, None]
+    bounds = pairwise(starts.tolist())
+    products = np.stack([weighted[first:end].T @ columns[first:end] for first, end in bounds])
+    return products[:, :-1, :-1], products[:, :-1, -1]
 
 
 def _inverse(matrices: Floats) -> Floats:
-    """Inverses of positive definite matrices (n, k, k), with parameters scaled to equal size."""
+    """Inverses of positive definite matrices (n, k, k)."""
+    scaled, scale = _of_equal_size(matrices)
+    return np.asarray(np.linalg.inv(scaled) * scale[:, :, None] * scale[:, None])
+
+
+def _of_equal_size(matrices: Floats) -> tuple[Floats, Floats]:
+    """Positive definite matrices (n, k, k) with parameters scaled to a diagonal of ones, and the scales (n, k)."""
     scale = 1 / np.sqrt(np.diagonal(matrices, axis1=1, axis2=2))
-    return np.asarray(np.linalg.inv(matrices * scale[:, :, None] * scale[:, None]) * scale[:, :, None] * scale[:, None])
+    return np.asarray(matrices * scale[:, :, None] * scale[:, None]), np.asarray(scale)
 
 
 def _mean_deviance(electrons: Floats, expected: Floats, dark_e2: Floats) -> float:

@@ -72,16 +72,18 @@ class Priors:
         camera = np.zeros(CAMERA_PARAMETERS)
         if uncertainty is not None:
             camera = np.hypot(uncertainty.device_sigmas(), uncertainty.shot_sigmas())
-        ids = [key for key in frame.luminaires if any(led.luminaire == key for led in leds)]
+        hung = {led.luminaire for led in leds}
+        ids = [key for key in frame.luminaires if key in hung]
         stated = [frame.luminaires[one] for one in ids]
         rows = [one.sigmas() for one in stated]
         index = {one: k for k, one in enumerate(ids)}
         own = np.zeros((len(leds), LED_PARAMETERS))
         for k, led in enumerate(leds):
-            sigmas = led.sigmas()
-            own[k, :3] = sigmas[:3]
-            own[k, SIZE] = sigmas[3] / led.half_width_m
-            own[k, PROFILE][:2] = sigmas[4:]
+            if led.states_errors:
+                sigmas = led.sigmas()
+                own[k, :3] = sigmas[:3]
+                own[k, SIZE] = sigmas[3] / led.half_width_m
+                own[k, PROFILE][:2] = sigmas[4:]
         motion = motion_prior(frame)
         of_luminaire = np.array(rows).reshape(-1, LUMINAIRE_PARAMETERS)
         if own[:, :3].any() or of_luminaire.any():

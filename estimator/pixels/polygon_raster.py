@@ -58,22 +58,27 @@ class RoiStack:
             self.starts()[roi] + (row - self.rows[roi]) * (self.widths[roi] + 1) + column - self.columns[roi]
         )
 
-    def overlapping(self, k: int) -> list[int]:
-        """Other regions that share pixels with region k."""
-        bottom, right = self.rows + self.heights, self.columns + self.widths
-        overlaps = (self.rows < bottom[k]) & (bottom > self.rows[k])
-        overlaps &= (self.columns < right[k]) & (right > self.columns[k])
-        overlaps[k] = False
+    def meeting(self, others: "RoiStack", k: int) -> list[int]:
+        """Regions of this stack that share pixels with region k of another."""
+        top, left = others.rows[k], others.columns[k]
+        overlaps = (self.rows < top + others.heights[k]) & (self.rows + self.heights > top)
+        overlaps &= (self.columns < left + others.widths[k]) & (self.columns + self.widths > left)
         return list(map(int, np.flatnonzero(overlaps)))
 
-    def intersection(self, k: int, other: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-        """The pixels that two regions share, as (rows, columns) slices of each."""
-        slices = []
-        for first, sizes in ((self.rows, self.heights), (self.columns, self.widths)):
-            low = max(first[k], first[other])
-            high = min(first[k] + sizes[k], first[other] + sizes[other])
-            slices.append([slice(int(low - first[i]), int(high - first[i])) for i in (k, other)])
-        return (slices[0][0], slices[1][0]), (slices[0][1], slices[1][1])
+    def intersection(self, k: int, others: "RoiStack", other: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+        """The pixels that region k shares with one of another stack, as (rows, columns) slices of each."""
+        own, its = self._spans(k), others._spans(other)
+        shared = [(max(a[0], b[0]), min(a[1], b[1])) for a, b in zip(own, its, strict=True)]
+        (rows, columns), (other_rows, other_columns) = (
+            [slice(low - span[0], high - span[0]) for span, (low, high) in zip(spans, shared, strict=True)]
+            for spans in (own, its)
+        )
+        return (rows, columns), (other_rows, other_columns)
+
+    def _spans(self, k: int) -> tuple[tuple[int, int], tuple[int, int]]:
+        """First row and the row after the last of region k, and its columns."""
+        top, left = int(self.rows[k]), int(self.columns[k])
+        return (top, top + int(self.heights[k])), (left, left + int(self.widths[k]))
 
 
 @dataclass(frozen=True, eq=False)

@@ -122,7 +122,8 @@ class Search:
     def run(self, used: Mask, pose: Pose, nuisances: Nuisances, components: Components) -> ScoringResult:
         """Scoring with the LEDs used, (n,), to convergence or until the images leave the gathered pixels."""
         pixels, camera = self._pixels, self._camera
-        stated = self._with_edge_errors(used)
+        at_start = fit_photometry(pixels, pixels.rendered, used, self._noise)
+        stated = self._with_edge_errors(at_start)
         priors = components.added(stated)
         photometry: PhotometricFit | None = None
         factor, accepted, min_deviance = 1.0, (pose, nuisances), np.inf
@@ -133,7 +134,8 @@ class Search:
             rendered = self._rendered(state)
             profile = nuisances.profile() if priors.leds[:, PROFILE].any() else None
             angles = pose.rig_angles(camera)
-            candidate = fit_photometry(pixels, rendered, used, self._noise, photometry, profile)
+            first = photometry is None and profile is None and rendered is pixels.rendered
+            candidate = at_start if first else fit_photometry(pixels, rendered, used, self._noise, photometry, profile)
             of_priors = self._gravity.deviance(angles) + nuisances.deviance(priors)
             deviance = candidate.deviance + of_priors / len(pixels.electrons)
             too_long = deviance > MAX_DEVIANCE_RATIO * min_deviance  # for the linearization
@@ -192,10 +194,9 @@ class Search:
         length2 = before.view_step @ step.information @ before.view_step * factor**2
         return 0.5 if inner < -MAX_RETURN * length2 else 1.0
 
-    def _with_edge_errors(self, used: Mask) -> Priors:
+    def _with_edge_errors(self, photometry: PhotometricFit) -> Priors:
         """The priors, with the errors of the sizes that an imperfect background causes."""
         pixels = self._pixels
-        photometry = fit_photometry(pixels, pixels.rendered, used, self._noise)
         amplitude, background = np.zeros(len(pixels.leds)), np.zeros(len(pixels.leds))
         np.maximum.at(amplitude, pixels.led, photometry.amplitude)
         np.maximum.at(background, pixels.led, photometry.background)
@@ -207,7 +208,9 @@ class Search:
 
     def _rendered(self, state: ImageState) -> RenderedLeds:
         pixels = self._pixels
-        return pixels.rendered if state is pixels.state else pixels.model.render(state, pixels.rendered.parameters)
+        return (
+            pixels.rendered if state.same_as(pixels.state) else pixels.model.render(state, pixels.rendered.parameters)
+        )
 
     def _moved(self, start: tuple[Pose, Nuisances], step: Solution, factor: float) -> tuple[Pose, Nuisances]:
         return start[0].moved(factor * step.pose_step, self._camera), start[1].moved(step.step, factor)

@@ -14,6 +14,7 @@ import numpy as np
 from estimator.errors import InputError
 from estimator.io.device import AnyLed, DecodedSpot, DeviceFrame, DiscLed, Identity, Led, Luminaire, SquareLed
 from estimator.io.downlink import INDEX_BITS, Codes, DiscFace, Packets, Tones
+from estimator.io.shared import SharedResults
 from estimator.receiver.bits import bits_seen
 from estimator.receiver.codes import code_books, match_code, match_code_of_frames
 from estimator.receiver.packets import PacketFormat, decode_packet
@@ -281,7 +282,9 @@ def with_identities(frame: DeviceFrame) -> DeviceFrame:
     if others != frame.other_cameras:
         frame = replace(frame, other_cameras=others)
     asked = frame.downlink is not None and frame.downlink.demodulation == "pixels"
-    return receive_frames((frame,))[0] if asked and frame.identities is None else frame
+    if not asked or frame.identities is not None:
+        return frame
+    return receive_frames((replace(frame, shared=frame.shared or SharedResults()),))[0]
 
 
 def receive_frames(frames: Sequence[DeviceFrame]) -> tuple[DeviceFrame, ...]:

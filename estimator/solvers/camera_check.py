@@ -1,5 +1,7 @@
 """Check of a camera that states no errors by the residuals of a fit, and what an unchecked focal length may cost."""
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,6 +28,7 @@ def contradicts_camera(observations: Observations, best: Fit) -> bool:
     return bool((np.abs(found) > MAX_CAMERA_SIGMA * errors)[visible].any())
 
 
+@lru_cache(maxsize=1)  # both checks of a fit
 def _camera_errors(observations: Observations, best: Fit) -> tuple[Floats, Floats, Floats, Floats]:
     """Errors of the intrinsics (k,) that each by itself explain the residuals of a fit best.
 

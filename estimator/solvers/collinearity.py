@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter
 from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
 
 from estimator.camera.pose import Pose, rotation
 from estimator.camera.projection import Projection
@@ -100,7 +99,7 @@ def fit_pose(leds_m: Floats, image: Floats, projection: Projection, start: Pose)
     """
 
     def pose_of(parameters: Floats) -> Pose:
-        return Pose(parameters[:3], np.asarray(Rotation.from_rotvec(parameters[3:]).as_matrix()))
+        return Pose(parameters[:3], cv2.Rodrigues(parameters[3:])[0])
 
     def residuals(parameters: Floats) -> Floats:
         return np.asarray(projection.project(pose_of(parameters).in_camera(leds_m))[0] - image).ravel()
@@ -108,12 +107,12 @@ def fit_pose(leds_m: Floats, image: Floats, projection: Projection, start: Pose)
     def jacobian(parameters: Floats) -> Floats:
         pose = pose_of(parameters)
         by_point = projection.project(pose.in_camera(leds_m))[1]
-        # SciPy has the rotation, OpenCV its derivative by the rotation vector as well: (3, 9), row by row.
+        # Derivative of the rotation by its vector, (3, 9), row by row.
         by_vector = cv2.Rodrigues(parameters[3:])[1].reshape(3, 3, 3)
         rotated = np.einsum("kij,nj->nik", by_vector, leds_m - pose.position_m)
         return np.concatenate([by_point @ -pose.R_cam_world, by_point @ rotated], axis=2).reshape(-1, 6)
 
-    vector = Rotation.from_matrix(start.R_cam_world).as_rotvec()
+    vector = cv2.Rodrigues(start.R_cam_world)[0].ravel()
     first = np.concatenate([start.position_m, vector])
     if not np.isfinite(residuals(first)).all():
         return None

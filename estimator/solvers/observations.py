@@ -6,15 +6,16 @@ spots have the covariance C = C_centroids + J S J^T, which is not block-diagonal
 are exposed one after another displaces spots by its velocity (`estimator.solvers.shutter_motion`).
 
 The centroid of an LED's image differs from the image of the LED's centre; photogrammetry calls the difference
-eccentricity (Lenz & Fritsch 1990). Here it has a closed form. A face of uniform luminance, at X from the camera,
-illuminates the image plane in proportion to z / |X|^4 per unit of its own area: its solid angle, and the lens's cos^4.
-The centroid of its image is then the image of M = mean of X / |X|^4 over the face. With the mean X0, at the distance d,
-the upward normal n, and the mean square extent s^2 along any direction of the face, X / |X|^4 to second order puts M
-along X0 + 4 s^2 (n . X0) / d^2 n: **the image of a point above the LED by 4 s^2 h / d^2**, where h is the LED's height
-above the camera. s^2 is r^2 / 4 for a disc of radius r, and a^2 / 12 for a square of side a. The next order is
-r^4 / h^3, a nanometre.
+eccentricity (Lenz & Fritsch 1990). A face of uniform luminance, at X from the camera, illuminates the image plane in
+proportion to z / |X|^4 per unit of its own area: its solid angle, and the lens's cos^4. The centroid of its image is
+then the image of the face's mean X, weighted by 1 / |X|^4. To second order that point is on the line of sight to a
+point **above the LED by 4 s^2 h / d^2**, where s^2 is the mean square extent of the face along any direction, h the
+height of the LED above the camera, and d its distance. s^2 is r^2 / 4 for a disc of radius r, and a^2 / 12 for a square
+of side a. `light_centres_m` takes the mean by Gauss's rule of 3 x 3 points, which is exact for the terms of fourth
+order of a square; with second order alone the position is off by some r^4 / h^3, a nanometre for LEDs of 1 cm and
+0.1 mm for luminaires of 60 cm. A disc has the points of the square with the same s^2, which is exact to second order.
 
-The closed form holds in a pinhole's image plane. A lens that bends straight lines also bends the image of an LED, and
+The mean holds in a pinhole's image plane. A lens that bends straight lines also bends the image of an LED, and
 the undistorted centroid is then not the centroid of the undistorted image. `corrected_for_eccentricity` subtracts that
 difference once a pose determines the size of the images.
 """
@@ -34,7 +35,7 @@ from estimator.camera.projection import projection_of
 from estimator.camera.undistort import has_pinhole_image, pinhole_image
 from estimator.io.device import Camera, DeviceFrame
 from estimator.solvers.shutter_motion import ShutterMotion, image_slopes, motion_prior
-from estimator.solvers.uncertainty import Uncertainty, assumed_uncertainty, uncertainty
+from estimator.solvers.uncertainty import Uncertainty, assumed_camera, uncertainty
 from estimator.spots.correspondences import centroids_px, led_positions_m
 from estimator.spots.identify import Correspondence
 
@@ -42,6 +43,10 @@ Floats = NDArray[np.float64]
 
 # Added to every centroid's covariance, so that a spot without noise has a finite weight.
 MIN_CENTROID_SIGMA_PX = 1e-4
+# Gauss's rule of three points on a square of s = 1, whose half side is sqrt(3): nodes (9, 2) and weights (9,).
+_ALONG, _SHARES = np.sqrt(1.8) * np.array([-1.0, 0.0, 1.0]), np.array([5.0, 8.0, 5.0]) / 18
+FACE_NODES = np.stack(np.meshgrid(_ALONG, _ALONG, indexing="ij"), axis=-1).reshape(-1, 2)
+FACE_WEIGHTS = np.outer(_SHARES, _SHARES).ravel()
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,16 +99,10 @@ class Observations:
         if self.motion is None:
             return centroid_images(pose, self.leds_m, self.lift_m2)
         now = self.motion.prior.velocity if velocity is None else velocity
-        p_cam = seen_in_motion(self.lifted_m(pose, now), pose, now, self.motion.times_s).p_cam
+        camera_m = pose.position_m + self.motion.times_s[:, None] * now[3:]
+        points_m = light_centres_m(self.leds_m, self.lift_m2, camera_m)
+        p_cam = seen_in_motion(points_m, pose, now, self.motion.times_s).p_cam
         return _in_plane(p_cam), p_cam[:, 2]
-
-    def lifted_m(self, pose: Pose, velocity: Floats) -> Floats:
-        """Points (n, 3), world metres, whose images are the centroids of the LEDs' images, see the module."""
-        times_s = np.zeros(len(self.leds_m)) if self.motion is None else self.motion.times_s
-        offset = self.leds_m - pose.position_m - times_s[:, None] * velocity[3:]
-        lifted = self.leds_m.copy()
-        lifted[:, 2] += self.lift_m2 * offset[:, 2] / (offset**2).sum(axis=1)
-        return lifted
 
     def total_covariance(self, pose: Pose) -> Floats:
         """`covariance` with the displacements by the prior of the velocity, (2n, 2n)."""
@@ -134,8 +133,7 @@ class Observations:
         """The same spots; a camera that states nothing has the errors of one as sold."""
         if self.camera.uncertainty is not None:
             return self
-        camera = self.camera.model_copy(update={"uncertainty": assumed_uncertainty(self.camera)})
-        return replace(self, uncertainty=self.uncertainty.with_camera(camera))
+        return replace(self, uncertainty=self.uncertainty.with_camera(assumed_camera(self.camera)))
 
     def without_gravity(self) -> "Observations":
         """The same spots without gravity."""
@@ -195,11 +193,22 @@ def observe(
 
 def centroid_images(pose: Pose, leds_m: Floats, lift_m2: Floats) -> tuple[Floats, Floats]:
     """Centroids (n, 2) of the images of LEDs (n, 3) in the pinhole's image plane, and the LEDs' depths (n,), metres."""
-    offset = leds_m - pose.position_m
-    lifted = leds_m.copy()
-    lifted[:, 2] += lift_m2 * offset[:, 2] / (offset**2).sum(axis=1)
-    p_cam = pose.in_camera(lifted)
+    p_cam = pose.in_camera(light_centres_m(leds_m, lift_m2, pose.position_m))
     return _in_plane(p_cam), p_cam[:, 2]
+
+
+def light_centres_m(leds_m: Floats, lift_m2: Floats, camera_m: Floats) -> Floats:
+    """Points (n, 3) of the faces of LEDs (n, 3) whose images are the centroids of the LEDs' images, see the module.
+
+    `lift_m2` (n,) is 4 s^2 of each, `camera_m` (3,) or (n, 3) the projection centre; all in world metres.
+    """
+    offset = leds_m - camera_m
+    s = np.sqrt(lift_m2 / 4)[:, None]
+    nearer = 2 * s * (offset[:, :2] @ FACE_NODES.T) + s**2 * (FACE_NODES**2).sum(axis=1)
+    weights = FACE_WEIGHTS / ((offset**2).sum(axis=1, keepdims=True) + nearer) ** 2
+    points = leds_m.copy()
+    points[:, :2] += s * (weights @ FACE_NODES) / weights.sum(axis=1, keepdims=True)
+    return points
 
 
 def _in_plane(p_cam: Floats) -> Floats:
@@ -246,20 +255,19 @@ def moving_slopes(observations: Observations, pose: Pose, velocity: Floats, x: F
 def corrected_for_eccentricity(observations: Observations, pose: Pose) -> Observations:
     """Observations with centroids as a lens that does not bend the images would have them, of the size by a pose.
 
-    Each LED is represented by four points, sqrt(2) s from its centre along x and y, which have its s^2. Their images
-    are weighted by the lens's irradiance, z / |X|^4, for any lens: a lens that spreads light over more pixels makes it
-    dimmer. An LED with a point that has no image is not corrected. Motion shifts an image by some pixels, over which
-    the difference does not change.
+    Each LED is represented by the nodes of `light_centres_m`. Their images are weighted by the lens's irradiance,
+    z / |X|^4, for any lens: a lens that spreads light over more pixels makes it dimmer. An LED with a node that has no
+    image is not corrected. Motion shifts an image by some pixels, over which the difference does not change.
     """
-    steps = np.sqrt(observations.lift_m2 / 2)[:, None, None] * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
-    points_m = (observations.leds_m[:, None] + steps).reshape(-1, 3)
+    nodes = np.sqrt(observations.lift_m2 / 4)[:, None, None] * np.column_stack([FACE_NODES, 0 * FACE_WEIGHTS])
+    points_m = (observations.leds_m[:, None] + nodes).reshape(-1, 3)
     p_cam = pose.in_camera(points_m)
     camera = observations.camera
-    lens_image = projection_of(camera).project(p_cam)[0].reshape(-1, 4, 2)
-    p_cam = p_cam.reshape(-1, 4, 3)
+    lens_image = projection_of(camera).project(p_cam)[0].reshape(-1, len(FACE_NODES), 2)
+    p_cam = p_cam.reshape(-1, len(FACE_NODES), 3)
     imaged = (p_cam[..., 2] > 0).all(axis=1) & np.isfinite(lens_image).all(axis=(1, 2))
     p_cam, lens_image = p_cam[imaged], lens_image[imaged]
-    weights = p_cam[..., 2] / (p_cam**2).sum(axis=2) ** 2
+    weights = FACE_WEIGHTS * p_cam[..., 2] / (p_cam**2).sum(axis=2) ** 2
     weights /= weights.sum(axis=1, keepdims=True)
     lens_centroids = pinhole_image(camera.to_pixels((weights[..., None] * lens_image).sum(axis=1)), camera)
     pinhole_centroids = (weights[..., None] * p_cam[..., :2] / p_cam[..., 2:]).sum(axis=1)

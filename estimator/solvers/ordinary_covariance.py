@@ -12,10 +12,10 @@ the position count as well.
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from estimator.camera.pose import Pose
 from estimator.solvers import second_order
+from estimator.solvers.chi_square import chi2_limit
 from estimator.solvers.observations import Observations, centroid_images, pose_slopes, pose_vector
 from estimator.solvers.robust_fit import OUTLIER_PROBABILITY
 
@@ -37,7 +37,7 @@ def ordinary_covariance(observations: Observations, pose: Pose) -> Floats:
     expected = float(np.einsum("ij,ji->", left_open, covariance))
     eccentric = left_open @ (lifted - centres).ravel()
     ratio = float(residuals @ residuals) / (expected + float(eccentric @ eccentric))
-    if ratio > chi2.isf(OUTLIER_PROBABILITY, freedom) / freedom:
+    if ratio > chi2_limit(OUTLIER_PROBABILITY, freedom) / freedom:
         if any(parameter.group == "map" for parameter in observations.uncertainty.parameters):
             covariance = covariance * ratio
         else:

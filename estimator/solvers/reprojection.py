@@ -8,14 +8,15 @@ Where the camera has a rolling shutter, its velocity while the frame is read out
 (`estimator.solvers.shutter_motion`); the pose is that at mid-readout.
 """
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
+from scipy.optimize import least_squares, leastsq
 
 from estimator.camera.motion import MOTION_PARAMETERS
 from estimator.camera.pose import POSE_PARAMETERS, Pose
@@ -24,10 +25,15 @@ from estimator.solvers import second_order
 from estimator.solvers.observations import Observations, moving_slopes, position_slopes
 
 Floats = NDArray[np.float64]
+Function = Callable[[Floats], Floats]
 
+# With gravity, two spots have as many coordinates as a pose has parameters.
+MIN_SPOTS = 2
 # Residuals beyond this many standard deviations are weighted down by the robust loss.
 ROBUST_SIGMA = 3.0
 MAX_EVALUATIONS = 60
+# Relative change of the sum, of the parameters, and cosine to the gradient, at which a search ends.
+TOLERANCE = 1e-8
 # The slopes of a spot by the map change with the pose by a share of the error of the initial pose: the weights of the
 # second repetition are those at a pose that is good to the errors stated.
 RELINEARIZATIONS = 2
@@ -153,10 +159,10 @@ def _inverse_root(covariance: Floats) -> Floats:
 
 def _whitened(whitening: Floats, of_spots: Floats) -> Floats:
     """Residuals (n, 2) or slopes (n, 2, k) of spots, whitened, (2n,) or (2n, k)."""
-    flat = of_spots.reshape(2 * len(of_spots), *of_spots.shape[2:])
+    flat = 2 * len(of_spots), *of_spots.shape[2:]
     if whitening.ndim == 2:
-        return np.asarray(whitening @ flat)
-    return np.asarray(np.einsum("nij,nj...->ni...", whitening, of_spots)).reshape(flat.shape)
+        return np.asarray(whitening @ of_spots.reshape(flat))
+    return np.asarray(whitening @ of_spots.reshape(len(of_spots), 2, -1)).reshape(flat)
 
 
 def _fit(observations: Observations, start: Pose, whitening: Floats, loss: Literal["linear", "soft_l1"]) -> Fit:
@@ -165,7 +171,7 @@ def _fit(observations: Observations, start: Pose, whitening: Floats, loss: Liter
     count = len(observations.leds_m)
 
     def pose_of(x: Floats) -> Pose:
-        R_cam_world = np.asarray(Rotation.from_rotvec(x[:3]).as_matrix())
+        R_cam_world = cv2.Rodrigues(x[:3])[0]
         return Pose(centre - R_cam_world.T @ x[3:POSE_PARAMETERS], R_cam_world)
 
     def residuals(x: Floats) -> Floats:
@@ -177,10 +183,12 @@ def _fit(observations: Observations, start: Pose, whitening: Floats, loss: Liter
         return np.concatenate(parts)
 
     def jacobian(x: Floats) -> Floats:
-        # The lift of an LED, some micrometres, changes these by some millionths.
+        # The eccentricity changes these by s^2 / d^2: some millionths for an LED of 1 cm, a hundredth for one of 60 cm.
         if motion is None:
             of_image = cv2.projectPoints(model, x[:3], x[3:], np.eye(3), None)[1][:, :6].reshape(-1, 2, 6)
-            return np.vstack([_whitened(whitening, of_image), _tilt_jacobian(x, observations)])
+            slopes = np.empty((2 * count + 2, POSE_PARAMETERS))
+            slopes[:-2], slopes[-2:] = _whitened(whitening, of_image), _tilt_jacobian(x, observations)
+            return slopes
         of_image = moving_slopes(observations, pose_of(x), x[POSE_PARAMETERS:], x)
         of_priors = np.zeros((2 + MOTION_PARAMETERS, POSE_PARAMETERS + MOTION_PARAMETERS))
         of_priors[:2, :POSE_PARAMETERS] = _tilt_jacobian(x, observations)
@@ -188,35 +196,26 @@ def _fit(observations: Observations, start: Pose, whitening: Floats, loss: Liter
         return np.vstack([_whitened(whitening, of_image), of_priors])
 
     try:
+        if count < MIN_SPOTS:
+            raise ValueError("fewer observations than parameters")
         with np.errstate(all="ignore"):
-            vector = Rotation.from_matrix(start.R_cam_world).as_rotvec()
+            vector = cv2.Rodrigues(start.R_cam_world)[0].ravel()
             velocity = np.zeros(0) if motion is None else motion.prior.velocity
             x0 = np.concatenate([vector, start.R_cam_world @ (centre - start.position_m), velocity])
-            # MINPACK ("lm") is several times faster, and has no robust loss.
-            found = least_squares(
-                residuals,
-                x0,
-                jacobian,
-                method="lm" if loss == "linear" else "trf",
-                loss=loss,
-                f_scale=ROBUST_SIGMA,
-                x_scale="jac",
-                max_nfev=MAX_EVALUATIONS,
-            )
-            # SciPy's own Jacobian is scaled by the robust loss, and so is not the information.
-            slope = jacobian(found.x)
+            # MINPACK is several times faster, and has no robust loss.
+            x, at_minimum, cost = (_by_minpack if loss == "linear" else _robustly)(residuals, x0, jacobian)
+            slope = jacobian(x)
             information = slope.T @ slope
             covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
     except (np.linalg.LinAlgError, ValueError, cv2.error):
         raise EstimationFailure("position", "the observations do not determine a pose") from None
-    pose = pose_of(found.x)
-    at_minimum = residuals(found.x)
+    pose = pose_of(x)
     of_spots = at_minimum[: 2 * count]
-    of_position = np.zeros((3, len(found.x)))
-    of_position[:, :POSE_PARAMETERS] = position_slopes(found.x[:POSE_PARAMETERS])
+    of_position = np.zeros((3, len(x)))
+    of_position[:, :POSE_PARAMETERS] = position_slopes(x[:POSE_PARAMETERS])
     covariance_m2 = of_position @ covariance @ of_position.T
     if motion is not None:
-        covariance_m2 = covariance_m2 + second_order.of_pose_vector(found.x, covariance)
+        covariance_m2 = covariance_m2 + second_order.of_pose_vector(x, covariance)
     # At the minimum J^T C^-1 r with the shares of gravity and motion is zero, and so q = C^-1 r.
     roots = whitening.reshape(2 * count, count, 2) if whitening.ndim == 2 else None
     if roots is None:
@@ -229,7 +228,7 @@ def _fit(observations: Observations, start: Pose, whitening: Floats, loss: Liter
         pulled = (whitening.T @ slope[: 2 * count]).reshape(count, 2, -1)
     return Fit(
         pose=pose,
-        cost=2 * float(found.cost),
+        cost=cost,
         spots_chi2=(of_spots.reshape(-1, 2) ** 2).sum(axis=1),
         tilt_chi2=float((at_minimum[2 * count : 2 * count + 2] ** 2).sum()),
         covariance_m2=covariance_m2,
@@ -240,15 +239,42 @@ def _fit(observations: Observations, start: Pose, whitening: Floats, loss: Liter
         residuals=at_minimum,
         slopes=slope,
         whitening=whitening,
-        velocity=found.x[POSE_PARAMETERS:],
+        velocity=x[POSE_PARAMETERS:],
         motion_chi2=float((at_minimum[2 * count + 2 :] ** 2).sum()),
     )
 
 
+def _by_minpack(residuals: Function, x0: Floats, jacobian: Function) -> tuple[Floats, Floats, float]:
+    """Minimum of the sum of squares from x0, the residuals there, and the sum; raises ValueError."""
+    x, _, found, _, _ = leastsq(
+        residuals,
+        x0,
+        (),
+        jacobian,
+        full_output=True,
+        ftol=TOLERANCE,
+        xtol=TOLERANCE,
+        gtol=TOLERANCE,
+        maxfev=MAX_EVALUATIONS,
+    )
+    cost = float((found["fvec"] ** 2).sum())
+    if not np.isfinite(cost):  # the search has not left its start
+        raise ValueError("residuals are not finite")
+    return x, found["fvec"], cost
+
+
+def _robustly(residuals: Function, x0: Floats, jacobian: Function) -> tuple[Floats, Floats, float]:
+    """Minimum of the sum of a robust loss of the squares from x0, the residuals there, and the sum."""
+    found = least_squares(
+        residuals, x0, jacobian, loss="soft_l1", f_scale=ROBUST_SIGMA, x_scale="jac", max_nfev=MAX_EVALUATIONS
+    )
+    return found.x, residuals(found.x), 2 * float(found.cost)
+
+
 def _tilt_residual(pose: Pose, observations: Observations) -> Floats:
     """Tilts of a pose minus the accelerometer's, in standard deviations, (2,)."""
-    x, y, z = pose.R_cam_world[:, 2]
-    off = np.array([np.arctan2(y, z), -np.arcsin(np.clip(x, -1, 1))]) - observations.tilt_rad
+    x, y, z = pose.R_cam_world[:, 2].tolist()
+    off = np.array([math.atan2(y, z), -math.asin(min(max(x, -1.0), 1.0))]) - observations.tilt_rad
     # Wrapped to -pi ... pi.
     return np.asarray((off + np.pi) % (2 * np.pi) - np.pi) / observations.tilt_sigma_rad
 
@@ -256,8 +282,8 @@ def _tilt_residual(pose: Pose, observations: Observations) -> Floats:
 def _tilt_jacobian(x: Floats, observations: Observations) -> Floats:
     """Derivatives of `_tilt_residual` by the six parameters, (2, 6)."""
     R_cam_world, by_vector = cv2.Rodrigues(x[:3])
-    up_y, up_z = R_cam_world[1:, 2]
-    by_x, by_y, by_z = by_vector[:, [2, 5, 8]].T
+    up_y, up_z = R_cam_world[1:, 2].tolist()
+    by_x, by_y, by_z = by_vector.T[2::3]
     # tilt_x is undefined where the camera's x axis is vertical.
     across2 = max(up_y**2 + up_z**2, 1e-12)
     slopes = np.zeros((2, 6))

@@ -20,13 +20,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2, f
 
 from estimator.camera.motion import MOTION_PARAMETERS
 from estimator.camera.pose import Pose
 from estimator.camera.projection import projection_of
 from estimator.errors import EstimationFailure
 from estimator.solvers.camera_check import contradicts_camera, unchecked_focal_m2
+from estimator.solvers.chi_square import chi2_limit, pair_limit
 from estimator.solvers.observations import Observations, centroid_images, corrected_for_eccentricity
 from estimator.solvers.reprojection import Fit, fit
 
@@ -99,7 +99,7 @@ class Consensus:
         if self.adapted:
             return self.best.covariance_m2 * (max(freedom, 3) / (max(freedom, 3) - 2)) + self.unchecked_m2
         total = self.best.chi2
-        scale = total / freedom if freedom > 0 and total > chi2.isf(OUTLIER_PROBABILITY, freedom) else 1.0
+        scale = total / freedom if freedom > 0 and total > chi2_limit(OUTLIER_PROBABILITY, freedom) else 1.0
         return self.best.covariance_m2 * scale + self.unchecked_m2
 
     def of_inliers(self) -> Observations:
@@ -148,7 +148,7 @@ def _consensus(
     else:
         rough = [*(one.pose for one in fits), *starts, *more_starts()]
     found = _explanations(observations, rough)
-    limit = chi2.isf(OUTLIER_PROBABILITY, 2)
+    limit = chi2_limit(OUTLIER_PROBABILITY, 2)
     if gravity_optional and not any(one.best.tilt_chi2 <= limit and not one.adapted for one in found):
         found += _explanations(observations.without_gravity(), rough, sizes=(False,))
     if not found:
@@ -189,9 +189,10 @@ def _explanations(
 
 def _plausible(agreed: Consensus, observations: Observations) -> bool:
     """Whether chi-square of inliers and gravity is as the errors say, and the spots do not contradict the camera."""
-    chosen, best = observations.only(agreed.inliers), agreed.best
-    freedom = _freedom(chosen)
-    if best.tilt_chi2 > chi2.isf(OUTLIER_PROBABILITY, 2) or best.chi2 > chi2.isf(OUTLIER_PROBABILITY, max(freedom, 1)):
+    chosen = observations if agreed.inliers.all() else observations.only(agreed.inliers)
+    best = agreed.best
+    freedom = max(_freedom(chosen), 1)
+    if best.tilt_chi2 > chi2_limit(OUTLIER_PROBABILITY, 2) or best.chi2 > chi2_limit(OUTLIER_PROBABILITY, freedom):
         return False
     return chosen.correlated or chosen.camera.uncertainty is not None or not contradicts_camera(chosen, best)
 
@@ -353,7 +354,7 @@ def _freedom(observations: Observations) -> int:
 def _passes(found: Fit, observations: Observations, adapted: bool) -> NDArray[np.bool_]:
     """Spots (n,) that pass data snooping; with errors of a size by the residuals the test is Fisher's."""
     freedom = _freedom(observations)
-    limit = 2 * f.isf(OUTLIER_PROBABILITY, 2, max(freedom, 1)) if adapted else chi2.isf(OUTLIER_PROBABILITY, 2)
+    limit = pair_limit(OUTLIER_PROBABILITY, max(freedom, 1)) if adapted else chi2_limit(OUTLIER_PROBABILITY, 2)
     return np.asarray(found.outlier_chi2(_model_error(observations)) <= limit)
 
 
@@ -417,12 +418,12 @@ def _same_minimum(one: Pose, other: Pose) -> bool:
 
 def _explains_all(found: Fit, observations: Observations) -> bool:
     """Whether a fit explains all spots and gravity, with a motion that its prior allows."""
-    if found.tilt_chi2 > chi2.isf(OUTLIER_PROBABILITY, 2):
+    if found.tilt_chi2 > chi2_limit(OUTLIER_PROBABILITY, 2):
         return False
-    if found.motion_chi2 > chi2.isf(OUTLIER_PROBABILITY, MOTION_PARAMETERS):
+    if found.motion_chi2 > chi2_limit(OUTLIER_PROBABILITY, MOTION_PARAMETERS):
         return False
     if observations.correlated:
-        return found.chi2 <= chi2.isf(OUTLIER_PROBABILITY, max(_freedom(observations), 1)) and bool(
+        return found.chi2 <= chi2_limit(OUTLIER_PROBABILITY, max(_freedom(observations), 1)) and bool(
             _passes(found, observations, adapted=False).all()
         )
     return bool(_explained(found, observations).all())
@@ -435,4 +436,4 @@ def _explained(found: Fit, observations: Observations) -> NDArray[np.bool_]:
     model_error2 = (MODEL_ERROR_PX * observations.camera.pixel_angle_rad) ** 2
     covariance = spread @ spread.transpose(0, 2, 1) + model_error2 * np.eye(2)
     distance2 = np.einsum("ni,ni->n", offset, np.linalg.solve(covariance, offset[:, :, None])[:, :, 0])
-    return np.asarray(distance2 <= chi2.isf(OUTLIER_PROBABILITY, 2))
+    return np.asarray(distance2 <= chi2_limit(OUTLIER_PROBABILITY, 2))

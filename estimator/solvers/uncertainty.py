@@ -18,6 +18,7 @@ LED by g s^2 / r does: g r / 4 for a disc, g r / 3 for a square. An error of the
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -149,6 +150,12 @@ def _of_camera(camera: Camera) -> tuple[list[Parameter], list[float], list[int]]
     return parameters, sigmas, intrinsics
 
 
+@lru_cache(maxsize=16)
+def assumed_camera(camera: Camera) -> Camera:
+    """A camera that states no errors with those of `assumed_uncertainty`."""
+    return camera.model_copy(update={"uncertainty": assumed_uncertainty(camera)})
+
+
 def assumed_uncertainty(camera: Camera) -> CameraUncertainty:
     """Errors of a camera that states none: those of one as sold, by AS_SOLD and the radius of its sensor's corner."""
     lengths_px = [
@@ -230,12 +237,14 @@ def _add_luminaires(of_map: _MapParameters, leds: Sequence[Led], luminaires: Map
 
 
 def _add_leds(of_map: _MapParameters, leds: Sequence[Led]) -> None:
+    sigmas = np.array([led.sigmas() for led in leds]).reshape(-1, 6)
+    if not sigmas.any():
+        return
     count = len(leds)
     ids = [led.id for led in leds]
     each = np.zeros((count, 3, count, 3))
     each[np.arange(count), :, np.arange(count)] = np.eye(3)
     names = [f"led_{axis}" for axis in AXES] * count
-    sigmas = np.array([led.sigmas() for led in leds]).reshape(-1, 6)
     of_map.add(names, np.repeat(ids, 3).tolist(), sigmas[:, :3].ravel(), each.reshape(count, 3, 3 * count))
     shift_m = np.array([led.shift_by_gradient_m for led in leds])
     of_face = (each[:, :, :, :2] * shift_m[:, None, None, None]).reshape(count, 3, 2 * count)

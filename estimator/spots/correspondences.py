@@ -1,6 +1,7 @@
 """Correspondences: from a frame's images to spots of identified LEDs, the input of methods that work on spots."""
 
-from collections.abc import Callable, Sequence
+import weakref
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -8,65 +9,70 @@ from numpy.typing import NDArray
 
 from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame
-from estimator.spots.detect import Readout, Spot, detect
+from estimator.spots.denoise import DENOISERS, Denoiser
+from estimator.spots.detect import Spot, detect
 from estimator.spots.identify import Correspondence, gate_px, identify
 from estimator.spots.lamps import has_stripes, lamps_of, light_centre_px
+from estimator.spots.led_light import Readout
 from estimator.spots.sampling import lens_blur
 
 Floats = NDArray[np.float64]
-Image = NDArray[np.float32]
+RAW = DENOISERS["none"]
 
 # Offset of the plain centroid of a steady LED image from the centre of its outline, as a share of its second moment.
 MAX_STEADY_OFF = 0.2
 
 
-def find_correspondences(
-    frame: DeviceFrame, denoise: Callable[[Image], Image] | None = None, denoise_radius_px: int = 0
-) -> list[Correspondence]:
+def find_correspondences(frame: DeviceFrame, denoiser: Denoiser = RAW) -> list[Correspondence]:
     """Spots in a frame that are identified as LEDs.
 
-    `denoise` maps an image of electrons to a denoised one; each of its pixels depends on a square of
-    2 `denoise_radius_px` + 1. Under a rolling shutter, spots of LED images with stripes are the centres of their
-    outlines (`estimator.spots.striped`), without denoising, which would mix lines. Raises EstimationFailure if no LED
-    is detected or identified.
+    Under a rolling shutter, spots of LED images with stripes are the centres of their outlines
+    (`estimator.spots.striped`), without denoising, which would mix lines. Raises EstimationFailure if no LED is
+    detected or identified.
     """
-    if has_stripes(frame):
-        return _find_striped(frame)
-    return list(
-        identify(
-            _detected(frame, denoise, denoise_radius_px), frame.spots, frame.leds, _gate_px(frame, denoise_radius_px)
-        )
-    )
+    striped = has_stripes(frame)
+    if striped:
+        denoiser = RAW
+
+    def identified() -> tuple[Correspondence, ...]:
+        spots = _striped(frame) if striped else _detected(frame, denoiser)
+        return identify(spots, frame.spots, frame.leds, _gate_px(frame, denoiser))
+
+    # The reference does not keep the frame, which holds the results, and no other frame equals it.
+    return list(frame.once(("correspondences", denoiser, weakref.ref(frame)), identified))
 
 
-def _gate_px(frame: DeviceFrame, denoise_radius_px: int) -> float:
+def _gate_px(frame: DeviceFrame, denoiser: Denoiser) -> float:
     # A denoiser may move light by its radius: Algorithm 1 as printed does by half of it.
-    return gate_px(frame.camera.width_px) + denoise_radius_px
+    return gate_px(frame.camera.width_px) + denoiser.radius_px
 
 
-def _detected(
-    frame: DeviceFrame, denoise: Callable[[Image], Image] | None = None, denoise_radius_px: int = 0
-) -> tuple[Spot, ...]:
+def _detected(frame: DeviceFrame, denoiser: Denoiser) -> tuple[Spot, ...]:
     """Spots of LED images without stripes; raises EstimationFailure if there is none."""
-    readouts, sensor = [], frame.sensor
-    for part in frame.parts:
-        raw = frame.electrons(part)
-        image = raw if denoise is None else denoise(raw)
-        noise = sensor.floor_e2(), sensor.prnu, sensor.rounding_e2()
-        readouts.append(Readout(part.row, part.column, image, raw, frame.clipped(part), *noise))
-    decoded_px = np.array([(spot.u_px, spot.v_px) for spot in frame.spots]).reshape(-1, 2)
     any_square = any(frame.leds[spot.led].shape == "square" for spot in frame.spots)
-    sensor_px = frame.camera.width_px * frame.camera.height_px
-    gate, lens = _gate_px(frame, denoise_radius_px), lens_blur(frame.camera)
-    return detect(readouts, sensor_px, denoise_radius_px, decoded_px, any_square, gate, lens, sensor.crosstalk)
+
+    def detected() -> tuple[Spot, ...]:
+        readouts, sensor = [], frame.sensor
+        floor_sigma_e = float(np.sqrt(sensor.floor_e2()))
+        for part in frame.parts:
+            raw = frame.electrons(part)
+            noise = sensor.floor_e2(), sensor.prnu, sensor.rounding_e2()
+            image = denoiser.apply(raw, floor_sigma_e)
+            readouts.append(Readout(part.row, part.column, image, raw, frame.clipped(part), *noise))
+        decoded_px = np.array([(spot.u_px, spot.v_px) for spot in frame.spots]).reshape(-1, 2)
+        sensor_px = frame.camera.width_px * frame.camera.height_px
+        gate, lens = _gate_px(frame, denoiser), lens_blur(frame.camera)
+        return detect(readouts, sensor_px, denoiser.radius_px, decoded_px, any_square, gate, lens, sensor.crosstalk)
+
+    return frame.once(("spots", denoiser, frame.spots, any_square), detected)
 
 
-def _find_striped(frame: DeviceFrame) -> list[Correspondence]:
-    """Spots of a frame with stripes that are identified as LEDs; steady LED images have their plain centroids."""
+def _striped(frame: DeviceFrame) -> list[Spot]:
+    """Spots of a frame with stripes; steady LED images have their plain centroids."""
     lamps = lamps_of(frame)
     if not lamps:
         raise EstimationFailure("detect", "no LED image with stripes or without found")
-    steady = () if all(lamp.striped for lamp in lamps) else _detected(frame)
+    steady = () if all(lamp.striped for lamp in lamps) else _detected(frame, RAW)
     steady_px = np.array([(spot.u_px, spot.v_px) for spot in steady]).reshape(-1, 2)
     spots = []
     for lamp in lamps:
@@ -79,7 +85,7 @@ def _find_striped(frame: DeviceFrame) -> list[Correspondence]:
             if (off_px[nearest] ** 2 <= MAX_STEADY_OFF**2 * np.diag(lamp.moments_px2)).all():
                 spot = steady[nearest]
         spots.append(spot)
-    return list(identify(spots, frame.spots, frame.leds, _gate_px(frame, 0)))
+    return spots
 
 
 def led_positions_m(correspondences: Sequence[Correspondence]) -> Floats:

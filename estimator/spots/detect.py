@@ -5,8 +5,12 @@ an ellipse. The ellipse of a small LED image, which the smoothing widens, is rep
 moments. The centroid is computed over the ellipse padded by a margin, so that it contains all light of the LED image,
 blurred or not, and the background around it cancels. What the sampling by pixels adds is subtracted
 (`estimator.spots.sampling`).
+
+The light of a large LED image, or of one that may be square, is summed over the padded part above half level itself,
+which holds less background than an ellipse around it (`estimator.spots.led_light`).
 """
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -15,12 +19,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.errors import EstimationFailure
+from estimator.spots.led_light import (
+    MARGIN_PX,
+    RING_PX,
+    SMOOTHING_PX,
+    Ellipse,
+    Pixels,
+    Readout,
+    light_of,
+    second_moments,
+)
 from estimator.spots.sampling import PIXEL_VARIANCE, SHARP, LensBlur, sampling_error, sampling_variance_px2
 
-Pixels = NDArray[np.float64]
-
-# Blobs are searched in a 5 x 5 mean, which keeps an LED image of a few electrons a pixel in one piece.
-SMOOTHING_PX = 5
 # Share of the brightest level: above ceiling and walls at 1/100 of an LED, below an LED at a quarter of it.
 THRESHOLD_OF_BRIGHTEST = 0.05
 THRESHOLD_SIGMA = 6.0
@@ -36,21 +46,14 @@ MIN_PIECE = 0.2
 SQUARE_STRETCH = 1.5**0.5
 # A disc of blur extends a quarter further than to where it has fallen to the threshold.
 FRINGE_EXTENSION = 1.25
-MARGIN_PX = 2.0
-RING_PX = 3.0
 MIN_SIGNAL_TO_NOISE = 5.0
 # The 5 x 5 mean widens the part above half level of LED images with a smaller semi-axis than about its own width.
 SMALL_PX = 6.0
+# Across a disc with a larger semi-axis the lens's fall-off changes the background by more than noise. The ellipse
+# around a square contains so much background that this holds from SMALL_PX on.
+LARGE_PX = 40.0
 # Second moments replace the ellipse where noise changes them by a few percent at most.
 MIN_SIGNAL_FOR_MOMENTS = 50.0
-# Pixels of the ring this many standard deviations from its median are no background of the LED.
-BACKGROUND_SIGMA = 3.0
-# Of fewer pixels the variance is not measured.
-MIN_RING_PIXELS = 20
-# A ring whose variance exceeds the noise's by this many standard deviations has a structure.
-STRUCTURE_SIGMA = 4.0
-# Below this share of the variance, which noise of half a step exceeds, rounding errors are independent.
-MAX_ROUNDING_SHARE = 0.25
 # A sampling error with a smaller share of the noise's variance is left alone.
 MIN_SAMPLING_SHARE = 1e-3
 
@@ -74,57 +77,6 @@ class Spot:
     peak_e: float
     touches_border: bool
     saturated: bool
-
-
-@dataclass(frozen=True, eq=False)
-class Readout:
-    """A region of interest in electrons, `image_e` (rows, columns); its first pixel is (row, column) of the sensor.
-
-    `raw_e` is the image before denoising; `clipped` marks saturated pixels. Beside shot noise a pixel's variance has a
-    signal-independent part, `floor_e2`, of which `rounding_e2` is by the ADC's steps, and one proportional to its
-    signal squared, by the photo response nonuniformity `prnu`.
-    """
-
-    row: int
-    column: int
-    image_e: NDArray[np.float32]
-    raw_e: NDArray[np.float32]
-    clipped: NDArray[np.bool_]
-    floor_e2: float = 0.0
-    prnu: float = 0.0
-    rounding_e2: float = 0.0
-
-
-@dataclass(frozen=True, eq=False)
-class _Ellipse:
-    """Part of a blob above half level: its centroid (u, v) and the ellipse of the same second moments.
-
-    `axes` (2, 2) are its unit axes as columns, `semi_axes_px` (2,) their lengths. `low_px` and `high_px` (2,) are
-    opposite vertices of the upright box around the part itself. `stretch` is the factor that makes the ellipse enclose
-    a square. `fringe_px` is the width of the light found around the ellipse beyond that of a sharp LED image.
-    """
-
-    centre_px: NDArray[np.float64]
-    axes: NDArray[np.float64]
-    semi_axes_px: NDArray[np.float64]
-    low_px: NDArray[np.float64]
-    high_px: NDArray[np.float64]
-    area_px: int
-    stretch: float
-    fringe_px: float = 0.0
-
-    def distance2(self, u_px: NDArray[np.float64], v_px: NDArray[np.float64], padding_px: float) -> NDArray[np.float64]:
-        """Squared distance from the centre in units of the padded ellipse, at most 1 inside.
-
-        Takes a row of u (1, columns) and a column of v (rows, 1); returns (rows, columns).
-        """
-        du, dv = u_px - self.centre_px[0], v_px - self.centre_px[1]
-        (uu, uv), (_, vv) = (self.axes / (self.semi_axes_px + padding_px) ** 2) @ self.axes.T
-        return np.asarray(uu * du**2 + vv * dv**2 + (2 * uv * dv) * du)
-
-    def half_extent(self, padding_px: float) -> NDArray[np.float64]:
-        """Half width and half height, (2,), of the upright box around the padded ellipse."""
-        return np.asarray(np.sqrt((self.axes**2) @ (self.semi_axes_px + padding_px) ** 2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,7 +134,7 @@ def detect(
     return tuple(_corrected_for_sampling(measured, any_square, lens, crosstalk))
 
 
-def _spots(readout: Readout, ellipses: Sequence[_Ellipse], denoise_radius_px: int) -> list[_Measured]:
+def _spots(readout: Readout, ellipses: Sequence[Ellipse], denoise_radius_px: int) -> list[_Measured]:
     """Measure each ellipse of a region, given those near it."""
     if denoise_radius_px == 0:
         narrowed = [_narrowed(readout, e, others) for e, others in _with_neighbours(ellipses, denoise_radius_px)]
@@ -194,8 +146,11 @@ def _spots(readout: Readout, ellipses: Sequence[_Ellipse], denoise_radius_px: in
     return [spot for spot in measured if spot is not None]
 
 
-def _with_neighbours(ellipses: Sequence[_Ellipse], denoise_radius_px: int) -> Iterator[tuple[_Ellipse, list[_Ellipse]]]:
+def _with_neighbours(ellipses: Sequence[Ellipse], denoise_radius_px: int) -> Iterator[tuple[Ellipse, list[Ellipse]]]:
     """Each ellipse with the others whose surroundings overlap its own."""
+    if len(ellipses) == 1:
+        yield ellipses[0], []
+        return
     fringe_px = max((ellipse.fringe_px for ellipse in ellipses), default=0.0)
     margin_px = MARGIN_PX + max(denoise_radius_px, fringe_px)
     centres = np.array([ellipse.centre_px for ellipse in ellipses]).reshape(-1, 2)
@@ -245,7 +200,7 @@ def levels_of(smooth: Sequence[NDArray[np.float32]], whole: bool, brightest_e: f
 
 def _ellipses(
     smooth: NDArray[np.float32], background_e: float, threshold_e: float, largest_px: float, stretch: float
-) -> tuple[list[_Ellipse], tuple[int, int]]:
+) -> tuple[list[Ellipse], tuple[int, int]]:
     """Blobs above the threshold, cut at half of their own level, as ellipses with axes longer by `stretch`.
 
     Also returns how many blobs are too small, and too large.
@@ -283,7 +238,7 @@ def _ellipses(
     return ellipses, (small, large)
 
 
-def _ellipse(core: NDArray[np.bool_], left: int, top: int, stretch: float) -> _Ellipse:
+def _ellipse(core: NDArray[np.bool_], left: int, top: int, stretch: float) -> Ellipse:
     """Ellipse with the centroid and second moments of the pixels set; (left, top) is the first pixel of `core`."""
     weights = core.astype(np.float64)
     of_columns, of_rows = weights.sum(axis=0), weights.sum(axis=1)
@@ -291,18 +246,18 @@ def _ellipse(core: NDArray[np.bool_], left: int, top: int, stretch: float) -> _E
     u_px, v_px = np.arange(core.shape[1]) + left + 0.5, np.arange(core.shape[0]) + top + 0.5
     centre = np.array([of_columns @ u_px, of_rows @ v_px]) / count
     du, dv = u_px - centre[0], v_px - centre[1]
-    mixed = dv @ weights @ du
-    moments = np.array([[of_columns @ du**2, mixed], [mixed, of_rows @ dv**2]]) / count
-    variances, axes = np.linalg.eigh(moments)
+    variances, axes = _principal_axes(second_moments(weights, du, dv) / count)
     # A uniform ellipse has variance a^2 / 4 along its semi-axis a.
     semi_axes_px = 2 * stretch * np.sqrt(np.maximum(variances, 0)) + 0.5
-    columns, rows = np.flatnonzero(of_columns), np.flatnonzero(of_rows)
+    (columns,), (rows,) = of_columns.nonzero(), of_rows.nonzero()
     low_px = np.array([columns[0] + left, rows[0] + top], dtype=np.float64)
     high_px = np.array([columns[-1] + left + 1, rows[-1] + top + 1], dtype=np.float64)
-    return _Ellipse(centre, axes, semi_axes_px, low_px, high_px, int(count), stretch)
+    uses_core = semi_axes_px.max() > (LARGE_PX if stretch == 1.0 else SMALL_PX)
+    own = core[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] if uses_core else None
+    return Ellipse(centre, axes, semi_axes_px, low_px, high_px, int(count), stretch, core=own)
 
 
-def _fringe_px(ellipse: _Ellipse, low_px: NDArray[np.int64], high_px: NDArray[np.int64]) -> float:
+def _fringe_px(ellipse: Ellipse, low_px: NDArray[np.int64], high_px: NDArray[np.int64]) -> float:
     """Width by which a blob's box exceeds its core's, less the smoothing's; 0 if the fringe is not the LED image's own.
 
     A fringe wider than the LED image itself is not its blur but another bright object.
@@ -311,110 +266,24 @@ def _fringe_px(ellipse: _Ellipse, low_px: NDArray[np.int64], high_px: NDArray[np
     return FRINGE_EXTENSION * float(fringe_px) if 0 < fringe_px < ellipse.semi_axes_px.max() else 0.0
 
 
-@dataclass(frozen=True, eq=False)
-class _Light:
-    """Light of an LED image: pixels of a rectangle `roi` at u (1, columns) and v (rows, 1), of its region's own.
-
-    `signal_e` (rows, columns) are electrons above the background, 0 outside the support; `variance_e2` is the variance
-    of every pixel.
-    """
-
-    roi: tuple[slice, slice]
-    u_px: NDArray[np.float64]
-    v_px: NDArray[np.float64]
-    electrons: NDArray[np.float64]
-    support: NDArray[np.bool_]
-    signal_e: NDArray[np.float64]
-    variance_e2: NDArray[np.float64]
-
-    @property
-    def flux_e(self) -> float:
-        """Sum of the signal, electrons."""
-        return float(self.signal_e.sum())
-
-    @property
-    def signal_to_noise(self) -> float:
-        """Flux over its standard deviation."""
-        return self.flux_e / max(float(np.sqrt(self.variance_e2[self.support].sum())), 1e-300)
-
-    def centroid_px(self) -> NDArray[np.float64]:
-        """Centroid (u, v), (2,)."""
-        by_column, by_row = self.signal_e.sum(axis=0), self.signal_e.sum(axis=1)
-        return np.array([by_column @ self.u_px[0], by_row @ self.v_px[:, 0]]) / self.flux_e
-
-    def moments_px2(self, centroid_px: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Second moments about the centroid, (2, 2)."""
-        du, dv = self.u_px - centroid_px[0], self.v_px - centroid_px[1]
-        mixed = float((du * dv * self.signal_e).sum())
-        uu, vv = float((du**2 * self.signal_e).sum()), float((dv**2 * self.signal_e).sum())
-        return np.array([[uu, mixed], [mixed, vv]]) / self.flux_e
-
-    def moment_sigmas_px2(self, centroid_px: NDArray[np.float64], moments: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Standard deviations (2,) of the second moments (2,) along u and v by the pixels' noise."""
-        along = (self.u_px - centroid_px[0]) ** 2 - moments[0], (self.v_px - centroid_px[1]) ** 2 - moments[1]
-        noise = [float((np.where(self.support, one, 0.0) ** 2 * self.variance_e2).sum()) for one in along]
-        return np.sqrt(noise) / self.flux_e
+def _principal_axes(moments: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Eigenvalues (2,) and, as columns, unit eigenvectors (2, 2) of second moments (2, 2)."""
+    (uu, uv), (_, vv) = moments.tolist()
+    angle, middle, half = math.atan2(2 * uv, uu - vv) / 2, (uu + vv) / 2, math.hypot(uu - vv, 2 * uv) / 2
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([middle + half, middle - half]), np.array([[c, -s], [s, c]])
 
 
-def _light(readout: Readout, ellipse: _Ellipse, others: list[_Ellipse], denoise_radius_px: int) -> _Light:
-    """Light in the ellipse and a margin; the background is that of a ring around them."""
-    margin_px = MARGIN_PX + max(denoise_radius_px, ellipse.fringe_px)
-    height_px, width_px = readout.image_e.shape
-    half_extent = ellipse.half_extent(margin_px + RING_PX)
-    left, top = np.maximum(np.floor(ellipse.centre_px - half_extent), 0).astype(int)
-    right, bottom = np.minimum(np.ceil(ellipse.centre_px + half_extent), (width_px, height_px)).astype(int)
-    roi = np.s_[top:bottom, left:right]
-    u_px, v_px = np.arange(left, right)[None, :] + 0.5, np.arange(top, bottom)[:, None] + 0.5
-    electrons = readout.image_e[roi].astype(np.float64)
-    distance2 = ellipse.distance2(u_px, v_px, margin_px)
-    support = distance2 <= 1
-    ring = ~support & (ellipse.distance2(u_px, v_px, margin_px + RING_PX) <= 1)
-    for other in others:
-        # A pixel in two supports belongs to the nearer spot.
-        other_distance2 = other.distance2(u_px, v_px, MARGIN_PX + max(denoise_radius_px, other.fringe_px))
-        support &= distance2 <= other_distance2
-        ring &= other_distance2 > 1
-    # Shot noise: a raw pixel's variance is its electrons.
-    raw_e = np.maximum(readout.raw_e[roi].astype(np.float64), 0.0)
-    variance_e2 = raw_e + readout.floor_e2 + (readout.prnu * raw_e) ** 2
-    background_e = 0.0
-    if ring.any():
-        # One electron more: the noise of a pixel with fewer is not normal.
-        gate_e = BACKGROUND_SIGMA * float(np.sqrt(np.median(variance_e2[ring]) + 1.0))
-        # The ring without pixels of another surface or light.
-        ring &= np.abs(electrons - np.median(electrons[ring])) <= gate_e
-        background_e = float(electrons[ring].mean())
-        if np.count_nonzero(ring) >= MIN_RING_PIXELS:
-            unlit = support & (electrons - background_e <= gate_e)
-            excess_e2 = _excess_variance(readout, readout.raw_e[roi][ring], float(variance_e2[ring].mean()))
-            variance_e2[unlit] = np.maximum(variance_e2[unlit] + excess_e2, 0.0)
-    signal_e = np.where(support, electrons - background_e, 0.0)
-    return _Light(roi, u_px, v_px, electrons, support, signal_e, variance_e2)
-
-
-def _excess_variance(readout: Readout, ring_e: NDArray[np.float32], model_e2: float) -> float:
-    """Variance of a pixel without light of an LED, by the ring's pixels, less that by the model, electrons squared.
-
-    It is negative where the ADC's steps exceed the noise: neighbouring pixels are then rounded alike, while the model's
-    rounding errors are independent. It is positive where the background has a structure.
-    """
-    excess_e2 = float(ring_e.var(ddof=1, dtype=np.float64)) - model_e2
-    if readout.rounding_e2 > MAX_ROUNDING_SHARE * model_e2:
-        return excess_e2
-    # The variance of n normal numbers has a relative standard deviation of sqrt(2 / n).
-    return excess_e2 if excess_e2 > STRUCTURE_SIGMA * np.sqrt(2 / ring_e.size) * model_e2 else 0.0
-
-
-def _narrowed(readout: Readout, ellipse: _Ellipse, others: list[_Ellipse]) -> _Ellipse:
+def _narrowed(readout: Readout, ellipse: Ellipse, others: list[Ellipse]) -> Ellipse:
     """The ellipse, or that of the light's second moments if the smoothing has widened it."""
     if ellipse.semi_axes_px.max() > SMALL_PX:
         return ellipse
     for _ in range(2):
-        light = _light(readout, ellipse, others, 0)
+        light = light_of(readout, ellipse, others, 0)
         if light.signal_to_noise < MIN_SIGNAL_FOR_MOMENTS:
             return ellipse
         centroid = light.centroid_px()
-        variances, axes = np.linalg.eigh(light.moments_px2(centroid))
+        variances, axes = _principal_axes(light.moments_px2(centroid))
         semi_axes_px = 2 * ellipse.stretch * np.sqrt(np.maximum(variances, 0)) + 0.5
         if (semi_axes_px >= ellipse.semi_axes_px).any():
             return ellipse
@@ -458,18 +327,13 @@ def _corrected_for_sampling(
     ]
 
 
-def _measure(readout: Readout, ellipse: _Ellipse, others: list[_Ellipse], denoise_radius_px: int) -> _Measured | None:
+def _measure(readout: Readout, ellipse: Ellipse, others: list[Ellipse], denoise_radius_px: int) -> _Measured | None:
     """Centroid and covariance of one spot; None if its signal-to-noise ratio is too small."""
     height_px, width_px = readout.image_e.shape
-    light = _light(readout, ellipse, others, denoise_radius_px)
+    light = light_of(readout, ellipse, others, denoise_radius_px)
     if light.signal_to_noise <= MIN_SIGNAL_TO_NOISE:
         return None
     centroid, u_px, v_px = light.centroid_px(), light.u_px, light.v_px
-    # A centroid of box means is a sum over the raw pixels, weighted by the box means of the centroid's weights.
-    box = (2 * denoise_radius_px + 1, 2 * denoise_radius_px + 1)
-    levers = np.stack([light.support * (u_px - centroid[0]), light.support * (v_px - centroid[1])]) / light.flux_e
-    weights = np.stack([cv2.blur(lever, box, borderType=cv2.BORDER_CONSTANT).ravel() for lever in levers])
-    covariance = (weights * light.variance_e2.ravel()) @ weights.T
     moments = np.diag(light.moments_px2(centroid))
 
     inside = ellipse.distance2(u_px, v_px, 0.0) <= 1
@@ -479,7 +343,7 @@ def _measure(readout: Readout, ellipse: _Ellipse, others: list[_Ellipse], denois
     spot = Spot(
         u_px=float(centroid[0]) + readout.column,
         v_px=float(centroid[1]) + readout.row,
-        covariance_px2=covariance,
+        covariance_px2=light.covariance_px2(centroid, denoise_radius_px),
         brightest_u_px=float(u_px[0, brightest[1]]) + readout.column,
         brightest_v_px=float(v_px[brightest[0], 0]) + readout.row,
         area_px=ellipse.area_px,

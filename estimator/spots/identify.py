@@ -16,6 +16,8 @@ CENTROID_PX = 0.25
 GATE_SIGMA = 4.0
 # The second nearest spot has to be this many times further from a decoded pixel, or the identity is ambiguous.
 CLEARANCE = 2.0
+# Half the length of a blob of three LED images in a row, in radii of a disc of the blob's area.
+MERGED_RADII = 3**0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,10 +39,10 @@ def identify(
     """Match spots and decoded identities one to one; the result is in the order of `decoded`.
 
     An identity is assigned its nearest spot, at most `gate_px` away, unless another spot is within CLEARANCE times that
-    distance, or another identity has the same nearest spot: a merged blob is assigned to no LED. Spots that touch the
-    image's border take part, so that their identity is not assigned to another spot, and are then left out because
-    their centroid is biased. Raises EstimationFailure, with the number of identities by cause, if no correspondence is
-    left.
+    distance, another identity has the same nearest spot, or one without a spot lies in this one: a merged blob is
+    assigned to no LED. Spots that touch the image's border take part, so that their identity is not assigned to another
+    spot, and are then left out because their centroid is biased. Raises EstimationFailure, with the number of
+    identities by cause, if no correspondence is left.
     """
     if not decoded:
         raise EstimationFailure("identify", "no identity was decoded")
@@ -50,6 +52,8 @@ def identify(
     nearest = np.argmin(distance_px, axis=1)
     inside = distance_px.min(axis=1) <= gate_px
     identities_of_spot = np.bincount(nearest[inside], minlength=len(spots))
+    half_length_px = MERGED_RADII * np.sqrt([spot.area_px / np.pi for spot in spots])
+    identities_of_spot += (distance_px[~inside] < half_length_px).sum(axis=0)
     correspondences = []
     beyond, unclear, cut = 0, 0, 0
     for row, identity in enumerate(decoded):

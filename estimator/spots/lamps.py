@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from estimator.camera.projection import relative_illumination
 from estimator.io.device import Camera, DeviceFrame
 from estimator.io.downlink import Codes, Downlink, Packets, SquareFace, Tones, Transmitter
-from estimator.spots.detect import Readout
+from estimator.spots.led_light import Readout
 from estimator.spots.striped import Lamp, find_lamps
 
 Floats = NDArray[np.float64]
@@ -61,7 +61,10 @@ def lamps_of(frame: DeviceFrame) -> tuple[Lamp, ...]:
     squares = any(led.shape == "square" for led in frame.leds.values())
     squares |= any(isinstance(one, Packets) and isinstance(one.led, SquareFace) for one in downlink.transmitters)
     sensor_px = frame.camera.width_px * frame.camera.height_px
-    return find_lamps(readouts_of(frame), shutter.along, stripe_px, sensor_px, squares)
+    return frame.once(
+        ("lamps", stripe_px, squares),
+        lambda: find_lamps(readouts_of(frame), shutter.along, stripe_px, sensor_px, squares),
+    )
 
 
 def light_centre_px(lamp: Lamp, camera: Camera) -> Floats:

@@ -33,6 +33,9 @@ SHAPE_UNCERTAINTY = 0.003
 MIN_HALF_EXTENT_PX = 0.7
 # A centroid that moves by less than this share of the LED image's movement says little about it.
 MIN_SLOPE = 0.3
+# Second moment by light beyond the two columns around the centroid below which the half extent is not determined: 1 %
+# of the light in a third column adds 0.02 px^2 at most.
+MIN_THIRD_COLUMN_PX2 = 0.02
 MAX_ROUNDS = 30
 CONVERGED_PX = 1e-5
 SOLVED_PX = 1e-3
@@ -96,6 +99,10 @@ def sampling_error(centroid_px: Floats, moments_px2: Floats, moment_sigmas_px2: 
     true_px, half_px, solved = _solve(centroid_px, moments_px2)
     step_px = 1e-3
     by_half = (_moments(true_px, half_px + step_px) - _moments(true_px, half_px - step_px)) / (2 * step_px)
+    by_centre = (_moments(true_px + step_px, half_px) - _moments(true_px - step_px, half_px)) / (2 * step_px)
+    error_by_half = (_error(true_px, half_px + step_px)[0] - _error(true_px, half_px - step_px)[0]) / (2 * step_px)
+    # The sampled centroid is given: the true one changes with the half extent.
+    by_half -= by_centre * error_by_half / np.maximum(_error(true_px, half_px)[1], MIN_SLOPE)
     model_px2 = SHAPE_UNCERTAINTY * half_px**2 / 2
     sigma_px = np.hypot(moment_sigmas_px2, model_px2) / np.maximum(np.abs(by_half), 1e-6)
     shrinking = np.exp(-((2 * np.pi * HARMONICS * sigma_px[:, None]) ** 2) / 2)
@@ -104,7 +111,9 @@ def sampling_error(centroid_px: Floats, moments_px2: Floats, moment_sigmas_px2: 
     x = 2 * np.pi * HARMONICS * half_px[:, None]
     envelope2 = np.minimum(8 / (np.pi * x**3), 1.0)
     rest = (envelope2 * (1 - shrinking**2) / (np.pi * HARMONICS) ** 2).sum(axis=1) / 2
-    usable = solved & (slope > MIN_SLOPE)
+    # Light in two columns alone has the second moment p (1 - p) with the share p of one: nothing of its half extent.
+    share = (centroid_px - 0.5) % 1
+    usable = solved & (slope > MIN_SLOPE) & (moments_px2 - share * (1 - share) > MIN_THIRD_COLUMN_PX2)
     return SamplingError(
         error_px=np.where(usable, error_px, 0.0),
         variance_px2=np.where(usable, rest, sampling_variance_px2(half_px, square=False)),

@@ -25,9 +25,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.spots.detect import MAX_BLOB_OF_FRAME, Readout, Spot, brightest_of, levels_of
+from estimator.spots.detect import MAX_BLOB_OF_FRAME, Spot, brightest_of, levels_of
 from estimator.spots.ellipse_fit import fit_ellipse
 from estimator.spots.glow import glow
+from estimator.spots.led_light import Readout
 from estimator.spots.line_edges import LineEdges, edges_of
 from estimator.spots.line_profile import Profile, is_striped, profile_of
 from estimator.spots.outlines import EdgeEllipse, Outline, OutlineFit, moved_outline

@@ -7,7 +7,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.spots.detect import MAX_BLOBS, MIN_BLOB_PX, Readout
+from estimator.spots.detect import MAX_BLOBS, MIN_BLOB_PX
+from estimator.spots.led_light import Readout
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]

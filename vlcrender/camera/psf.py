@@ -9,8 +9,8 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import signal
 from scipy.special import j1, ndtr
 
 from vlcrender.camera.intrinsics import Camera
@@ -29,6 +29,8 @@ DISC_OF_GAUSSIAN = 4 / np.pi * np.sqrt(2 * np.pi)
 """Diameter of the disc whose line spread function is as high as a normal one's, in standard deviations."""
 MAX_DEVIATIONS = 4.5
 """Radius of the kernel of a normal blur, in standard deviations: exp(-4.5^2 / 2) = 4e-5 of the light is beyond."""
+BAND_ROWS = 1000
+"""Rows that are blurred together."""
 MAX_PARTS = 64
 """Most parts across a pixel. A disc narrower than a part is ignored: it moves 0.2 % of an edge pixel's light."""
 
@@ -77,7 +79,7 @@ def blur_kernel(camera: Camera, depth_m: float, sigma_px: float = 0.0) -> Array 
     """
     kernel = _kernel(camera, float(defocus_diameter_px(camera, depth_m)), sigma_px, 1)
     if camera.psf_kernel is not None:
-        kernel = signal.convolve(kernel, np.array(camera.psf_kernel), method="direct")
+        kernel = scipy.signal.convolve(kernel, np.array(camera.psf_kernel), method="direct")
     kernel = kernel / kernel.sum()
     return kernel if kernel.size > 1 else None
 
@@ -140,7 +142,7 @@ def split_kernel(camera: Camera, depth_m: float, sigma_px: float = 0.0) -> Split
     parts = np.stack([[in_pixel[n - 1 - i :: n, n - 1 - j :: n] for j in range(n)] for i in range(n)])
     parts = np.maximum(parts, 0.0)
     if camera.psf_kernel is not None:
-        parts = signal.oaconvolve(parts, np.array(camera.psf_kernel)[None, None], mode="full", axes=(2, 3))
+        parts = scipy.signal.oaconvolve(parts, np.array(camera.psf_kernel)[None, None], mode="full", axes=(2, 3))
     return SplitKernel(parts / parts.sum(axis=(2, 3), keepdims=True))
 
 
@@ -150,7 +152,7 @@ def _kernel(camera: Camera, disc_px: float, sigma_px: float, n: int) -> Array:
     line = _normal_line(sigma_px * n)
     if line.size == 1:
         return kernel
-    blurred: Array = np.maximum(signal.oaconvolve(kernel, np.outer(line, line), mode="full"), 0.0)
+    blurred: Array = np.maximum(scipy.signal.oaconvolve(kernel, np.outer(line, line), mode="full"), 0.0)
     return blurred
 
 
@@ -188,7 +190,7 @@ def _blurred_airy(scale_px: float, disc_px: float, n: int) -> Array:
         return _airy(scale_px, n)
     # Where the pattern is narrow, convolve on finer pixels: otherwise the average over a pixel would enter twice.
     finer = 5 if scale_px * n < 3 else 1
-    fine = signal.fftconvolve(_disc(disc_px * n * finer), _airy(scale_px, n * finer))
+    fine = scipy.signal.fftconvolve(_disc(disc_px * n * finer), _airy(scale_px, n * finer))
     radius = int(np.ceil((fine.shape[0] // 2 - finer // 2) / finer))
     padded = np.pad(fine, radius * finer + finer // 2 - fine.shape[0] // 2)
     pixels = 2 * radius + 1
@@ -224,20 +226,39 @@ def _four_quarters(quarter: Array) -> Array:
 
 
 def blur(image: NDArray[Any], kernel: Array | None, border: str = "zero") -> NDArray[Any]:
-    """Convolve an image of light (rows, columns) with a kernel in double precision; the result has the image's dtype.
+    """Convolve an image of light (rows, columns) with a kernel; the result has the image's dtype.
 
     border "zero": the image is dark beyond its border; the result is padded by the kernel's radius on each side and
-    holds all the light (LED patches). border "edge": border pixels are repeated; the result has the image's shape
-    (backgrounds). Negative pixels from rounding become 0. Without a kernel the image is returned.
+    holds all the light (LED patches); in double precision. border "edge": border pixels are repeated; the result has
+    the image's shape (backgrounds); in the image's precision. Negative pixels from rounding become 0. Without a kernel
+    the image is returned.
     """
     if kernel is None:
         return image
     if border == "edge":
-        wide = np.pad(image, kernel.shape[0] // 2, mode="edge").astype(np.float64)
-        blurred = signal.oaconvolve(wide, kernel, mode="valid")
-    else:
-        blurred = signal.oaconvolve(image.astype(np.float64), kernel, mode="full")
-    return np.maximum(blurred, 0.0).astype(image.dtype)
+        return _blurred_in_bands(image, kernel.astype(image.dtype))
+    return np.maximum(spread(image.astype(np.float64), kernel), 0.0).astype(image.dtype)
+
+
+def _blurred_in_bands(image: NDArray[Any], kernel: NDArray[Any]) -> NDArray[Any]:
+    """An image whose border pixels are repeated, blurred in bands of rows, which bounds the memory."""
+    radius, rows = kernel.shape[0] // 2, len(image)
+    blurred = np.empty_like(image)
+    for start in range(0, rows, BAND_ROWS):
+        end = min(start + BAND_ROWS, rows)
+        inside = image[max(0, start - radius) : end + radius]
+        above, below = max(0, radius - start), max(0, end + radius - rows)
+        wide = np.pad(inside, ((above, below), (radius, radius)), mode="edge")
+        np.maximum(scipy.signal.oaconvolve(wide, kernel, mode="valid"), 0.0, out=blurred[start:end])
+    return blurred
+
+
+def spread(light: Array, kernel: Array | None) -> Array:
+    """Convolve numbers of either sign with a kernel; the result is padded by the kernel's radius on each side."""
+    if kernel is None:
+        return light
+    spread: Array = scipy.signal.oaconvolve(light, kernel, mode="full")
+    return spread
 
 
 def kernel_radius_px(kernel: Array | None) -> int:

@@ -1,6 +1,6 @@
 """Regions of interest: the rectangles of a sensor that are read out."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, NamedTuple, Self
 
@@ -96,6 +96,13 @@ class RegionImage(NamedTuple):
     roi: Roi
     image: NDArray[Any]
     """(rows, columns)."""
+
+
+def pixel_numbers(rois: Sequence[Roi]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Columns and rows on the sensor of all pixels of all regions, region by region, row by row, (pixels,) each."""
+    columns = [np.tile(np.arange(roi.column, roi.end_column, dtype=np.int32), roi.rows) for roi in rois]
+    rows = [np.repeat(np.arange(roi.row, roi.end_row, dtype=np.int32), roi.columns) for roi in rois]
+    return np.concatenate(columns), np.concatenate(rows)
 
 
 def led_regions(led_rois: Iterable[Roi], camera: Camera, settings: LedRegions) -> tuple[Roi, ...]:

@@ -39,6 +39,11 @@ class FaceProfile:
         value: Array = self.level + slope_x * x_m + slope_y * y_m + self.curvature_per_m2 * (x_m**2 + y_m**2)
         return value
 
+    def slopes(self, x_m: Array, y_m: Array) -> tuple[Array, Array]:
+        """Slopes of `at` by x and by y, 1/m."""
+        slope_x, slope_y = self.slopes_per_m
+        return slope_x + 2 * self.curvature_per_m2 * x_m, slope_y + 2 * self.curvature_per_m2 * y_m
+
     def mean_over(self, quads_m: Array) -> Array:
         """Mean over quadrilaterals (n, 4, 2) that lie on the face whole, (n,).
 

@@ -21,17 +21,6 @@ def kernel_seed(*parts: int | str) -> Any:
     return dr.opaque(mi.UInt64, key_number(KERNEL_KEY_BITS, *parts))
 
 
-def pixel_indices(shape: tuple[int, ...], row: int, column: int) -> tuple[Any, Any]:
-    """Column and row in the frame of each pixel of a region of this shape (rows, columns), flat, UInt32.
-
-    The region starts at (row, column), which may be negative: numbers are taken modulo 2^32.
-    """
-    columns, first_row, first_column = (dr.opaque(mi.UInt32, number % 2**32) for number in (shape[1], row, column))
-    index = dr.arange(mi.UInt32, shape[0] * shape[1])
-    down = index // columns
-    return first_column + (index - down * columns), first_row + down
-
-
 def normals(seed: Any, column: Any, row: Any) -> tuple[Any, Any]:
     """Two independent standard normal numbers a pixel, Float32 (Box & Muller, Ann. Math. Stat. 29 (1958) 610).
 

@@ -151,10 +151,10 @@ def _crossings_of_circle(polygons: Array, radius: float) -> tuple[Array, Array, 
     p = polygons
     q = np.roll(polygons, -1, axis=1)
     edge = q - p
-    length2 = np.maximum((edge**2).sum(-1), np.finfo(float).tiny)
+    length2 = np.maximum(_dot(edge, edge), np.finfo(float).tiny)
     # The edge meets the circle at p + t * edge with t = t_mid -+ half.
-    t_mid = -(p * edge).sum(-1) / length2
-    closest2 = np.maximum((p**2).sum(-1) - t_mid**2 * length2, 0.0)
+    t_mid = -_dot(p, edge) / length2
+    closest2 = np.maximum(_dot(p, p) - t_mid**2 * length2, 0.0)
     half = np.sqrt(np.maximum(radius**2 - closest2, 0.0) / length2)
     meets = radius**2 > closest2
     enter = np.where(meets, np.clip(t_mid - half, 0.0, 1.0), 0.0)
@@ -162,7 +162,7 @@ def _crossings_of_circle(polygons: Array, radius: float) -> tuple[Array, Array, 
     a = p + enter[..., None] * edge
     b = p + leave[..., None] * edge
     # b is q where q is inside, except for rounding, which near the centre may change its direction by any angle.
-    at_center = (q**2).sum(-1) < (1e-3 * radius) ** 2
+    at_center = _dot(q, q) < (1e-3 * radius) ** 2
     return p, a, b, q, at_center
 
 
@@ -202,7 +202,7 @@ def _moved_into_rectangle(polygons: Array, half_x: float, half_y: float) -> Arra
 def _triangle_moments(a: Array, b: Array) -> Array:
     """Signed integrals of 1, x, y and x^2 + y^2 over triangles of the origin and the points a, b (..., 2), (4, ...)."""
     area = _cross(a, b) / 2
-    second = area / 6 * ((a * a).sum(-1) + (a * b).sum(-1) + (b * b).sum(-1))
+    second = area / 6 * (_dot(a, a) + _dot(a, b) + _dot(b, b))
     return np.stack([area, *(area / 3 * np.moveaxis(a + b, -1, 0)), second])
 
 
@@ -222,8 +222,13 @@ def _cross(a: Array, b: Array) -> Array:
     return product
 
 
+def _dot(a: Array, b: Array) -> Array:
+    product: Array = a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1]
+    return product
+
+
 def _angle(a: Array, b: Array) -> Array:
-    angle: Array = np.arctan2(_cross(a, b), (a * b).sum(-1))
+    angle: Array = np.arctan2(_cross(a, b), _dot(a, b))
     return angle
 
 

@@ -8,12 +8,12 @@ alone, as if lens and map were exact. Figures are root mean squares over the pos
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.rig import MAIN, Mounted
 from vlcrender.camera.roi import RegionImage
 from vlcrender.core.warn_once import warn_once
@@ -24,7 +24,6 @@ from vlcrender.dataset.true_world import tilt_sigmas_deg
 from vlcrender.errors import InputError
 from vlcrender.rendering.bayer import MosaicRenderer
 from vlcrender.rendering.crlb import FrameSlopes
-from vlcrender.rendering.expected_image import LedPatch
 from vlcrender.rendering.renderer import Renderer, check_inside
 from vlcrender.rendering.spot_errors import ACCELEROMETER, NOISE, SpotErrors
 from vlcrender.rendering.uncertainty import Uncertainty
@@ -232,13 +231,10 @@ def spot_errors_at(
     exposure_s = recipe.time_s(view)
     tilts = tilt_sigmas_deg(recipe, main)
 
-    def patches(posed: PosedCamera) -> Sequence[LedPatch]:
-        return renderer.led_patches(posed, recipe.regions, at.pose)
-
     slopes = FrameSlopes.rendered(
         mounted,
         main,
-        patches,
+        partial(renderer.led_slopes, regions=recipe.regions),
         exposure_s,
         [
             RegionImage(part.roi, variance_e2(recipe.sensor, part.expected_electrons(exposure_s), exposure_s))

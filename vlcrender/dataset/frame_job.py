@@ -2,8 +2,9 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property, lru_cache
+from functools import cache, cached_property, lru_cache, partial
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from vlcrender.dataset.files import EXPECTED, FRAMES, PREVIEWS, PROCESSED
 from vlcrender.dataset.motion import poses_during
 from vlcrender.dataset.pose_sampling import pose_of_frame
 from vlcrender.dataset.preview import write_preview
-from vlcrender.dataset.recipe import Recipe
+from vlcrender.dataset.recipe import Plan, Recipe
 from vlcrender.dataset.schema import Flat9, FrameRecord, FrameRow, LedTruth, SpotRow, TruthRow, five, flat9, triple
 from vlcrender.dataset.true_world import (
     built_leds,
@@ -45,7 +46,7 @@ from vlcrender.scene.loader import Scene, build_scene
 from vlcrender.scene.schema import SceneSettings
 from vlcrender.sensor.radiometry import detectors, electron_rate_per_cd_m2
 from vlcrender.sensor.sensor import Sensor
-from vlcrender.sensor.signal_chain import expose, variance_e2
+from vlcrender.sensor.signal_chain import expose_regions, variance_e2
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,18 @@ class Job:
     scene_json: str
     scene_folder: str
     directory: str
+
+    @classmethod
+    def of(cls, plan: Plan, directory: Path) -> Self:
+        """The job of a plan. In this process its frames use the plan's scene, which is not loaded again."""
+        scene, folder = plan.scene.settings.model_dump_json(), str(plan.scene.folder)
+        _loaded.clear()
+        _loaded[scene, folder] = plan.scene
+        return cls(plan.recipe.model_dump_json(), scene, folder, str(directory))
+
+
+_loaded: dict[tuple[str, str], Scene] = {}
+"""The scene of the latest job that this process made, by its JSON and folder."""
 
 
 def make_frames(job: Job, frames: Sequence[int]) -> list[FrameRecord]:
@@ -86,10 +99,7 @@ def make_frame(job: Job, frame: int) -> FrameRecord:
     exposed = view.exposed(waves, start_s)
     noise = random_key(recipe.seed, frame, "shot-noise")
     of_device = device_sensor(recipe, device)
-    dn = [
-        RegionImage(roi, expose(of_device, mean, noise, roi.row, roi.column, exposure_s=exposure_s, camera=told.name))
-        for roi, mean in exposed.expected
-    ]
+    dn = expose_regions(of_device, exposed.expected, noise, exposure_s=exposure_s, camera=told.name)
     attributes = exr_attributes(camera, told.name, exposure_s, frame)  # of the told camera: a reader sees them
     file = f"{FRAMES}/{frame:06d}.exr"
     digest = write_exr(directory / file, dn, sensor, attributes)
@@ -243,7 +253,7 @@ class _View:
         return FrameSlopes.rendered(
             mounted,
             main,
-            lambda posed: renderer.led_patches(posed, recipe.regions, at.pose),
+            partial(renderer.led_slopes, regions=recipe.regions),
             self.exposure_s,
             [],
             float(np.median(np.linalg.norm(renderer.scene.leds.centers_m - at.position_m, axis=1))),
@@ -312,7 +322,9 @@ def _white_balance(camera: Camera, sensor: Sensor, scene: Scene) -> tuple[float,
 @cache
 def _renderer(recipe_json: str, scene_json: str, scene_folder: str) -> tuple[Recipe, Renderer | MosaicRenderer]:
     """The recipe and its renderer; one for each process and plan."""
-    scene = build_scene(SceneSettings.model_validate_json(scene_json), "scene", Path(scene_folder))
+    scene = _loaded.get((scene_json, scene_folder))
+    if scene is None:
+        scene = build_scene(SceneSettings.model_validate_json(scene_json), "scene", Path(scene_folder))
     recipe, light = Recipe.model_validate_json(recipe_json), bake(scene)
     sensor = recipe.sensor
     if sensor.mosaic == "none":

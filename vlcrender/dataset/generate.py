@@ -13,7 +13,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from functools import cache, partial
 from importlib.metadata import version
-from itertools import groupby, product
+from itertools import accumulate, groupby, product
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +59,9 @@ from vlcrender.sensor.radiometry import detectors
 
 log = logging.getLogger(__name__)
 
+JOURNAL = "journal.jsonl"
+"""File of an unfinished dataset with a line for each frame that is complete."""
+
 
 def generate(
     plan: Plan,
@@ -100,9 +103,7 @@ def generate(
             built_leds(plan.recipe, plan.scene, map_number)
     room_mesh(plan.scene)  # impossible furniture ends the run before anything is written
     _prepare(directory, provenance, plan.recipe)
-    job = Job(
-        plan.recipe.model_dump_json(), plan.scene.settings.model_dump_json(), str(plan.scene.folder), str(directory)
-    )
+    job = Job.of(plan, directory)
     done = _journal(directory, plan.recipe)
     total = plan.recipe.frame_count
     missing = [frame for frame in range(total) if frame not in done]
@@ -115,13 +116,13 @@ def generate(
     _warn_of_flicker(plan)
     for warning in light_warnings(plan.recipe, plan.scene):
         warn_once(log, warning)
-    with (directory / "journal.jsonl").open("a", encoding="utf-8") as journal:
+    with (directory / JOURNAL).open("ab") as journal:
         for record in _records(job, _bursts(missing, plan.recipe), workers, scheduler):
-            done[record.frame] = record
-            journal.write(record.model_dump_json() + "\n")
+            done[record.frame] = journal.tell()
+            journal.write(_line(record))
             journal.flush()
             report(Progress(FRAMES_STAGE, len(done), total))
-    _finish(plan, directory, provenance, [done[frame] for frame in sorted(done)])
+    _finish(plan, directory, provenance, done)
     return True
 
 
@@ -287,12 +288,15 @@ def _prepare(directory: Path, provenance: dict[str, Any], recipe: Recipe) -> Non
     write_json(plan_file, {"provenance": provenance})
 
 
-def _journal(directory: Path, recipe: Recipe) -> dict[int, FrameRecord]:
-    """Frames that an interrupted run finished and whose files are still intact; the journal then holds these alone."""
-    path = directory / "journal.jsonl"
+def _journal(directory: Path, recipe: Recipe) -> dict[int, int]:
+    """Frames that an interrupted run finished and whose files are still intact; the journal then holds these alone.
+
+    Each with the place of its line in the journal: the memory of a run does not grow with records of frames.
+    """
+    path = directory / JOURNAL
     if not path.exists():
         return {}
-    done: dict[int, FrameRecord] = {}
+    done: dict[int, bytes] = {}
     lines = path.read_text(encoding="utf-8").splitlines()
     for line in lines:
         try:
@@ -301,21 +305,34 @@ def _journal(directory: Path, recipe: Recipe) -> dict[int, FrameRecord]:
             continue  # a line that a crash truncated: its frame is made again
         file = directory / record.device.file
         if file.is_file() and sha256_of(file) == record.device.sha256:
-            done[record.frame] = record
+            done[record.frame] = _line(record)
     folders = extra_folders(recipe.expected, recipe.processed is not None)
     for frame in missing_files(directory, folders, list(done)):
         del done[frame]
     if len(done) < len(lines):
         log.warning("%s: %d frames are damaged or incomplete and are made again", path, len(lines) - len(done))
     with whole_file(path) as partial:
-        partial.write_text("".join(record.model_dump_json() + "\n" for record in done.values()), encoding="utf-8")
-    return done
+        partial.write_bytes(b"".join(done.values()))
+    return dict(zip(done, accumulate(map(len, done.values()), initial=0), strict=False))
 
 
-def _finish(plan: Plan, directory: Path, provenance: dict[str, Any], records: list[FrameRecord]) -> None:
-    recipe, scene = plan.recipe, plan.scene
-    write_table(directory / "frames.parquet", [record.device for record in records], FrameRow)
-    write_table(directory / "truth.parquet", [record.truth for record in records], TruthRow)
+def _line(record: FrameRecord) -> bytes:
+    """The journal's line of a frame."""
+    return record.model_dump_json().encode() + b"\n"
+
+
+def _recorded(path: Path, places: dict[int, int]) -> Iterator[FrameRecord]:
+    """The frames of a journal, of which each has its place, in order of their numbers."""
+    with path.open("rb") as journal:
+        for frame in sorted(places):
+            journal.seek(places[frame])
+            yield FrameRecord.model_validate_json(journal.readline())
+
+
+def _finish(plan: Plan, directory: Path, provenance: dict[str, Any], places: dict[int, int]) -> None:
+    recipe, scene, journal = plan.recipe, plan.scene, directory / JOURNAL
+    write_table(directory / "frames.parquet", (record.device for record in _recorded(journal, places)), FrameRow)
+    write_table(directory / "truth.parquet", (record.truth for record in _recorded(journal, places)), TruthRow)
     sigmas = luminaires = None
     told_map = recipe.map == "given"
     if recipe.belief is not None:
@@ -328,7 +345,7 @@ def _finish(plan: Plan, directory: Path, provenance: dict[str, Any], records: li
         format="vlcrender-dataset",
         version=FORMAT_VERSION,
         name=recipe.name,
-        frame_count=len(records),
+        frame_count=len(places),
         cameras={
             mounted.name: camera_entry(mounted, None if sigmas is None else sigmas.cameras[mounted.name])
             for mounted in recipe.cameras
@@ -345,4 +362,4 @@ def _finish(plan: Plan, directory: Path, provenance: dict[str, Any], records: li
     )
     write_json(directory / "dataset.json", dataset.model_dump(mode="json"))
     (directory / "plan.json").unlink()
-    (directory / "journal.jsonl").unlink()
+    journal.unlink()

@@ -1,8 +1,10 @@
 """Poses of the frames: random ones that see LEDs, listed ones, or a grid."""
 
+from functools import lru_cache
 from typing import Annotated, Literal, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from vlcrender.camera.intrinsics import Camera, Pose
@@ -124,10 +126,8 @@ def pose_of_frame(poses: AnyPoses, frame: int, seed: int, camera: Camera, scene:
 def _aimed_pose(poses: AimedPoses, frame: int, seed: int, camera: Camera, scene: Scene) -> Pose:
     tilts = []
     for axis, (low, high) in (("x", poses.tilt_x_deg), ("y", poses.tilt_y_deg)):
-        # Latin hypercube: each axis is cut into `count` strata, shuffled against the other.
-        order = stream(seed, 0, f"tilt-{axis}-strata").permutation(poses.count)
         within = stream(seed, frame, f"tilt-{axis}").uniform()
-        tilts.append(low + (high - low) * (order[frame] + within) / poses.count)
+        tilts.append(low + (high - low) * (_strata(seed, axis, poses.count)[frame] + within) / poses.count)
     tilt_x, tilt_y = map(float, tilts)
     generator = stream(seed, frame, "aim")
     low_corner = np.array([poses.wall_distance_m, poses.wall_distance_m, 0.0])
@@ -158,6 +158,15 @@ def _aimed_pose(poses: AimedPoses, frame: int, seed: int, camera: Camera, scene:
         f"poses: frame {frame}: no position in {TRIES} tries sees {poses.min_leds} LEDs whole at tilts "
         f"({tilt_x:.1f}, {tilt_y:.1f}) deg: {seen}; lower min_leds or the tilts, or raise height_m"
     )
+
+
+@lru_cache(maxsize=4)
+def _strata(seed: int, axis: str, count: int) -> NDArray[np.int64]:
+    """Stratum of each pose's tilt about an axis, (count,): a Latin hypercube, each axis shuffled against the other.
+
+    Kept, since a permutation takes a time in proportion to `count`, and all poses of a set share it.
+    """
+    return stream(seed, 0, f"tilt-{axis}-strata").permutation(count)
 
 
 def _leds_seen(posed: PosedCamera, scene: Scene, poses: AimedPoses) -> int:

@@ -1,6 +1,7 @@
 """Parquet tables of row models: written whole or not at all, read back row by row."""
 
 from collections.abc import Iterable
+from itertools import islice
 from pathlib import Path
 from typing import TypeVar
 
@@ -15,12 +16,16 @@ from vlcrender.errors import InputError
 
 R = TypeVar("R", bound=Settings)
 
+ROWS_AT_ONCE = 1000
+"""Rows of a row group: bounds the memory of writing a table."""
+
 
 def write_table(path: Path, rows: Iterable[R], model: type[R]) -> None:
     """Write rows as a Parquet table; it appears whole or not at all. Raises InputError where it cannot be written."""
-    table = pa.Table.from_pylist([row.model_dump() for row in rows], schema=arrow_schema(model))
-    with whole_file(path) as partial:
-        pq.write_table(table, partial)
+    schema, remaining = arrow_schema(model), iter(rows)
+    with whole_file(path) as partial, pq.ParquetWriter(partial, schema) as writer:
+        while group := [row.model_dump() for row in islice(remaining, ROWS_AT_ONCE)]:
+            writer.write_table(pa.Table.from_pylist(group, schema=schema))
 
 
 def read_table(path: Path, model: type[R]) -> list[R]:

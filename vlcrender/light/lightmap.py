@@ -1,7 +1,7 @@
 """Lightmap: illuminance in lux at every vertex of the room's mesh, baked once per scene.
 
 Illuminance has three parts. Direct light of the LEDs, and its specular reflection by glazing, is a sum over point
-sources of each LED's Lambertian order, with one shadow ray each: no noise. Light that surfaces reflected at least once,
+sources (`direct_light`): no noise. Light that surfaces reflected at least once,
 and daylight through glazing, are path traced with Mitsuba, through a room whose surfaces emit the light of the LEDs
 that they reflect; their Monte Carlo standard error is kept. Ambient light has the same illuminance on every surface and
 includes its own reflections by definition.
@@ -14,6 +14,7 @@ import hashlib
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +24,11 @@ from numpy.typing import NDArray
 from vlcrender.core.backend import dr, exact_math, mi
 from vlcrender.core.warn_once import warn_once
 from vlcrender.light.bake_cache import BakedIlluminance, cache_folder, load, store
+from vlcrender.light.direct_light import RAY_OFFSET_M, led_illuminance_lux
 from vlcrender.light.mitsuba_room import mitsuba_scene
-from vlcrender.scene.fresnel import glazing_reflectance
-from vlcrender.scene.furniture import furniture_meshes
 from vlcrender.scene.loader import Scene
 from vlcrender.scene.mesh import Mesh, join, mesh_of_surfaces
-from vlcrender.scene.sources import Sources, point_sources
+from vlcrender.scene.sources import point_sources
 from vlcrender.scene.surfaces import Glazing, check_absorptance
 
 Array = NDArray[np.float64]
@@ -43,8 +43,6 @@ ROULETTE_DEPTH = 4
 """Bounces before Russian roulette begins."""
 MAX_RAYS = 4_000_000
 """Largest number of rays traced together, for memory."""
-RAY_OFFSET_M = 1e-4
-"""Distance of a ray's origin from its surface."""
 
 
 @dataclass(frozen=True)
@@ -61,21 +59,26 @@ class Lightmap:
     sigma_lux: Array
     """Monte Carlo standard error of the whole illuminance, (n,)."""
 
-    def led_cd_m2(self) -> Array:
-        """Luminance by reflected light of LEDs, (n,): albedo * illuminance / pi."""
-        return self.albedo * self.led_lux / np.pi
+    def led_cd_m2(self, places: slice = slice(None)) -> Array:
+        """Luminance by reflected light of LEDs at all places or some, (n,): albedo * illuminance / pi."""
+        return self.albedo[places] * self.led_lux[places] / np.pi
 
-    def ambient_cd_m2(self) -> Array:
-        """Luminance by reflected ambient light and daylight, (n,)."""
-        return self.albedo * self.ambient_lux / np.pi
+    def ambient_cd_m2(self, places: slice = slice(None)) -> Array:
+        """Luminance by reflected ambient light and daylight at all places or some, (n,)."""
+        return self.albedo[places] * self.ambient_lux[places] / np.pi
 
 
+@lru_cache(maxsize=1)
 def room_mesh(scene: Scene) -> Mesh:
     """Surfaces and furniture as one mesh; owners are the numbers of surfaces, then those of furniture.
 
-    Raises InputError for furniture that cannot be used.
+    The mesh of the latest scene is kept. Raises InputError for furniture that cannot be used.
     """
-    furniture = furniture_meshes(scene, len(scene.surfaces))
+    furniture: list[Mesh] = []
+    if scene.settings.furniture:
+        from vlcrender.scene.furniture import furniture_meshes  # loads trimesh
+
+        furniture = furniture_meshes(scene, len(scene.surfaces))
     texel_m, leds_m = scene.settings.bake.texel_m, scene.leds.centers_m
     return join([mesh_of_surfaces(scene.surfaces, texel_m, furniture, leds_m), *furniture])
 
@@ -114,75 +117,6 @@ def _warn_of_dark_furniture(scene: Scene, mesh: Mesh, baked: BakedIlluminance) -
                 f"furniture[{number}].file = {piece.file!r}: no light falls on the front sides of its triangles; their "
                 "vertices must be counter-clockwise as seen from the lit side, and nothing may enclose them",
             )
-
-
-def led_illuminance_lux(
-    blockers: Any, points_m: Array, normals: Array, sources: Sources, glazings: tuple[Glazing, ...] = ()
-) -> Array:
-    """Direct illuminance of the LEDs, and that by one specular reflection in glazing, (n,).
-
-    blockers: Mitsuba scene for shadow rays. points_m, normals: surface points (n, 3) with unit normals (n, 3).
-
-    E = sum of I cos^m(theta_source) cos(theta_surface) / d^2 over the sources visible from the point. Glazing adds the
-    mirror image of each source, times its Fresnel reflectance, if nothing blocks the way from point to glazing to
-    source. Light reflected by glazing more than once is left out.
-    """
-    total = np.zeros(len(points_m))
-    block = max(1, MAX_RAYS // len(sources))
-    for start in range(0, len(points_m), block):
-        here = slice(start, start + block)
-        origins = points_m[here] + RAY_OFFSET_M * normals[here]
-        lux = _unshadowed_lux(points_m[here], normals[here], sources, sources.centers_m)
-        point, source = np.nonzero(lux > 0)
-        visible = ~is_blocked(blockers, origins[point], sources.centers_m[source] - [0, 0, RAY_OFFSET_M])
-        np.add.at(total[here], point, lux[point, source] * visible)
-        for glazing in glazings:
-            images_m = glazing.mirrored(sources.centers_m)
-            lux = _unshadowed_lux(points_m[here], normals[here], sources, images_m)
-            to_image = images_m[None] - points_m[here, None]
-            slope = (to_image * glazing.normal).sum(axis=2)
-            height = ((points_m[here] - glazing.corner_m) * glazing.normal).sum(axis=1)
-            point, source = np.nonzero((lux > 0) & (slope < 0) & (height[:, None] > RAY_OFFSET_M))
-            share = height[point] / -slope[point, source]
-            on_glazing = points_m[here][point] + share[:, None] * to_image[point, source]
-            within = glazing.contains(on_glazing)
-            point, source, on_glazing = point[within], source[within], on_glazing[within]
-            start_m = on_glazing + RAY_OFFSET_M * glazing.normal
-            visible = ~is_blocked(blockers, origins[point], start_m)
-            visible &= ~is_blocked(blockers, start_m, sources.centers_m[source] - [0, 0, RAY_OFFSET_M])
-            cosine = -slope[point, source] / np.linalg.norm(to_image[point, source], axis=1)
-            reflected = lux[point, source] * glazing_reflectance(cosine, glazing.refractive_index, np.sqrt)
-            np.add.at(total[here], point, reflected * visible)
-    return total
-
-
-def _unshadowed_lux(points_m: Array, normals: Array, sources: Sources, centers_m: Array) -> Array:
-    """Illuminance of each point by each source at `centers_m` without occlusion, (points, sources).
-
-    Sources face down, and so do their mirror images in vertical glazing.
-    """
-    to_source = centers_m[None] - points_m[:, None]
-    distance = np.maximum(np.linalg.norm(to_source, axis=2), 1e-9)  # 0 on an LED's own face
-    cos_source = np.maximum(to_source[..., 2] / distance, 0.0)
-    cos_surface = np.maximum((to_source * normals[:, None]).sum(axis=2) / distance, 0.0)
-    lux: Array = sources.intensities_cd * cos_source**sources.orders * cos_surface / distance**2
-    return lux
-
-
-def is_blocked(blockers: Any, origins_m: Array, targets_m: Array) -> NDArray[np.bool_]:
-    """Whether something lies between origins (n, 3) and targets (n, 3), (n,)."""
-    if not len(origins_m):
-        return np.zeros(0, dtype=bool)  # Dr.Jit has no empty arrays
-    span = targets_m - origins_m
-    length = np.linalg.norm(span, axis=1, keepdims=True)
-    with exact_math():
-        ray = mi.Ray3f(_points(origins_m), mi.Vector3f(*(span / length).T.astype(np.float32)))
-        maxt: Any = mi.Float(length[:, 0].astype(np.float32))
-        ray.maxt = maxt
-        hit = blockers.ray_test(ray)
-        dr.eval(hit)
-    blocked: NDArray[np.bool_] = hit.numpy().astype(bool)
-    return blocked
 
 
 def path_traced_lux(
@@ -260,7 +194,9 @@ def _compute(scene: Scene, mesh: Mesh, progress: Progress) -> BakedIlluminance:
     leds = scene.leds
     points = np.concatenate([mesh.probes_m, leds.centers_m])
     normals = np.concatenate([mesh.normals, np.tile([0.0, 0.0, -1.0], (len(leds), 1))])
-    return illuminance_at(scene, mesh, points, normals, scene.settings.bake.paths, progress)
+    direct = _direct_lux(scene, mesh, points, normals, progress)
+    vertices = direct[: len(mesh.probes_m)]
+    return _with_bounces(scene, mesh, vertices, points, normals, direct, scene.settings.bake.paths, progress)
 
 
 def illuminance_at(
@@ -273,28 +209,50 @@ def illuminance_at(
 ) -> BakedIlluminance:
     """Illuminance at surface points (n, 3) with unit normals (n, 3), not interpolated.
 
-    mesh: `room_mesh(scene)`. paths: light paths traced from each point. The first points are the mesh's probes in a
-    bake; other points tell what its interpolation leaves out.
+    mesh: `room_mesh(scene)`. paths: light paths traced from each point. A bake has the mesh's probes as its points;
+    other points tell what its interpolation leaves out.
     """
-    dark = np.zeros(len(mesh.vertices_m))
-    progress("direct light of LEDs", 0.0)
-    blockers = mitsuba_scene(mesh, dark, (), daylight=False)
+    vertices = _direct_lux(scene, mesh, mesh.probes_m, mesh.normals, progress)
+    direct = _direct_lux(scene, mesh, points_m, normals, progress)
+    return _with_bounces(scene, mesh, vertices, points_m, normals, direct, paths, progress)
+
+
+def _direct_lux(scene: Scene, mesh: Mesh, points_m: Array, normals: Array, progress: Progress) -> Array:
+    """Direct illuminance of the LEDs at surface points (n, 3) with unit normals (n, 3), (n,)."""
+    stage = "direct light of LEDs"
+    progress(stage, 0.0)
+    blockers = mitsuba_scene(mesh, np.zeros(len(mesh.vertices_m)), (), daylight=False)
     sources = point_sources(scene.leds)
-    vertices = led_illuminance_lux(blockers, mesh.probes_m, mesh.normals, sources, scene.glazings)
-    direct = led_illuminance_lux(blockers, points_m, normals, sources, scene.glazings)
-    progress("direct light of LEDs", 1.0)
-    lit = mitsuba_scene(mesh, mesh.albedo * vertices / np.pi, scene.glazings, daylight=False)
+    direct = led_illuminance_lux(
+        blockers, points_m, normals, sources, scene.glazings, lambda share: progress(stage, share)
+    )
+    progress(stage, 1.0)
+    return direct
+
+
+def _with_bounces(
+    scene: Scene,
+    mesh: Mesh,
+    vertices_lux: Array,
+    points_m: Array,
+    normals: Array,
+    direct_lux: Array,
+    paths: int,
+    progress: Progress,
+) -> BakedIlluminance:
+    """Illuminance at points (n, 3) of direct illuminance `direct_lux` (n,), in a room whose vertices have another."""
+    lit = mitsuba_scene(mesh, mesh.albedo * vertices_lux / np.pi, scene.glazings, daylight=False)
     bounced, sigma = path_traced_lux(
         lit, points_m, normals, paths, lambda share: progress("reflected light of LEDs", share)
     )
     daylight = np.zeros(len(points_m))
     if any(glazing.luminance_cd_m2 > 0 for glazing in scene.glazings):
-        outside = mitsuba_scene(mesh, dark, scene.glazings, daylight=True)
+        outside = mitsuba_scene(mesh, np.zeros(len(mesh.vertices_m)), scene.glazings, daylight=True)
         daylight, more = path_traced_lux(
             outside, points_m, normals, paths, lambda share: progress("daylight through glazing", share)
         )
         sigma = np.hypot(sigma, more)
-    return BakedIlluminance(direct + bounced, daylight, sigma)
+    return BakedIlluminance(direct_lux + bounced, daylight, sigma)
 
 
 def _key(scene: Scene, mesh: Mesh) -> str:

@@ -1,10 +1,13 @@
 """Lines of sight from a camera to LEDs, by one ray each to points of an LED's face."""
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
 from vlcrender.camera.posed_camera import PosedCamera
-from vlcrender.light.lightmap import RAY_OFFSET_M, is_blocked, room_mesh
+from vlcrender.light.direct_light import RAY_OFFSET_M, is_blocked
+from vlcrender.light.lightmap import room_mesh
 from vlcrender.light.mitsuba_room import mitsuba_scene
 from vlcrender.scene.loader import Scene
 
@@ -46,11 +49,7 @@ class LinesOfSight:
         return points
 
 
-_latest: list[tuple[Scene, LinesOfSight]] = []
-
-
+@lru_cache(maxsize=1)
 def lines_of_sight(scene: Scene) -> LinesOfSight:
     """The lines of sight of a scene; those of the latest scene are kept."""
-    if not _latest or _latest[0][0] is not scene:
-        _latest[:] = [(scene, LinesOfSight(scene))]
-    return _latest[0][1]
+    return LinesOfSight(scene)

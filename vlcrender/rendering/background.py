@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlcrender.camera.posed_camera import PosedCamera
-from vlcrender.camera.roi import Roi
+from vlcrender.camera.roi import Roi, pixel_numbers
 from vlcrender.camera.vignetting import relative_illumination
 from vlcrender.core.backend import dr, exact_math, mi
 from vlcrender.light.lightmap import Lightmap
@@ -151,9 +151,8 @@ def _pixel_centers(rois: Sequence[Roi], sensor: Roi) -> "tuple[mi.Float, mi.Floa
         row = index // sensor.columns
         return mi.Float(index - row * sensor.columns) + 0.5, mi.Float(row) + 0.5
     # As data, not computed in the kernel: regions of any number and size are then one launch of the same kernel.
-    u = [np.tile(np.arange(r.column, r.end_column, dtype=np.float32) + np.float32(0.5), r.rows) for r in rois]
-    v = [np.repeat(np.arange(r.row, r.end_row, dtype=np.float32) + np.float32(0.5), r.columns) for r in rois]
-    return mi.Float(np.concatenate(u)), mi.Float(np.concatenate(v))
+    u, v = (mi.Float(numbers.astype(np.float32) + np.float32(0.5)) for numbers in pixel_numbers(rois))
+    return u, v
 
 
 def _opaque(matrix: NDArray[np.float64]) -> "list[list[mi.Float]]":
@@ -172,6 +171,7 @@ def _edges(surfaces: NDArray[np.uint32], roi: Roi, sensor: Roi) -> NDArray[np.bo
 
 def differs_from_neighbour(labels: NDArray[Any]) -> NDArray[np.bool_]:
     """Pixels (rows, columns) with another label than one of their 8 neighbours."""
+    labels = labels.astype(np.min_scalar_type(labels.max(initial=0)), copy=False)  # most scenes: 8 bits, a pass of 4
     differs = np.zeros(labels.shape, dtype=bool)
     for here, there in (
         (np.s_[:, 1:], np.s_[:, :-1]),

@@ -13,7 +13,9 @@ from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.roi import LedRegions, Roi
 from vlcrender.rendering.crosstalk import REACH_PX, shared_patch, with_crosstalk
 from vlcrender.rendering.expected_image import ExpectedImage, ExpectedRegion, Gain, Gains, Halo, Image, LedPatch
-from vlcrender.rendering.renderer import During, Renderer, read_out
+from vlcrender.rendering.led_slopes import Cameras
+from vlcrender.rendering.led_view import During, read_out
+from vlcrender.rendering.renderer import Renderer
 from vlcrender.scene.leds import Leds
 from vlcrender.scene.loader import Scene
 from vlcrender.sensor.quantum_efficiency import COLOURS
@@ -109,6 +111,22 @@ class MosaicRenderer:
                 for renderer, of_colour in zip(self.of_colours, self._of_colours(posed), strict=True)
             ]
         )
+        return self._with_crosstalk(patches, posed)
+
+    def led_slopes(
+        self, posed: PosedCamera, changes: Sequence[Cameras], regions: LedRegions | None = None
+    ) -> tuple[tuple[LedPatch, ...], ...]:
+        """As `Renderer.led_slopes`."""
+        of_cameras = [zip(*map(self._of_colours, cameras), strict=True) for cameras in changes]
+        of_colours = [
+            renderer.led_slopes(of_colour, of_changes, regions)
+            for renderer, of_colour, of_changes in zip(
+                self.of_colours, self._of_colours(posed), zip(*of_cameras, strict=True), strict=True
+            )
+        ]
+        return tuple(self._with_crosstalk(self._patches(same), posed) for same in zip(*of_colours, strict=True))
+
+    def _with_crosstalk(self, patches: tuple[LedPatch, ...], posed: PosedCamera) -> tuple[LedPatch, ...]:
         if not self.crosstalk:
             return patches
         return tuple(shared_patch(patch, self.crosstalk, Roi.of_sensor(posed.camera)) for patch in patches)

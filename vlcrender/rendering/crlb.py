@@ -10,8 +10,8 @@ unknowns i and j is
     J_ij = sum over p of (d mu / d i) (d mu / d j) / var,
 
 exact for Poisson counts (var = mu); for a sensor with further noise it is the information in the mean, without the
-information in the variance, which goes as 1 / mu. The derivatives with respect to the pose are central differences of
-images whose edges are exact. The accelerometer adds 1 / sigma^2 to each of the two tilts.
+information in the variance, which goes as 1 / mu. The derivatives with respect to the pose are those of exact edges
+(`led_slopes`). The accelerometer adds 1 / sigma^2 to each of the two tilts.
 
 The hybrid bound (Y. Rockah and P. Schultheiss, Array shape calibration using sources in unknown locations, IEEE Trans.
 ASSP 35(3), 1987) lets lens and map err too, by the sigmas of `Uncertainty`: each such error is an unknown with a normal
@@ -42,6 +42,7 @@ from vlcrender.core.planar_shapes import Disc
 from vlcrender.rendering.expected_image import Gains, LedPatch, gain_in
 from vlcrender.rendering.led_coverage import intersections_with_plane
 from vlcrender.rendering.led_radiance import face_of_led
+from vlcrender.rendering.led_slopes import Cameras
 from vlcrender.rendering.uncertainty import (
     MapLevers,
     Uncertainty,
@@ -54,11 +55,9 @@ Array = NDArray[np.float64]
 
 MARGIN_PX = 10.0
 """Background around each LED that counts: its level is an unknown, and more pixels of it add little information."""
-STEP_PX = 1e-5
-"""Displacement of the two images of a difference to either side. The slope of a pixel's coverage jumps where the edge
-enters or leaves the pixel. So small a step crosses such a point in very few pixels. This matters because directions
-that are hardly determined depend on small differences between slopes. Images are exact to some 1e-12, slopes then to
-1e-7."""
+STEP_PX = 1e-3
+"""Displacement of LED images to either side, in whose differences each unknown's step results: rounding is then below
+1e-9 of it, and terms of the third order, (1e-3 px / focal length)^2, are smaller."""
 MAX_CONDITION = 1e12
 """Condition number of the information, in units of the steps, above which a direction holds only rounding errors."""
 PIXELS_AT_ONCE = 100_000
@@ -70,7 +69,8 @@ FACE_STEP = 1e-6
 OWN = 6
 """Errors of an LED's own: x, y, z, size, and two tilts of its face."""
 
-Render = Callable[[PosedCamera], Sequence[LedPatch]]
+Render = Callable[[PosedCamera, Sequence[Cameras]], Sequence[Sequence[LedPatch]]]
+"""`led_slopes` of a renderer: the patches of some LEDs at a camera, and their changes with each change of it."""
 HaloOf = Callable[[Sequence[LedPatch], Roi], Array]
 """The halo of some patches in a region of the sensor, electrons a second."""
 
@@ -89,7 +89,7 @@ def position_bound_m2(
     """Bound of the covariance of a camera's position, (3, 3), m2, world; None where the frame does not determine it.
 
     mounted: the camera on its rig. main: the pose of `main`, to which the accelerometer is fixed. render: patches of
-    the LEDs with the camera at poses near this, electrons a second. variance_e2: the regions read out, with the
+    the LEDs and their changes, electrons a second. variance_e2: the regions read out, with the
     variance of each pixel, inf for pixels without information (saturated ones). distance_m: from the camera to the
     LEDs, roughly. tilt_sigmas_deg: standard deviations of the accelerometer on tilt_x and tilt_y; 0 means that both
     tilts are known. overscan: whether LEDs count beyond the sensor. halo_of: halos of a lens with glare.
@@ -105,8 +105,8 @@ class FrameSlopes:
     mounted: Mounted
     main: Pose
     at_pose: Sequence[LedPatch]
-    pairs: Sequence[tuple[Mapping[int, LedPatch], Mapping[int, LedPatch]]]
-    """For each unknown of the pose, patches by LED id at a step to either side."""
+    changes: Sequence[Mapping[int, LedPatch]]
+    """For each unknown of the pose, by LED id, the change of a patch from a step to one side to a step to the other."""
     steps: tuple[float, ...]
     """Steps of x, y, z in metres and tilt_x, tilt_y, yaw in radians."""
     exposure_s: float
@@ -133,22 +133,19 @@ class FrameSlopes:
         unknowns: render the first ones of the pose only; `spot_covariances_px2` needs 2, the bounds all 6.
         """
 
-        def patches_at(pose: Pose) -> Sequence[LedPatch]:
-            return render(mounted.posed(pose))
-
-        at_pose = patches_at(main)
-        if not at_pose:
-            return None
         # Each step moves images by about STEP_PX.
         angle = STEP_PX / mounted.camera.focal_px
         steps = (angle * distance_m,) * 3 + (angle,) * 3
-        pairs = []
-        for i, step in enumerate(steps[:unknowns]):
-            plus, minus = (
-                {patch.led_id: patch for patch in patches_at(moved(main, i, sign * step))} for sign in (1, -1)
-            )
-            pairs.append((plus, minus))
-        return cls(mounted, main, at_pose, pairs, steps, exposure_s, variance_e2, overscan, halo_of)
+
+        def after(unknown: int, step: float) -> PosedCamera:
+            return mounted.posed(moved(main, unknown, step))
+
+        cameras = [(after(i, step), after(i, -step)) for i, step in enumerate(steps[:unknowns])]
+        at_pose, *changed = render(mounted.posed(main), cameras)
+        if not at_pose:
+            return None
+        changes = [{patch.led_id: patch for patch in patches} for patches in changed]
+        return cls(mounted, main, at_pose, changes, steps, exposure_s, variance_e2, overscan, halo_of)
 
     def exposed(self, variance_e2: Sequence[RegionImage], gains: Gains | None = None) -> "FrameSlopes":
         """The slopes of one exposure of the same view: with the variance of its pixels, and known gains of LEDs by id.
@@ -165,10 +162,7 @@ class FrameSlopes:
         return replace(
             self,
             at_pose=[lit(patch) for patch in self.at_pose],
-            pairs=[
-                ({led: lit(patch) for led, patch in plus.items()}, {led: lit(patch) for led, patch in minus.items()})
-                for plus, minus in self.pairs
-            ],
+            changes=[{led: lit(patch) for led, patch in change.items()} for change in self.changes],
             variance_e2=variance_e2,
         )
 
@@ -179,10 +173,8 @@ class FrameSlopes:
             for common, inside, weight in self._parts(box):
                 slopes = np.stack(
                     [
-                        (self._of(common, plus, inside) - self._of(common, minus, inside))
-                        * self.exposure_s
-                        / (2 * step)
-                        for (plus, minus), step in zip(self.pairs, self.steps, strict=True)
+                        self._of(common, change, inside) * self.exposure_s / (2 * step)
+                        for change, step in zip(self.changes, self.steps, strict=True)
                     ]
                 )
                 nuisances = [self._light(common, patch) for patch in inside]
@@ -300,7 +292,11 @@ class FrameSlopes:
     def _of(self, roi: Roi, patches: Mapping[int, LedPatch], leds: Sequence[LedPatch]) -> Array:
         """Light of some LEDs in a region, electrons a second: of those in `patches` (by id) that `leds` names."""
         found = [patches[led.led_id] for led in leds if led.led_id in patches]
-        image = np.zeros((roi.rows, roi.columns)) if self.halo_of is None else self.halo_of(found, roi)
+        image = np.zeros((roi.rows, roi.columns))
+        if self.halo_of is not None:
+            for sign in (1.0, -1.0):  # a halo is that of light, which is positive
+                light = [replace(p, electrons_per_s=np.maximum(sign * p.electrons_per_s, 0.0)) for p in found]
+                image += sign * self.halo_of(light, roi)
         for patch in found:
             if roi.overlaps(patch.roi):
                 both = roi.intersection(patch.roi)
@@ -313,9 +309,7 @@ class FrameSlopes:
 
     def _slope(self, roi: Roi, unknown: int, led: LedPatch) -> Array:
         """Slope of one LED's light in a region by an unknown of the pose, electrons per m or radian."""
-        plus, minus = self.pairs[unknown]
-        difference = self._of(roi, plus, [led]) - self._of(roi, minus, [led])
-        return difference * self.exposure_s / (2 * self.steps[unknown])
+        return self._of(roi, self.changes[unknown], [led]) * self.exposure_s / (2 * self.steps[unknown])
 
     def _box_factor(
         self, box: Roi, leds: Leds, index_of: Mapping[int, int], uncertainty: Uncertainty

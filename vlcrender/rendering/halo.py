@@ -13,8 +13,9 @@ from functools import cached_property
 from typing import Protocol
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import signal, sparse
+from scipy import sparse
 
 from vlcrender.camera.glare import Glare
 from vlcrender.camera.intrinsics import Camera
@@ -102,7 +103,7 @@ class HaloGrid:
         """The halo at the nodes, electrons a pixel, of light on the nodes."""
         down, across = (np.arange(1 - size, size, dtype=np.float64) * self.step_px for size in self.shape)
         kernel = glare.share * glare.spread_per_px2(np.hypot(down[:, None], across), pixel_pitch_um)
-        return np.maximum(signal.fftconvolve(kernel, light, mode="valid"), 0.0)
+        return np.maximum(scipy.signal.fftconvolve(kernel, light, mode="valid"), 0.0)
 
     def values_by_line(self, sources: "Sequence[tuple[Array, Array]]", roi: Roi) -> Array:
         """Sum of values times a gain for each row or column of the sensor, (rows, columns). All gains are of one shape.

@@ -3,8 +3,9 @@
 Where the blur is narrow, pixels that the LED's edge crosses are split (`led_edges`), and each part has its own kernel.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,15 +13,14 @@ from numpy.typing import NDArray
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.psf import (
     SplitKernel,
-    blur,
     blur_kernel,
     kernel_radius_px,
     off_axis_sigma_px,
     split_for,
     split_kernel,
+    spread,
 )
 from vlcrender.camera.roi import Roi
-from vlcrender.rendering.led_coverage import candidate_leds
 from vlcrender.rendering.led_edges import LedEdges
 from vlcrender.scene.leds import Leds
 
@@ -57,7 +57,12 @@ class LedKernel:
 
         edges: of the LED's images at one or more poses; light_per_excess: light of an excess of 1, in units of `light`.
         """
-        result = blur(light, self.whole)
+        positive: Array = np.maximum(self.spread(light, roi, edges, light_per_excess), 0.0)
+        return positive
+
+    def spread(self, light: Array, roi: Roi, edges: Sequence[LedEdges], light_per_excess: float) -> Array:
+        """`blurred` of numbers of either sign, such as changes of light."""
+        result = spread(light, self.whole)
         if self.parts is None:
             return result
         n, m = self.parts.split, self.parts.parts.shape[-1]
@@ -67,21 +72,28 @@ class LedKernel:
             for row, column, of_pixel in zip(edge.rows - roi.row, edge.columns - roi.column, excess, strict=True):
                 # not `@`: the last bits of a matrix product may depend on threads and processor
                 result[row : row + m, column : column + m] += np.einsum("p,pq->q", of_pixel, kernels).reshape(m, m)
-        positive: Array = np.maximum(result, 0.0)
-        return positive
+        return result
+
+
+SHARP = LedKernel()
+"""Kernel of an LED that is not blurred, or that is too far from the sensor to light it."""
 
 
 @dataclass(frozen=True)
 class LedBlur:
-    """Blur at one pose. `kernels`: by index of the LED; `typical`: of the room behind the LEDs."""
+    """Blur at one pose. `near`: kernels of LEDs near the sensor, by index; `typical`: of the room behind the LEDs."""
 
-    kernels: tuple[LedKernel, ...]
+    near: Mapping[int, LedKernel]
     typical: Array | None
 
-    @property
+    def kernel(self, i: int) -> LedKernel:
+        """Kernel of LED number i."""
+        return self.near.get(i, SHARP)
+
+    @cached_property
     def radius_px(self) -> int:
         """Greatest radius of the kernels."""
-        return max((kernel.radius_px for kernel in self.kernels), default=0)
+        return max((kernel.radius_px for kernel in self.near.values()), default=0)
 
 
 def led_blur(leds: Leds, posed: PosedCamera) -> LedBlur:
@@ -90,22 +102,22 @@ def led_blur(leds: Leds, posed: PosedCamera) -> LedBlur:
     The room behind is blurred as at the median depth, and place in the field, of the LEDs that are blurred.
     """
     camera = posed.camera
-    kernels = [LedKernel()] * len(leds)
     if camera.focus_distance_m is None and camera.psf == "none" and camera.off_axis_sigma_um == 0:
-        return LedBlur(tuple(kernels), None)
-    led_depths_m = np.maximum(posed.focus_depths_m(leds.centers_m), MIN_DEPTH_M)
-    sigmas_px = np.zeros(len(leds))
+        return LedBlur({}, None)
+    near = leds.spheres.candidates(posed, BLUR_MARGIN_PX)
+    depths_m = np.maximum(posed.focus_depths_m(leds.centers_m[near]), MIN_DEPTH_M)
+    sigmas_px = np.zeros(len(near))
     if camera.off_axis_sigma_um > 0:
-        sigmas_px = off_axis_sigma_px(camera, posed.project(leds.centers_m))
+        sigmas_px = off_axis_sigma_px(camera, posed.project(leds.centers_m[near]))
         sigmas_px = np.exp(np.round(np.log(np.maximum(sigmas_px, MIN_SIGMA_PX)) / DEPTH_STEP) * DEPTH_STEP)
+    kernels: dict[int, LedKernel] = {}
     point: dict[int, tuple[float, float]] = {}
     by_point: dict[tuple[float, float], LedKernel] = {}
-    for i in candidate_leds(posed, leds.centers_m, leds.circumradii_m, BLUR_MARGIN_PX).tolist():
-        depth = float(np.exp(np.round(np.log(led_depths_m[i]) / DEPTH_STEP) * DEPTH_STEP))
-        sigma_px = float(sigmas_px[i])
+    for i, depth_m, sigma_px in zip(near.tolist(), depths_m.tolist(), sigmas_px.tolist(), strict=True):
+        depth = float(np.exp(np.round(np.log(depth_m) / DEPTH_STEP) * DEPTH_STEP))
         if split_for(camera, depth, sigma_px) > 1:
             # A narrow disc may change more within a step than it is wide. Without a focus depth has no effect.
-            depth = float(led_depths_m[i]) if camera.focus_distance_m is not None else 1.0
+            depth = depth_m if camera.focus_distance_m is not None else 1.0
         point[i] = depth, sigma_px
         if point[i] not in by_point:
             parts = split_kernel(camera, depth, sigma_px)
@@ -114,4 +126,4 @@ def led_blur(leds: Leds, posed: PosedCamera) -> LedBlur:
         kernels[i] = by_point[point[i]]
     blurred = sorted((i for i in point if kernels[i].whole is not None), key=lambda i: kernels[i].radius_px)
     typical = blur_kernel(camera, *point[blurred[len(blurred) // 2]]) if blurred else None
-    return LedBlur(tuple(kernels), typical)
+    return LedBlur(kernels, typical)

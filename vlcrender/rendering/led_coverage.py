@@ -93,20 +93,6 @@ def outline_roi(posed: PosedCamera, face: LedFace) -> Roi | None:
     return Roi(row, column, end_row - row, end_column - column)
 
 
-def candidate_leds(
-    posed: PosedCamera, centers_m: Array, circumradii_m: Array, margin_px: float = 0.0
-) -> NDArray[np.int64]:
-    """Indices of all LEDs that light a pixel of the sensor or up to `margin_px` beside it, and perhaps of some others.
-
-    centers_m: (n, 3), world; circumradii_m: (n,), radii of circles around the faces. An LED is a candidate where the
-    sphere of this radius enters the camera's field of view.
-    """
-    above = centers_m[:, 2] > posed.pose.position_m[2]
-    seen = posed.camera.field_of_view(margin_px).may_contain(posed.camera_coordinates(centers_m), circumradii_m)
-    candidates: NDArray[np.int64] = np.flatnonzero(above & seen)
-    return candidates
-
-
 def _outline_px(posed: PosedCamera, face: LedFace) -> Array | None:
     """Pixel positions of the face's outline; None where the lens does not image it whole."""
     rim = face.shape.rim(RIM_POINTS)

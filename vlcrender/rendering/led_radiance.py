@@ -21,7 +21,6 @@ from vlcrender.core.planar_shapes import Disc, Rectangle
 from vlcrender.rendering.led_blur import LedBlur
 from vlcrender.rendering.led_coverage import (
     LedFace,
-    candidate_leds,
     coverage_of_led,
     intersections_with_plane,
     outline_roi,
@@ -48,17 +47,32 @@ Array = NDArray[np.float64]
 class LedImage:
     """Image of one LED at one pose, before blur: `coverage`, and relative illumination `weight`, in each pixel.
 
-    `pattern` is the luminance in each pixel over the LED's mean along its normal. `edges`, for narrow blurs, are the
-    parts of edge pixels times weight and pattern; the occluded share of a pixel is the same in all its parts.
+    `coverage` is the share of a pixel that the LED covers and nothing occludes, `clear` the share of that of the LED
+    alone. The luminance in each pixel over the LED's mean along its normal is `beam`, by direction, times `profile`, by
+    place on the face or diffuser. `edges`, for narrow blurs, are the parts of edge pixels times weight and luminance;
+    the occluded share of a pixel is the same in all its parts.
     """
 
     roi: Roi
     coverage: Array
+    clear: Array | float
     weight: Array
-    pattern: Array | float
+    beam: Array | float
+    profile: Array | float
     visible_fraction: float
     imaged_fraction: float
     edges: LedEdges | None
+
+    @property
+    def pattern(self) -> Array | float:
+        """Luminance in each pixel over the LED's mean along its normal."""
+        return self.beam * self.profile
+
+    @property
+    def full(self) -> Array:
+        """Light of a pixel that the face covers whole, over that of the LED's luminance and `profile`."""
+        full: Array = self.clear * self.weight * self.beam
+        return full
 
 
 def led_images(
@@ -77,7 +91,7 @@ def led_images(
     overscan = regions is not None and regions.overscan
     margin_px = _overscan_px(camera) if overscan else blurs.radius_px
     imaged = []
-    for i in candidate_leds(posed, leds.centers_m, leds.circumradii_m, margin_px).tolist():
+    for i in leds.spheres.candidates(posed, margin_px).tolist():
         if within is not None:
             outline = outline_roi(posed, face_of_led(leds, i))
             if outline is None or not outline.overlaps(within):
@@ -95,7 +109,7 @@ def led_images(
     images = {}
     for (i, image), share in zip(imaged, clear, strict=True):
         coverage, clear_fraction = image.coverage, 1.0
-        split = blurs.kernels[i].split
+        split = blurs.kernel(i).split
         edges = edges_of_led(posed, face_of_led(leds, i), image, split) if split > 1 else None
         if not isinstance(share, float):
             coverage = image.coverage * share
@@ -107,8 +121,10 @@ def led_images(
             images[i] = LedImage(
                 roi=image.roi,
                 coverage=coverage,
+                clear=share,
                 weight=weight,
-                pattern=pattern * image.profile,
+                beam=pattern if leds.diffusers[i] is None else 1.0,
+                profile=image.profile if leds.diffusers[i] is None else pattern,
                 visible_fraction=clear_fraction * image.visible_fraction,
                 imaged_fraction=clear_fraction * (1.0 if overscan else image.visible_fraction),
                 edges=edges and edges.times(weight * pattern, image.roi),
@@ -138,20 +154,25 @@ def luminance_pattern(leds: Leds, i: int, posed: PosedCamera, roi: Roi) -> Array
     if diffuser is not None:
         on_diffuser = partial(intersections_with_plane, posed, np.array([0.0, 0.0, leds.centers_m[i, 2]]))
         if _max_pixel_width_m(roi, on_diffuser) < MAX_UNIFORM_SHARE * diffuser.distance_m:
-            return _in_bands(roi, lambda u, v: diffuser.luminance(*on_diffuser(u, v)))
+            return _in_bands(roi, lambda u, v: diffuser.at(*on_diffuser(u, v)))
         nodes = list(itertools.product((-GAUSS_PX, GAUSS_PX), repeat=2))
 
         def mean(u: Array, v: Array) -> Array:
-            total: Array = sum((diffuser.luminance(*on_diffuser(u + a, v + b)) for a, b in nodes), np.zeros(()))
+            total: Array = sum((diffuser.at(*on_diffuser(u + a, v + b)) for a, b in nodes), np.zeros(()))
             return total / len(nodes)
 
         return _in_bands(roi, mean)
     if abs(order - 1.0) < 1e-12:
         return 1.0
-    x, y, z = posed.ray_world(*roi.centers_px())
+    return beam(posed, order, *roi.centers_px())
+
+
+def beam(posed: PosedCamera, order: float, u: Array, v: Array) -> Array:
+    """Luminance towards pixel positions over that along the normal, of an LED of this Lambertian order: cos^(m-1)."""
+    x, y, z = posed.ray_world(u, v)
     cosine = np.maximum(z / np.sqrt(x * x + y * y + z * z), 0.0)
-    pattern: Array = cosine ** (order - 1.0)
-    return pattern
+    luminance: Array = cosine ** (order - 1.0)
+    return luminance
 
 
 def _max_pixel_width_m(roi: Roi, on_plane: Callable[[Array, Array], tuple[Array, Array]]) -> float:

@@ -254,7 +254,7 @@ def _diffuser_cd_m2(scene: Scene, surface: Surface) -> "mi.Bitmap | None":
     for diffuser, luminance in lit:
         x0, y0, x1, y1 = diffuser.lit_m
         within = (at[..., 0] >= x0) & (at[..., 0] <= x1) & (at[..., 1] >= y0) & (at[..., 1] <= y1)
-        total += luminance * within * diffuser.luminance(at[..., 0], at[..., 1])
+        total += luminance * within * diffuser.at(at[..., 0], at[..., 1])
     return mi.Bitmap(total[:, :, None].astype(np.float32))
 
 

@@ -10,9 +10,9 @@ by the kernel of its depth (`led_blur`), and scatters a share of all light into 
 
 import copy
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import partial, reduce
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.psf import blur
-from vlcrender.camera.roi import LedRegions, Roi, led_regions
+from vlcrender.camera.roi import LedRegions, Roi
 from vlcrender.core.backend import dr
 from vlcrender.errors import InputError
 from vlcrender.light.lightmap import Lightmap, bake
@@ -31,6 +31,8 @@ from vlcrender.rendering.expected_image import ExpectedImage, ExpectedRegion, Im
 from vlcrender.rendering.halo import GlareHalo, glare_halo, halo_of_sources
 from vlcrender.rendering.led_blur import LedBlur, led_blur
 from vlcrender.rendering.led_radiance import LedImage, led_images
+from vlcrender.rendering.led_slopes import Cameras, led_slopes
+from vlcrender.rendering.led_view import During, LedBand, LedView, cut, patch_rois, read_out, union_of
 from vlcrender.rendering.occlusion import Occlusion
 from vlcrender.rendering.readout import Knot, RollingPoses, image_at_own_line
 from vlcrender.rendering.specular_reflection import blurred, specular_reflections
@@ -44,62 +46,6 @@ MAX_SENSORS = 16
 OVERSCAN_WITH_GLARE = "regions.overscan = true: glare is computed on the sensor only; remove overscan or camera.glare"
 
 Array = NDArray[np.float64]
-LedImages = Mapping[int, LedImage]
-"""Images of the LEDs at one pose, by the LED's index."""
-
-
-During = Sequence[Pose] | RollingPoses
-"""Poses of a moving camera: spread evenly over the exposure of all lines, or of each line."""
-
-
-@dataclass(frozen=True)
-class LedBand:
-    """The LEDs as a camera sees them at one or more poses, in lines of the sensor."""
-
-    poses: tuple[PosedCamera, ...]
-    images: tuple[LedImages, ...]
-    knot: Knot | None = None
-    """The lines, and the share of these poses in each; None for all lines."""
-
-    def share(self, roi: Roi) -> tuple[Roi, Array | float] | None:
-        """The lines in a region, and the share of these poses in them; None where there are none."""
-        if self.knot is None:
-            return roi, 1.0
-        if not self.knot.lines.overlaps(roi):
-            return None
-        inside = self.knot.lines.intersection(roi)
-        return inside, self.knot.weights_in(inside)
-
-
-@dataclass(frozen=True)
-class LedView:
-    """The LEDs as a camera sees them at one or more poses, and the pixels that each lights, by its index."""
-
-    posed: PosedCamera
-    bands: tuple[LedBand, ...]
-    blurs: LedBlur
-    patch_rois: Mapping[int, Roi]
-    rolling: RollingPoses | None = None
-    """Poses of the lines of a moving camera with a rolling shutter."""
-
-
-def read_out(views: Sequence[LedView], regions: LedRegions | None, reach_px: int = 0) -> tuple[Roi, ...]:
-    """The regions that are read out of a sensor: all of it, or regions around the LEDs of one or more views.
-
-    reach_px: pixels around its image that an LED lights by crosstalk.
-    """
-    camera = views[0].posed.camera
-    if regions is None:
-        return (Roi.of_sensor(camera),)
-    rois = dict(views[0].patch_rois)
-    for view in views[1:]:
-        for i, roi in view.patch_rois.items():
-            rois[i] = rois[i].union(roi) if i in rois else roi
-    if reach_px:
-        sensor = Roi.of_sensor(camera)
-        lit = {i: roi.padded(reach_px) for i, roi in rois.items()}
-        rois = {i: lit[i].intersection(sensor) if sensor.contains(roi) else lit[i] for i, roi in rois.items()}
-    return led_regions(rois.values(), camera, regions)
 
 
 class Renderer:
@@ -118,6 +64,7 @@ class Renderer:
         crosstalk: share of a pixel's electrons that its neighbours collect.
         """
         self._crosstalk = crosstalk
+        self._latest: tuple[tuple[PosedCamera, LedRegions | None], LedView] | None = None  # for `led_slopes`
         self.scene = scene
         self.detector = detector or Silicon()
         self._light = light or bake(scene)
@@ -130,6 +77,7 @@ class Renderer:
         The room's light and all occluders remain the scene's. `leds` has as many LEDs, in the same order.
         """
         renderer = copy.copy(self)
+        renderer._latest = None
         renderer.scene = replace(self.scene, leds=leds)
         # Where LEDs are as built, cameras are as made: each device, or frame, has its own.
         renderer._background = self._background.with_varying_cameras()
@@ -164,13 +112,17 @@ class Renderer:
             raise InputError(OVERSCAN_WITH_GLARE)
         if posed.camera.lateral_colour_um is not None:
             raise InputError("camera.lateral_colour_um: needs a sensor with a mosaic; remove it, or choose a mosaic")
+        self._latest = None  # one view at a time is in memory
         blurs = led_blur(self.scene.leds, posed)
         rolling = during if isinstance(during, RollingPoses) else None
         if isinstance(during, RollingPoses):
             bands = tuple(self._band(posed, knot.poses, regions, blurs, knot) for knot in during.knots)
         else:
             bands = (self._band(posed, [posed.pose] if during is None else during, regions, blurs),)
-        return LedView(posed, bands, blurs, _patch_rois(posed.camera, bands, blurs, regions), rolling)
+        view = LedView(posed, bands, blurs, patch_rois(posed.camera, bands, blurs, regions), rolling)
+        if rolling is None and bands[0].poses == (posed,):
+            self._latest = ((posed, regions), view)
+        return view
 
     def _band(
         self,
@@ -222,13 +174,43 @@ class Renderer:
         blurred_at: pose whose blur is applied, `posed` itself where not given. Kernels change in steps of depth, which
         differences between images at two poses must not contain.
         """
+        return self._with_crosstalk(self._patches(self._still(posed, regions, blurred_at), np.float64), posed)
+
+    def led_slopes(
+        self, posed: PosedCamera, changes: Sequence[Cameras], regions: LedRegions | None = None
+    ) -> tuple[tuple[LedPatch, ...], ...]:
+        """`led_patches`, and for each small change of the camera the changes of their light, to first order.
+
+        changes: cameras (after, before). The lens's blur and what is occluded count as constant.
+        """
+        view, leds, led_rate = self._still(posed, regions), self.scene.leds, self._rates(posed.camera).led
+        patches = self._patches(view, np.float64)
+        images = {i: view.bands[0].images[0][i] for i in view.patch_rois}
+        changed: list[list[LedPatch]] = [[] for _ in changes]
+        splits = {i: view.blurs.kernel(i).split for i in images}
+        for patch, (i, slopes) in zip(patches, led_slopes(leds, posed, changes, images, splits), strict=True):
+            roi, kernel, rate = images[i].roi, view.blurs.kernel(i), led_rate * float(leds.luminances_cd_m2[i])
+            for slope, of_change in zip(slopes, changed, strict=True):
+                edges = [] if slope.edges is None else [slope.edges]
+                light = cut(
+                    kernel.spread(rate * slope.change, roi, edges, rate), roi.padded(kernel.radius_px), patch.roi
+                )
+                of_change.append(replace(patch, electrons_per_s=light))
+        return tuple(self._with_crosstalk(one, posed) for one in (patches, *changed))
+
+    def _still(self, posed: PosedCamera, regions: LedRegions | None, blurred_at: Pose | None = None) -> "LedView":
+        """The view of a camera at rest."""
+        latest = self._latest
+        if blurred_at is None and latest is not None and latest[0] == (posed, regions):
+            return latest[1]
         leds = self.scene.leds
         blurs = led_blur(leds, posed if blurred_at is None else posed.at(blurred_at))
         bands = (LedBand((posed,), (led_images(leds, self._occlusion, posed, regions, blurs),)),)
-        view = LedView(posed, bands, blurs, _patch_rois(posed.camera, bands, blurs, regions))
-        patches = self._patches(view, np.float64)
+        return LedView(posed, bands, blurs, patch_rois(posed.camera, bands, blurs, regions))
+
+    def _with_crosstalk(self, patches: Iterable[LedPatch], posed: PosedCamera) -> tuple[LedPatch, ...]:
         if not self._crosstalk:
-            return patches
+            return tuple(patches)
         return tuple(shared_patch(patch, self._crosstalk, Roi.of_sensor(posed.camera)) for patch in patches)
 
     def halo_of(self, camera: Camera) -> Callable[[Sequence[LedPatch], Roi], Array] | None:
@@ -276,7 +258,8 @@ class Renderer:
             if totals is None:
                 totals = [room.image for room in rooms]
             else:
-                totals = [total + room.image for total, room in zip(totals, rooms, strict=True)]
+                for total, room in zip(totals, rooms, strict=True):
+                    total += room.image
             for number in range(len(self.scene.glazings) if with_reflections else 0):
                 label = self._background.room.first_glazing + number
                 if any((room.surfaces == label).any() for room in rooms):
@@ -316,8 +299,8 @@ class Renderer:
 
         step: the number of the pose of each band.
         """
-        vertices = len(self._light.mesh.vertices_m)  # the lightmap has the faces after the mesh
-        faces = rates.led * self._light.led_cd_m2()[vertices:] + rates.ambient * self._light.ambient_cd_m2()[vertices:]
+        places = slice(len(self._light.mesh.vertices_m), None)  # the lightmap has the faces after the mesh
+        faces = rates.led * self._light.led_cd_m2(places) + rates.ambient * self._light.ambient_cd_m2(places)
         sharp = [room.image.copy() for room in rooms] if len(bands) > 1 else [room.image for room in rooms]
         for band in bands:
             for i, led in band.images[step].items():
@@ -339,9 +322,10 @@ class Renderer:
     def _patches(self, view: LedView, precision: type[np.floating] = np.float32) -> tuple[LedPatch, ...]:
         """Patches of the LEDs: means over the images at several poses, blurred."""
         leds, posed = self.scene.leds, view.posed
-        center_px = posed.project(leds.centers_m)
+        led_rate = self._rates(posed.camera).led
+        centers_px = posed.project(leds.centers_m[list(view.patch_rois)]).tolist()
         patches = []
-        for i, roi in view.patch_rois.items():
+        for (i, roi), (u, v) in zip(view.patch_rois.items(), centers_px, strict=True):
             light = np.zeros((roi.rows, roi.columns)) if view.rolling else None
             shares: list[tuple[float, float, float]] = []
             for band in view.bands:
@@ -349,7 +333,8 @@ class Renderer:
                 shared = band.share(roi)
                 if not of_led or shared is None:
                     continue
-                of_band = self._light_of(view, i, of_led, len(band.poses), roi if light is None else shared[0])
+                here = roi if light is None else shared[0]
+                of_band = self._light_of(view, i, of_led, len(band.poses), here, led_rate)
                 visible, imaged = (
                     sum(getattr(image, name) for image in of_led) / len(band.poses)
                     for name in ("visible_fraction", "imaged_fraction")
@@ -363,7 +348,6 @@ class Renderer:
                     shares.append((float(of_band.sum()), visible, imaged))
             assert light is not None  # an LED without an image has no patch
             total = sum(share for share, _, _ in shares) or 1.0
-            u, v = center_px[i].tolist()
             if view.rolling is not None:
                 u, v = image_at_own_line(posed, view.rolling.pose_at, leds.centers_m[i])
             patches.append(
@@ -379,51 +363,19 @@ class Renderer:
             )
         return tuple(patches)
 
-    def _light_of(self, view: LedView, i: int, of_led: Sequence[LedImage], poses: int, roi: Roi) -> Array:
+    def _light_of(
+        self, view: LedView, i: int, of_led: Sequence[LedImage], poses: int, roi: Roi, led_rate: float
+    ) -> Array:
         """Light of LED number i in a region: the mean over its images at this number of poses, blurred."""
-        luminance, kernel = self.scene.leds.luminances_cd_m2[i], view.blurs.kernels[i]
-        led_rate = self._rates(view.posed.camera).led
-        union = _union(of_led)
+        luminance, kernel = self.scene.leds.luminances_cd_m2[i], view.blurs.kernel(i)
+        union = union_of(of_led)
         light = np.zeros((union.rows, union.columns))
         for image in of_led:
             light[union.slices(image.roi)] += led_rate * luminance * image.coverage * image.weight * image.pattern
         edges = [image.edges for image in of_led if image.edges is not None]
         light_per_excess = led_rate * float(luminance) / poses
         result = kernel.blurred(light / poses, union, edges, light_per_excess)
-        return _cut(result, union.padded(kernel.radius_px), roi)
-
-
-def _union(images: Iterable[LedImage]) -> Roi:
-    """The region that contains several images of an LED."""
-    return reduce(Roi.union, (image.roi for image in images))
-
-
-def _cut(light: Array, of: Roi, roi: Roi) -> Array:
-    """Light in the region `of`, in another region that it may not fill."""
-    if of.contains(roi):
-        return light[of.slices(roi)]
-    filled = np.zeros((roi.rows, roi.columns))
-    if of.overlaps(roi):
-        both = of.intersection(roi)
-        filled[roi.slices(both)] = light[of.slices(both)]
-    return filled
-
-
-def _patch_rois(camera: Camera, bands: Sequence[LedBand], blurs: LedBlur, regions: LedRegions | None) -> dict[int, Roi]:
-    """By the LED's index, the pixels that it lights, blur included; on the sensor only, unless with overscan."""
-    sensor = Roi.of_sensor(camera)
-    rois: dict[int, Roi] = {}
-    for band in bands:
-        for i in sorted({i for of_pose in band.images for i in of_pose}):
-            roi = _union(of_pose[i] for of_pose in band.images if i in of_pose).padded(blurs.kernels[i].radius_px)
-            if regions is None or not regions.overscan:
-                if not sensor.overlaps(roi):
-                    continue
-                roi = roi.intersection(sensor)
-            shared = band.share(roi)
-            if shared is not None:
-                rois[i] = rois[i].union(shared[0]) if i in rois else shared[0]
-    return dict(sorted(rois.items()))
+        return cut(result, union.padded(kernel.radius_px), roi)
 
 
 def _check_size(rois: Sequence[Roi], camera: Camera) -> None:

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.vignetting import relative_illumination
-from vlcrender.rendering.path_traced import reference_cd_m2
 from vlcrender.rendering.renderer import Renderer
 from vlcrender.scene.loader import Scene
 from vlcrender.scene.visibility import leds_in_view
@@ -117,6 +116,8 @@ def _draw_plan(axes: Axes, scene: Scene, posed: PosedCamera) -> EllipseCollectio
 
 
 def _reference_electrons(scene: Scene, posed: PosedCamera) -> NDArray[np.float64]:
+    from vlcrender.rendering.path_traced import reference_cd_m2  # loads trimesh
+
     camera = posed.camera
     coarse = camera.model_copy(
         update={

@@ -12,7 +12,7 @@ from vlcrender.camera.psf import blur, kernel_radius_px
 from vlcrender.camera.roi import Roi
 from vlcrender.camera.vignetting import relative_illumination
 from vlcrender.rendering.expected_image import SpecularReflection
-from vlcrender.rendering.led_coverage import candidate_leds, coverage_of_led
+from vlcrender.rendering.led_coverage import coverage_of_led
 from vlcrender.rendering.led_radiance import face_of_led, luminance_pattern
 from vlcrender.rendering.occlusion import LitRegion, Mirror, Occlusion
 from vlcrender.scene.fresnel import glazing_reflectance
@@ -60,7 +60,7 @@ def specular_reflections(
     leds, glazing, camera = scene.leds, scene.glazings[number], posed.camera
     mirrored = posed.at(mirrored_pose(posed.pose, glazing))
     found = []
-    for i in candidate_leds(mirrored, leds.centers_m, leds.circumradii_m).tolist():
+    for i in leds.spheres.candidates(mirrored).tolist():
         image = coverage_of_led(mirrored, face_of_led(leds, i))
         if image is None:
             continue

@@ -64,12 +64,18 @@ class Diffuser:
             area_m2=self.area_m2 * size**2,
         )
 
-    def luminance(self, x_m: Array, y_m: Array) -> Array:
+    def at(self, x_m: Array, y_m: Array) -> Array:
         """Luminance of the diffuser at (x, y) over that of the LED: T A cos^(m+3)(theta) / (pi d^2)."""
         tan2 = ((x_m - self.foot_m[0]) ** 2 + (y_m - self.foot_m[1]) ** 2) / self.distance_m**2
         at_foot = self.transmittance * self.area_m2 / (np.pi * self.distance_m**2)
         luminance: Array = at_foot * (1 + tan2) ** (-(self.order + 3) / 2)
         return luminance
+
+    def slopes(self, x_m: Array, y_m: Array) -> tuple[Array, Array]:
+        """Slopes of `at` by x and by y, 1/m."""
+        x, y = x_m - self.foot_m[0], y_m - self.foot_m[1]
+        by_square = -(self.order + 3) * self.at(x_m, y_m) / (self.distance_m**2 + x * x + y * y)
+        return by_square * x, by_square * y
 
     def quadrants(self) -> tuple[Array, Array]:
         """Centroids (x, y) of light, (4, 2), and luminance times area, (4,), of the four quadrants about the foot.
@@ -88,7 +94,7 @@ class Diffuser:
                 positions.append(foot + self.distance_m * np.sinh(s))
                 steps.append(np.abs(end) / 2 * weights * self.distance_m * np.cosh(s))
             x, y = np.meshgrid(*positions)
-            light = self.luminance(x, y) * np.outer(steps[1], steps[0])
+            light = self.at(x, y) * np.outer(steps[1], steps[0])
             totals[number] = light.sum()
             if totals[number] > 0:  # a foot on the border has quadrants without area
                 centers[number] = (light * x).sum() / totals[number], (light * y).sum() / totals[number]

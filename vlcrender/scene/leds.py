@@ -1,6 +1,8 @@
 """LEDs of a scene: identity, place, size, luminance and its profile, beam and diffuser of each."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,9 +11,13 @@ from vlcrender.core.face_profile import FaceProfile
 from vlcrender.core.random_keys import stream
 from vlcrender.errors import InputError
 from vlcrender.modulation.transmission import Transmitter, transmission_of
+from vlcrender.scene.bounding_spheres import BoundingSpheres
 from vlcrender.scene.diffuser import MIN_DISTANCE_RADII, Diffuser
 from vlcrender.scene.schema import PanelDiffuser, PanelGrid, PanelLeds, SceneSettings
 from vlcrender.scene.surfaces import TOUCH_M, panel_centers_m, panel_opening_m
+
+LEDS_AT_ONCE = 500
+"""LEDs whose neighbours are looked up together: bounds the memory where many are at one place."""
 
 
 @dataclass(frozen=True)
@@ -43,12 +49,12 @@ class Leds:
         """Number of LEDs."""
         return len(self.ids)
 
-    @property
+    @cached_property
     def areas_m2(self) -> NDArray[np.float64]:
         """Area of each face, (n,)."""
         return np.where(self.squares, 4.0, np.pi) * self.half_widths_m**2
 
-    @property
+    @cached_property
     def fluxes_lm(self) -> NDArray[np.float64]:
         """Luminous flux that each LED sends into the room, (n,): 2 pi L A / (m + 1), less what a diffuser absorbs."""
         through = np.array([1.0 if diffuser is None else diffuser.transmittance for diffuser in self.diffusers])
@@ -62,7 +68,7 @@ class Leds:
             return None
         return FaceProfile.of((gradient[0], gradient[1]), falloff, float(self.half_widths_m[i]), bool(self.squares[i]))
 
-    @property
+    @cached_property
     def circumradii_m(self) -> NDArray[np.float64]:
         """Distance from each centre to the farthest luminous point, (n,).
 
@@ -75,6 +81,11 @@ class Leds:
                 x, y = diffuser.foot_m
                 reaches[i] = np.hypot(max(x - x0, x1 - x), max(y - y0, y1 - y))
         return reaches
+
+    @cached_property
+    def spheres(self) -> BoundingSpheres:
+        """Spheres of the circumradii, n of them."""
+        return BoundingSpheres(self.centers_m, self.circumradii_m)
 
 
 def leds_of(settings: SceneSettings, source: str) -> Leds:
@@ -213,15 +224,34 @@ def _check_leds(leds: Leds, origins: list[str], room_m: NDArray[np.float64], sou
             f"{source}: {origins[i]}: LED {leds.ids[i]} at {center} m, {2 * leds.half_widths_m[i]:.4g} m wide, "
             f"is not inside the room of {room_m.tolist()} m"
         )
-    for i in range(len(leds) - 1):
-        between = leds.centers_m[i + 1 :] - leds.centers_m[i]
-        both_square = leds.squares[i + 1 :] & leds.squares[i]
+    for one, other in _neighbours(leds):
+        between = leds.centers_m[other] - leds.centers_m[one]
+        both_square = leds.squares[other] & leds.squares[one]
         apart = np.where(both_square, np.abs(between).max(axis=1), np.linalg.norm(between, axis=1))
-        close = np.flatnonzero(apart < leds.half_widths_m[i + 1 :] + leds.half_widths_m[i] - TOUCH_M)
+        close = np.flatnonzero(apart < leds.half_widths_m[other] + leds.half_widths_m[one] - TOUCH_M)
         if len(close):
-            other = i + 1 + close[0]
+            near, first, second = apart[close[0]], one[close[0]], other[close[0]]
             raise InputError(
-                f"{source}: {origins[other]}: LEDs {leds.ids[i]} and {leds.ids[other]} overlap: centres "
-                f"{apart[close[0]]:.4g} m apart, widths {2 * leds.half_widths_m[i]:.4g} and "
-                f"{2 * leds.half_widths_m[other]:.4g} m"
+                f"{source}: {origins[second]}: LEDs {leds.ids[first]} and {leds.ids[second]} overlap: centres "
+                f"{near:.4g} m apart, widths {2 * leds.half_widths_m[first]:.4g} and "
+                f"{2 * leds.half_widths_m[second]:.4g} m"
             )
+
+
+def _neighbours(leds: Leds) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """All pairs of LEDs that may overlap, as indices (n,) and larger indices (n,), for some LEDs at a time.
+
+    LEDs are sorted along the longer side of their field; each is paired with those of the next ones that are near
+    enough along this side.
+    """
+    axis = int(np.argmax(np.ptp(leds.centers_m, axis=0)))
+    order = np.argsort(leds.centers_m[:, axis], kind="stable")
+    along_m = leds.centers_m[order, axis]
+    ends = np.searchsorted(along_m, along_m + leds.half_widths_m[order] + leds.half_widths_m.max())
+    for start in range(0, len(leds), LEDS_AT_ONCE):
+        here = np.arange(start, min(start + LEDS_AT_ONCE, len(leds)))
+        counts = ends[here] - here - 1
+        one = np.repeat(here, counts)
+        step = np.arange(len(one)) - np.repeat(np.cumsum(counts) - counts, counts)
+        pair = order[one], order[one + 1 + step]
+        yield np.minimum(*pair), np.maximum(*pair)

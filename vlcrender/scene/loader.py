@@ -16,9 +16,9 @@ from vlcrender.scene.schema import SceneSettings
 from vlcrender.scene.surfaces import Glazing, Surface, check_absorptance, glazings_of, panel_surfaces, room_surfaces
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scene:
-    """A room ready to be rendered."""
+    """A room ready to be rendered. Two scenes are equal if they are one object: results are kept by scene."""
 
     settings: SceneSettings
     """The checked scene file."""

@@ -106,18 +106,18 @@ def _mesh_of_surface(surface: Surface, texel_m: float, number: int, furniture: S
     a, b = (
         _cuts(
             holes[:, axis].ravel(),
-            _Contacts(solids[:, axis], near[:, axis], surface.enclosed, _leds_beside(surface, edge_m, leds_m)),
+            _Contacts(_intervals(solids, axis), near[:, axis], surface.enclosed, _leds_beside(surface, edge_m, leds_m)),
             float(np.linalg.norm(edge_m)),
             texel_m,
         )
         for axis, edge_m in (([0, 2], surface.edge_u_m), ([1, 3], surface.edge_v_m))
     )
-    i, j = (index.ravel() for index in np.meshgrid(np.arange(len(a) - 1), np.arange(len(b) - 1), indexing="ij"))
-    middle_a, middle_b = (a[i] + a[i + 1]) / 2, (b[j] + b[j + 1]) / 2
-    kept = np.ones(len(i), dtype=bool)
+    middle_a, middle_b = (a[:-1] + a[1:]) / 2, (b[:-1] + b[1:]) / 2
+    kept = np.ones((len(middle_a), len(middle_b)), dtype=bool)
     for a0, b0, a1, b1 in holes:
-        kept &= ~((middle_a > a0) & (middle_a < a1) & (middle_b > b0) & (middle_b < b1))
-    i, j = i[kept], j[kept]
+        along_a = slice(np.searchsorted(middle_a, a0, "right"), np.searchsorted(middle_a, a1, "left"))
+        kept[along_a, np.searchsorted(middle_b, b0, "right") : np.searchsorted(middle_b, b1, "left")] = False
+    i, j = np.nonzero(kept)
     vertex = i * len(b) + j
     quads = np.stack([vertex, vertex + len(b), vertex + len(b) + 1, vertex + 1], axis=1)
     used, faces = np.unique(np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]), return_inverse=True)
@@ -135,6 +135,11 @@ def _mesh_of_surface(surface: Surface, texel_m: float, number: int, furniture: S
         faces=faces,
         owners=np.full(len(faces), number),
     )
+
+
+def _intervals(rectangles: Array, axis: list[int]) -> Array:
+    """Intervals of rectangles (n, 4) along an axis, each once, (k, 2): panels of a column have the same."""
+    return np.array(sorted(set(map(tuple, rectangles[:, axis].tolist())))).reshape(-1, 2)
 
 
 def _inset(a: Array, b: Array, i: Indices, j: Indices) -> Array:
@@ -182,9 +187,9 @@ def _leds_beside(surface: Surface, edge_m: Array, leds_m: Array) -> Array:
 
     Of LEDs at one height, which is rounded to millimetres, the nearest alone; at most MAX_LED_HEIGHTS of them.
     """
-    normal = np.cross(surface.edge_u_m, surface.edge_v_m)
     if not surface.enclosed or edge_m[:2].any() or not len(leds_m):
         return np.empty((0, 2))
+    normal = np.cross(surface.edge_u_m, surface.edge_v_m)
     from_corner = leds_m - surface.corner_m
     beside = np.stack([from_corner @ normal / np.linalg.norm(normal), from_corner[:, 2].round(3)], axis=1)
     beside = beside[np.argsort(beside[:, 0])]
@@ -211,7 +216,7 @@ class _Contacts:
     """What stands on or near a surface, along one of its sides; positions along the side are 0 to 1."""
 
     solids: Array
-    """Intervals on which solids stand, (n, 2)."""
+    """Intervals on which solids stand, (n, 2), each once."""
     near: Array
     """Intervals near furniture, (n, 2)."""
     enclosed: bool

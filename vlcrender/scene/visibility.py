@@ -45,7 +45,8 @@ class Visibility:
 def leds_in_view(posed: PosedCamera, scene: Scene, margin_px: float = 0.0) -> NDArray[np.int64]:
     """Indices of the LEDs whose whole face (a square's circle) is on the sensor, `margin_px` or more inside."""
     leds, camera = scene.leds, posed.camera
-    candidates = np.flatnonzero(_on_sensor(camera, posed.camera_coordinates(leds.centers_m)))
+    near = leds.spheres.candidates(posed)
+    candidates = near[_on_sensor(camera, posed.camera_coordinates(leds.centers_m[near]))]
     angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     rim = np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=1)
     # The 24-gon about the circle: a sensor that contains it contains the circle.
@@ -54,8 +55,7 @@ def leds_in_view(posed: PosedCamera, scene: Scene, margin_px: float = 0.0) -> ND
     )
     pixels = posed.project(points)
     inside = (pixels >= margin_px) & (pixels <= np.array([camera.width_px, camera.height_px]) - margin_px)
-    seen = inside.all(axis=(-1, -2)) & (posed.pose.position_m[2] < leds.centers_m[candidates, 2])
-    visible: NDArray[np.int64] = candidates[seen]
+    visible: NDArray[np.int64] = candidates[inside.all(axis=(-1, -2))]
     return visible
 
 

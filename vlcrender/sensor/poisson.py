@@ -6,13 +6,16 @@ they decide early what the density decides too, and a kernel computes the densit
 of uniforms (Knuth). Uniforms: `philox`.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vlcrender.camera.roi import Roi
 from vlcrender.core.backend import dr, exact_math, mi
-from vlcrender.core.philox import PHILOX, kernel_seed, pixel_indices
+from vlcrender.core.philox import PHILOX, kernel_seed
+from vlcrender.sensor.pixel_indices import pixel_indices
 
 MAX_TURNS = 1000
 """Bound of the loop. A turn accepts with a probability of 0.7 or more, so no draw reaches it."""
@@ -26,14 +29,20 @@ def poisson(means: NDArray[np.float32], key: str, row: int = 0, column: int = 0)
     means: (rows, columns), 0 to MAX_MEAN. The region starts at pixel (row, column), which may be negative, of the frame
     that `key` names. Raises ValueError for other means.
     """
+    rows, columns = means.shape
+    return poisson_of_regions(means.ravel(), key, [Roi(row, column, rows, columns)]).reshape(means.shape)
+
+
+def poisson_of_regions(means: NDArray[np.float32], key: str, rois: Sequence[Roi]) -> NDArray[np.uint32]:
+    """`poisson` of all pixels of all regions, region by region, row by row, (pixels,): one launch of one kernel."""
     low, high = float(means.min()), float(means.max())
     if not 0 <= low <= high <= MAX_MEAN:
         raise ValueError(f"means from {low} to {high} electrons; 0 to {MAX_MEAN:.0f} are allowed")
     with exact_math():
-        flat = np.ascontiguousarray(means, dtype=np.float32).ravel()
-        count: Any = mi.UInt32(draw(mi.Float(flat), kernel_seed(key), *pixel_indices(means.shape, row, column)))
+        flat = np.ascontiguousarray(means, dtype=np.float32)
+        count: Any = mi.UInt32(draw(mi.Float(flat), kernel_seed(key), *pixel_indices(rois)))
         dr.eval(count)
-    counts: NDArray[np.uint32] = count.numpy().reshape(means.shape)
+    counts: NDArray[np.uint32] = count.numpy()
     return counts
 
 

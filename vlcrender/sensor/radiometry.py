@@ -3,12 +3,10 @@
 Electrons in a pixel = (pi/4) (D/f_i)^2 cos^4(theta) A_pix t tau * integral of L_lambda QE(lambda) lambda/(h c) dlambda
 with D = f/N and f_i the image distance: D/f_i is one over the working f-number.
 
-Sources: spectra of white LEDs, CIE 15:2018 illuminants LED-B1 to LED-V2; luminous efficiency V(lambda), CIE 1924
-photopic observer; both as tabulated by the package colour-science. Absorption of silicon: `silicon`.
+Sources: spectra of white LEDs and luminous efficiency V(lambda), `spectra`; absorption of silicon, `silicon`.
 """
 
 from dataclasses import dataclass
-from functools import cache
 from typing import Protocol
 
 import numpy as np
@@ -19,8 +17,10 @@ from vlcrender.camera.intrinsics import Camera
 from vlcrender.sensor.quantum_efficiency import COLOURS, QuantumEfficiency
 from vlcrender.sensor.sensor import Sensor
 from vlcrender.sensor.silicon import silicon_absorption_per_m
+from vlcrender.sensor.spectra import LED_FIRST_NM, LED_SPECTRA, LED_STEP_NM, LUMINOUS_EFFICIENCY
 
 WAVELENGTHS_NM: NDArray[np.float64] = np.arange(380.0, 781.0, 1.0)
+"""The wavelengths of `spectra.LUMINOUS_EFFICIENCY`."""
 LUMINOUS_EFFICACY_LM_W = 683.0
 """The rounded value of photometric tables; 683.002 for V(lambda) in standard air."""
 
@@ -60,23 +60,16 @@ class Silicon:
         return qe
 
 
-@cache
-def _colour_science(kind: str, name: str) -> NDArray[np.float64]:
-    import colour  # loads in a second
-
-    table = {"illuminant": colour.SDS_ILLUMINANTS, "efficiency": colour.SDS_LEFS}[kind][name]
-    values: NDArray[np.float64] = np.interp(WAVELENGTHS_NM, np.asarray(table.wavelengths), np.asarray(table.values))
-    return values
-
-
 def relative_spectrum(name: str) -> NDArray[np.float64]:
     """Relative spectral power of a CIE LED illuminant at WAVELENGTHS_NM (linear between its 5 nm samples)."""
-    return _colour_science("illuminant", name)
+    spectrum = LED_SPECTRA[name]
+    samples_nm = LED_FIRST_NM + LED_STEP_NM * np.arange(len(spectrum))
+    return np.asarray(np.interp(WAVELENGTHS_NM, samples_nm, spectrum), dtype=np.float64)
 
 
 def luminous_efficiency() -> NDArray[np.float64]:
     """V(lambda) at WAVELENGTHS_NM."""
-    return _colour_science("efficiency", "CIE 1924 Photopic Standard Observer")
+    return np.array(LUMINOUS_EFFICIENCY)
 
 
 def spectral_radiance(luminance_cd_m2: float, spectrum: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,14 +1,17 @@
 """Exposure: expected electrons to digital numbers, through the chain that `sensor` describes step by step."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vlcrender.camera.roi import RegionImage, Roi
 from vlcrender.core.backend import dr, exact_math, mi
-from vlcrender.core.philox import PHILOX, kernel_seed, normals, pixel_indices
+from vlcrender.core.philox import PHILOX, kernel_seed, normals
 from vlcrender.core.random_keys import random_key
-from vlcrender.sensor.poisson import MAX_MEAN, draw, poisson
+from vlcrender.sensor.pixel_indices import pixel_indices
+from vlcrender.sensor.poisson import MAX_MEAN, draw, poisson_of_regions
 from vlcrender.sensor.sensor import Electrons, Sensor, clip_full_well
 
 
@@ -48,11 +51,27 @@ def expose(
     noise that the whole frame has there. With `noise = "full"`, dark current collects electrons for `exposure_s`, and
     the fixed patterns derive from the sensor's `serial` and the name of the camera. Raises ValueError for other means.
     """
-    expected_e = np.minimum(expected_e, np.float32(MAX_MEAN))
+    region = RegionImage(Roi(row, column, *expected_e.shape), expected_e)
+    (exposed,) = expose_regions(sensor, [region], key, exposure_s=exposure_s, camera=camera)
+    return exposed.image
+
+
+def expose_regions(
+    sensor: Sensor, expected_e: Sequence[RegionImage], key: str, *, exposure_s: float, camera: str = "main"
+) -> list[RegionImage]:
+    """`expose` of one or more regions of a frame, by one launch of one kernel."""
+    rois = [roi for roi, _ in expected_e]
+    images = [image.ravel() for _, image in expected_e]
+    flat = np.concatenate(images) if len(images) > 1 else images[0]
+    if flat.max() > MAX_MEAN:
+        flat = np.minimum(flat, np.float32(MAX_MEAN))
     if sensor.noise == "full":
-        return _full_chain(sensor, expected_e, key, random_key(sensor.serial, camera), (row, column), exposure_s)
-    electrons: Electrons = poisson(expected_e, key, row, column) if sensor.noise == "shot" else expected_e
-    return sensor.quantise(clip_full_well(electrons, sensor.full_well_e))
+        dn = _full_chain(sensor, flat, key, random_key(sensor.serial, camera), rois, exposure_s)
+    else:
+        electrons: Electrons = poisson_of_regions(flat, key, rois) if sensor.noise == "shot" else flat
+        dn = sensor.quantise(clip_full_well(electrons, sensor.full_well_e))
+    parts = np.split(dn, np.cumsum([roi.pixels for roi in rois])[:-1])
+    return [RegionImage(roi, part.reshape(roi.rows, roi.columns)) for roi, part in zip(rois, parts, strict=True)]
 
 
 def _full_chain(
@@ -60,10 +79,10 @@ def _full_chain(
     expected_e: NDArray[np.float32],
     key: str,
     individual: str,
-    start: tuple[int, int],
+    rois: Sequence[Roi],
     exposure_s: float,
 ) -> NDArray[np.uint32]:
-    """Steps 2 to 9 of the chain in the docstring of `sensor`, in one kernel."""
+    """Steps 2 to 9 of the chain in the docstring of `sensor`, in one kernel; means and numbers as `pixel_indices`."""
     low, high = float(expected_e.min()), float(expected_e.max())
     if not 0 <= low <= high:
         raise ValueError(f"means from {low} to {high} electrons; 0 and more are allowed")
@@ -72,9 +91,9 @@ def _full_chain(
         return dr.opaque(mi.Float, value)
 
     with exact_math():
-        column, row = pixel_indices(expected_e.shape, *start)
+        column, row = pixel_indices(rois)
         response, offset = normals(kernel_seed(individual, "pixels"), column, row)
-        mean = mi.Float(np.ascontiguousarray(expected_e).ravel())
+        mean = mi.Float(expected_e)
         mean = mean * dr.maximum(1.0 + number(sensor.prnu) * response, 0.0)  # 2
         mean = mean + number(sensor.dark_electrons(exposure_s))  # 3
         if sensor.hot_pixel_share > 0:
@@ -92,7 +111,7 @@ def _full_chain(
         level = dr.round(electrons / number(sensor.gain_at_iso_e_per_dn)) + number(sensor.black_level_dn)  # 8 and 9
         dn: Any = mi.UInt32(dr.clip(level, 0.0, number(sensor.largest_dn)))
         dr.eval(dn)
-    image: NDArray[np.uint32] = dn.numpy().reshape(expected_e.shape)
+    image: NDArray[np.uint32] = dn.numpy()
     return image
 
 

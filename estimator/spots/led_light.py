@@ -1,0 +1,251 @@
+"""The light of one LED image: which pixels hold it, and the background beneath it.
+
+The light is summed over an ellipse padded by a margin, or over the padded part above half level itself. The background
+is that of a ring around them. It has the lens's fall-off, as the light of the LED has: across the image of a luminaire
+of 60 cm by a wide lens it changes by a third, which moved the centroid by 0.4 px of 560. A large LED image therefore
+tells the fall-off by its own light, and the background is subtracted with it.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Pixels = NDArray[np.float64]
+
+# Blobs are searched in a 5 x 5 mean, which keeps an LED image of a few electrons a pixel in one piece.
+SMOOTHING_PX = 5
+MARGIN_PX = 2.0
+RING_PX = 3.0
+# Pixels of the ring this many standard deviations from its median are no background of the LED.
+BACKGROUND_SIGMA = 3.0
+# Of fewer pixels the variance is not measured.
+MIN_RING_PIXELS = 20
+# Of fewer pixels within an LED image the gradient of its light is not measured.
+MIN_INSIDE_PIXELS = 20
+# Illumination beside an LED image, relative to its middle: luminaires of 60 cm have 0.8 to 1.2; noise may give any.
+FALL_OFF_RANGE = 0.5, 2.0
+# A ring whose variance exceeds the noise's by this many standard deviations has a structure.
+STRUCTURE_SIGMA = 4.0
+# Below this share of the variance, which noise of half a step exceeds, rounding errors are independent.
+MAX_ROUNDING_SHARE = 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class Readout:
+    """A region of interest in electrons, `image_e` (rows, columns); its first pixel is (row, column) of the sensor.
+
+    `raw_e` is the image before denoising; `clipped` marks saturated pixels. Beside shot noise a pixel's variance has a
+    signal-independent part, `floor_e2`, of which `rounding_e2` is by the ADC's steps, and one proportional to its
+    signal squared, by the photo response nonuniformity `prnu`.
+    """
+
+    row: int
+    column: int
+    image_e: NDArray[np.float32]
+    raw_e: NDArray[np.float32]
+    clipped: NDArray[np.bool_]
+    floor_e2: float = 0.0
+    prnu: float = 0.0
+    rounding_e2: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Ellipse:
+    """Part of a blob above half level: its centroid (u, v) and the ellipse of the same second moments.
+
+    `axes` (2, 2) are its unit axes as columns, `semi_axes_px` (2,) their lengths. `low_px` and `high_px` (2,) are
+    opposite vertices of the upright box around the part itself. `stretch` is the factor that makes the ellipse enclose
+    a square. `fringe_px` is the width of the light found around the ellipse beyond that of a sharp LED image. `core`
+    are the pixels of the part, the first of them at `low_px`; None where the ellipse describes the LED image better.
+    """
+
+    centre_px: NDArray[np.float64]
+    axes: NDArray[np.float64]
+    semi_axes_px: NDArray[np.float64]
+    low_px: NDArray[np.float64]
+    high_px: NDArray[np.float64]
+    area_px: int
+    stretch: float
+    fringe_px: float = 0.0
+    core: NDArray[np.bool_] | None = None
+
+    def distance2(self, u_px: NDArray[np.float64], v_px: NDArray[np.float64], padding_px: float) -> NDArray[np.float64]:
+        """Squared distance from the centre in units of the padded ellipse, at most 1 inside.
+
+        Takes a row of u (1, columns) and a column of v (rows, 1); returns (rows, columns).
+        """
+        du, dv = u_px - self.centre_px[0], v_px - self.centre_px[1]
+        (uu, uv), (_, vv) = (self.axes / (self.semi_axes_px + padding_px) ** 2) @ self.axes.T
+        return np.asarray(uu * du**2 + vv * dv**2 + (2 * uv * dv) * du)
+
+    def half_extent(self, padding_px: float) -> NDArray[np.float64]:
+        """Half width and half height, (2,), of the upright box around the padded ellipse."""
+        return np.asarray(np.sqrt((self.axes**2) @ (self.semi_axes_px + padding_px) ** 2))
+
+
+@dataclass(frozen=True, eq=False)
+class Light:
+    """Light of an LED image: pixels of a rectangle `roi` at u (1, columns) and v (rows, 1), of its region's own.
+
+    `signal_e` (rows, columns) are electrons above the background, 0 outside the support; `variance_e2` is the variance
+    of every pixel.
+    """
+
+    roi: tuple[slice, slice]
+    u_px: NDArray[np.float64]
+    v_px: NDArray[np.float64]
+    electrons: NDArray[np.float64]
+    support: NDArray[np.bool_]
+    signal_e: NDArray[np.float64]
+    variance_e2: NDArray[np.float64]
+
+    @cached_property
+    def flux_e(self) -> float:
+        """Sum of the signal, electrons."""
+        return float(self.signal_e.sum())
+
+    @property
+    def signal_to_noise(self) -> float:
+        """Flux over its standard deviation."""
+        return self.flux_e / max(float(np.sqrt(self.variance_e2[self.support].sum())), 1e-300)
+
+    def centroid_px(self) -> NDArray[np.float64]:
+        """Centroid (u, v), (2,)."""
+        by_column, by_row = self.signal_e.sum(axis=0), self.signal_e.sum(axis=1)
+        return np.array([by_column @ self.u_px[0], by_row @ self.v_px[:, 0]]) / self.flux_e
+
+    def moments_px2(self, centroid_px: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Second moments about the centroid, (2, 2)."""
+        return second_moments(self.signal_e, *self._offsets(centroid_px)) / self.flux_e
+
+    def covariance_px2(self, centroid_px: NDArray[np.float64], denoise_radius_px: int) -> NDArray[np.float64]:
+        """Covariance of the centroid by the pixels' noise, (2, 2)."""
+        du, dv = self._offsets(centroid_px)
+        if denoise_radius_px == 0:
+            return second_moments(self.support * self.variance_e2, du, dv) / self.flux_e**2
+        # A centroid of box means is a sum over the raw pixels, weighted by the box means of the centroid's weights.
+        box = (2 * denoise_radius_px + 1, 2 * denoise_radius_px + 1)
+        levers = np.stack([self.support * du, self.support * dv[:, None]]) / self.flux_e
+        weights = np.stack([cv2.blur(lever, box, borderType=cv2.BORDER_CONSTANT).ravel() for lever in levers])
+        return np.asarray((weights * self.variance_e2.ravel()) @ weights.T)
+
+    def moment_sigmas_px2(self, centroid_px: NDArray[np.float64], moments: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Standard deviations (2,) of the second moments (2,) along u and v by the pixels' noise."""
+        (du, dv), noise_e2 = self._offsets(centroid_px), self.support * self.variance_e2
+        along_u, along_v = (du**2 - moments[0]) ** 2, (dv**2 - moments[1]) ** 2
+        return np.sqrt([noise_e2.sum(axis=0) @ along_u, noise_e2.sum(axis=1) @ along_v]) / self.flux_e
+
+    def _offsets(self, centroid_px: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Offsets of columns along u, and of rows along v, from the centroid."""
+        return self.u_px[0] - centroid_px[0], self.v_px[:, 0] - centroid_px[1]
+
+
+def second_moments(
+    weights: NDArray[np.float64], du: NDArray[np.float64], dv: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Sums (2, 2) of weights (rows, columns) times du^2, du dv and dv^2; du is along columns, dv along rows."""
+    mixed = dv @ weights @ du
+    return np.array([[weights.sum(axis=0) @ du**2, mixed], [mixed, weights.sum(axis=1) @ dv**2]])
+
+
+def light_of(readout: Readout, ellipse: Ellipse, others: list[Ellipse], denoise_radius_px: int) -> Light:
+    """Light in the ellipse and a margin; the background is that of a ring around them."""
+    margin_px = MARGIN_PX + max(denoise_radius_px, ellipse.fringe_px)
+    left, top, right, bottom = _surroundings(ellipse, margin_px + RING_PX, readout.image_e.shape)
+    roi = np.s_[top:bottom, left:right]
+    u_px, v_px = _centres_px(left, right)[None, :], _centres_px(top, bottom)[:, None]
+    electrons = readout.image_e[roi].astype(np.float64)
+    distance2 = ellipse.distance2(u_px, v_px, margin_px)
+    fall_off = np.ones(electrons.shape)
+    if ellipse.core is None:
+        support = distance2 <= 1
+        ring = ~support & (ellipse.distance2(u_px, v_px, margin_px + RING_PX) <= 1)
+    else:
+        face = np.zeros(electrons.shape, dtype=bool)
+        column, row = ellipse.low_px.astype(int) - (left, top)
+        face[row : row + ellipse.core.shape[0], column : column + ellipse.core.shape[1]] = ellipse.core
+        edge_px = SMOOTHING_PX // 2 + ellipse.fringe_px
+        fall_off = _relative_fall_off(electrons, _distance_px(face) > edge_px)
+        beyond_px = _distance_px(~face)
+        support = beyond_px <= margin_px
+        ring = ~support & (beyond_px <= margin_px + RING_PX)
+    for other in others:
+        # A pixel in two supports belongs to the nearer spot.
+        other_distance2 = other.distance2(u_px, v_px, MARGIN_PX + max(denoise_radius_px, other.fringe_px))
+        support &= distance2 <= other_distance2
+        ring &= other_distance2 > 1
+    # Shot noise: a raw pixel's variance is its electrons.
+    raw_e = np.maximum(readout.raw_e[roi].astype(np.float64), 0.0)
+    variance_e2 = raw_e + readout.floor_e2 + (readout.prnu * raw_e) ** 2
+    background_e = np.zeros(electrons.shape)
+    if ring.any():
+        # One electron more: the noise of a pixel with fewer is not normal.
+        gate_e = BACKGROUND_SIGMA * float(np.sqrt(_median(variance_e2[ring]) + 1.0))
+        even_e = electrons / fall_off
+        # The ring without pixels of another surface or light.
+        ring &= np.abs(even_e - _median(even_e[ring])) <= gate_e
+        background_e = float(even_e[ring].mean()) * fall_off
+        if np.count_nonzero(ring) >= MIN_RING_PIXELS:
+            unlit = support & (electrons - background_e <= gate_e)
+            ring_e = readout.raw_e[roi][ring] / fall_off[ring]
+            excess_e2 = _excess_variance(readout, ring_e, float(variance_e2[ring].mean()))
+            variance_e2[unlit] = np.maximum(variance_e2[unlit] + excess_e2, 0.0)
+    signal_e = np.where(support, electrons - background_e, 0.0)
+    return Light(roi, u_px, v_px, electrons, support, signal_e, variance_e2)
+
+
+def _median(values: NDArray[np.float64]) -> float:
+    """Median of numbers (n,): NumPy's own takes several times as long for a ring's pixels."""
+    middle = len(values) // 2
+    around = np.partition(values, (middle - 1 + len(values) % 2, middle))
+    return float(around[middle - 1 + len(values) % 2] + around[middle]) / 2
+
+
+def _centres_px(first: int, last: int) -> Pixels:
+    return np.arange(first, last, dtype=np.float64) + 0.5
+
+
+def _distance_px(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Distance of each pixel of a mask from the nearest one that is not in it; 0 for the others."""
+    return np.asarray(cv2.distanceTransform(mask.view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE))
+
+
+def _surroundings(ellipse: Ellipse, padding_px: float, shape: tuple[int, ...]) -> tuple[int, int, int, int]:
+    """First column and row, and those after the last, of a padded LED image in an image of this shape."""
+    low_px, high_px = ellipse.low_px - padding_px, ellipse.high_px + padding_px
+    if ellipse.core is None:
+        half_extent = ellipse.half_extent(padding_px)
+        low_px, high_px = ellipse.centre_px - half_extent, ellipse.centre_px + half_extent
+    left, top = np.maximum(np.floor(low_px), 0).astype(int).tolist()
+    right, bottom = np.minimum(np.ceil(high_px), shape[::-1]).astype(int).tolist()
+    return left, top, right, bottom
+
+
+def _relative_fall_off(electrons: Pixels, inside: NDArray[np.bool_]) -> Pixels:
+    """Illumination by the lens in each pixel: the plane that the light inside an LED image follows, 1 at its middle.
+
+    With the second moments S of the pixels inside, a relative gradient g of the light moves their centroid by S g.
+    """
+    if np.count_nonzero(inside) < MIN_INSIDE_PIXELS:
+        return np.ones(electrons.shape)
+    offset = np.indices(electrons.shape, dtype=np.float64)
+    offset -= offset[:, inside].mean(axis=1)[:, None, None]
+    moments = np.cov(offset[:, inside], bias=True)
+    gradient = np.linalg.solve(moments, offset[:, inside] @ electrons[inside] / electrons[inside].sum())
+    return np.asarray(np.clip(1 + np.tensordot(gradient, offset, axes=1), *FALL_OFF_RANGE))
+
+
+def _excess_variance(readout: Readout, ring_e: Pixels, model_e2: float) -> float:
+    """Variance of a pixel without light of an LED, by the ring's pixels, less that by the model, electrons squared.
+
+    It is negative where the ADC's steps exceed the noise: neighbouring pixels are then rounded alike, while the model's
+    rounding errors are independent. It is positive where the background has a structure.
+    """
+    excess_e2 = float(ring_e.var(ddof=1, dtype=np.float64)) - model_e2
+    if readout.rounding_e2 > MAX_ROUNDING_SHARE * model_e2:
+        return excess_e2
+    # The variance of n normal numbers has a relative standard deviation of sqrt(2 / n).
+    return excess_e2 if excess_e2 > STRUCTURE_SIGMA * np.sqrt(2 / ring_e.size) * model_e2 else 0.0

@@ -1,0 +1,30 @@
+"""Spheres around LEDs that a camera may see: by blocks the same as one by one, whatever the order of the LEDs."""
+
+import numpy as np
+import pytest
+
+from vlcrender.camera.intrinsics import Camera, Pose
+from vlcrender.camera.posed_camera import PosedCamera
+from vlcrender.scene.bounding_spheres import BLOCK, BoundingSpheres
+
+LENSES = {"perspective": Camera(focal_length_mm=6.0), "fish-eye": Camera(projection="equidistant", focal_length_mm=2.0)}
+
+
+@pytest.mark.parametrize("camera", LENSES.values(), ids=LENSES)
+@pytest.mark.parametrize("order", ["panels", "mixed"])
+def test_blocks_leave_out_no_sphere_that_may_be_seen(camera: Camera, order: str, rng: np.random.Generator) -> None:
+    """A grid of 2 025 spheres, the last block not full, at two heights, some of them below the camera."""
+    x, y = (index.ravel().astype(float) for index in np.meshgrid(np.arange(45), np.arange(45)))
+    centers = np.column_stack([x, y, np.where(rng.uniform(size=x.size) < 0.2, 1.2, 3.5)])
+    if order == "mixed":
+        rng.shuffle(centers)
+    spheres = BoundingSpheres(centers, rng.uniform(0.01, 0.3, len(centers)))
+    assert len(centers) % BLOCK
+    found = 0
+    for _ in range(30):
+        pose = Pose((*rng.uniform(5, 40, 2).tolist(), 1.5), *rng.uniform(-30, 30, 2), rng.uniform(-180, 180))
+        posed = PosedCamera(camera, pose)
+        one_by_one = np.flatnonzero(spheres._in_view(posed, 3.0) & (centers[:, 2] > 1.5))
+        assert np.array_equal(spheres.candidates(posed, 3.0), one_by_one)
+        found += len(one_by_one)
+    assert 30 < found < 30 * len(centers) / 2

@@ -1,0 +1,103 @@
+"""Slopes of LED images by the motion of their rims, against central differences of exact images."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from test_diffuser import panelled
+from test_path_traced import scene_of
+
+from vlcrender.camera.intrinsics import Camera, Pose
+from vlcrender.camera.posed_camera import PosedCamera
+from vlcrender.camera.roi import LedRegions
+from vlcrender.light.lightmap import bake
+from vlcrender.rendering.bayer import MosaicRenderer
+from vlcrender.rendering.crlb import moved
+from vlcrender.rendering.renderer import Renderer
+from vlcrender.scene.loader import Scene
+from vlcrender.sensor.radiometry import Silicon
+
+POSE = Pose((1.43, 1.54, 0.5), 6.0, -4.0, 10.0)
+CAMERA = {"width_px": 400, "height_px": 300, "pixel_pitch_um": 8.0, "focal_length_mm": 12.0}
+"""1500 px of focal length: 2 m away a disc of 0.04 m has a radius of 30 px."""
+LED = {"id": 1, "position_m": [1.5, 1.5, 2.5], "luminance_cd_m2": 8000.0, "radius_m": 0.04}
+SQUARE = {**{k: v for k, v in LED.items() if k != "radius_m"}, "shape": "square", "side_m": 0.07}
+STEP_PX = 1e-4
+COARSE = {"texel_m": 0.5, "paths": 16}
+
+
+def agree(
+    renderer: Renderer | MosaicRenderer,
+    camera: Camera,
+    regions: LedRegions | None = None,
+    tolerance: float = 2 / 1500,
+) -> None:
+    """Compare the norms of slopes by all six unknowns of the pose.
+
+    Exact coverage neglects the change of scale within a pixel, 1 / 1500 of itself, twice in a difference. The
+    displacement between nodes of the rim is right to 4e-5, and the polygon to less. A corner of a pixel that the rim
+    passes within the step would show; of some 200 edge pixels 4 * 200 * 2e-4 = 0.2 are expected.
+    """
+    posed = PosedCamera(camera, POSE)
+    angle = STEP_PX / 1500
+    steps = [2.0 * angle] * 3 + [angle] * 3
+    changes = [(posed.at(moved(POSE, i, step)), posed.at(moved(POSE, i, -step))) for i, step in enumerate(steps)]
+    base, *slopes = renderer.led_slopes(posed, changes, regions)
+    assert len(base) >= 1
+    for of_change, cameras in zip(slopes, changes, strict=True):
+        after, before = ({p.led_id: p for p in renderer.led_patches(each, regions, POSE)} for each in cameras)
+        for slope in of_change:
+            one, other = after[slope.led_id], before[slope.led_id]
+            assert one.roi == other.roi == slope.roi
+            difference = one.electrons_per_s - other.electrons_per_s
+            assert np.linalg.norm(difference) > 0
+            assert np.linalg.norm(slope.electrons_per_s - difference) < tolerance * np.linalg.norm(difference)
+
+
+@pytest.mark.parametrize(
+    "led",
+    [
+        LED,
+        SQUARE,
+        {**LED, "face_gradient": [0.3, -0.2], "face_falloff": 0.7},
+        {**SQUARE, "face_gradient": [0.2, 0.3]},
+        {**LED, "half_power_deg": 8.0},
+        {**LED, "position_m": [1.53, 1.49, 2.5]},
+    ],
+    ids=["disc", "square", "uneven disc", "uneven square", "beam", "cut by the border"],
+)
+def test_slopes_of_one_led(led: dict[str, Any]) -> None:
+    agree(Renderer(scene_of(led=[led], bake=COARSE)), Camera(**CAMERA))
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        {"focus_distance_m": 1.0},
+        {"focus_distance_m": 1.9},
+        {"psf": "diffraction", "f_number": 16.0},
+        {"distortion": {"k1": -0.2, "p1": 0.01}},
+        {"projection": "equidistant"},
+    ],
+    ids=["wide blur", "narrow blur", "diffraction", "distortion", "fish-eye"],
+)
+def test_slopes_through_a_lens(lens: dict[str, Any]) -> None:
+    led = {**LED, "face_gradient": [0.1, 0.0]}
+    agree(Renderer(scene_of(led=[led], bake=COARSE)), Camera(**CAMERA, **lens), LedRegions(kind="leds"))
+
+
+def test_slopes_of_diffusers() -> None:
+    """Six LEDs behind one diffuser, whose images overlap.
+
+    At the diffuser's border the image has the luminance of the pixel's centre, the slope that of the border: half a
+    pixel, 1.3 mm / 2 of 30 mm, times (m + 3) / 2, the largest slope of luminance: 4 %.
+    """
+    scene = panelled(diffuser=True, frame=False, bake=COARSE)
+    agree(Renderer(scene), Camera(**CAMERA), tolerance=0.04)
+
+
+def test_slopes_behind_a_mosaic_with_crosstalk() -> None:
+    scene: Scene = scene_of(led=[LED], bake=COARSE)
+    light = bake(scene)
+    renderer = MosaicRenderer(tuple(Renderer(scene, light, Silicon()) for _ in range(3)), "rggb", 0.1)
+    agree(renderer, Camera(**CAMERA, lateral_colour_um=(1.0, 2.0)))
