@@ -236,6 +236,10 @@ def test_shot_noise_alone_has_nothing_else_set() -> None:
     assert not [row for row in sheet.rows if row.passed is False]
     for key in ("sigma_d", "mu_I", "DSNU1288", "DSNU1288.row", "PRNU1288", "LE"):
         assert cells(row_of(sheet.rows, key))[0] == "none set"
+    linearity = row_of(sheet.rows, "LE")  # percent, as its tolerance
+    assert linearity.measured == pytest.approx(100 * sheet.measurement.linearity_error.value)
+    assert linearity.tolerance is not None
+    assert linearity.tolerance > 100 * sheet.measurement.linearity_noise
     assert row_of(sheet.rows, "sigma_d").measured == 0
     assert row_of(sheet.rows, "T_d").passed is None
     assert row_of(sheet.rows, "full well").set_value == 4095  # limit of the ADC, below the well's 6000 e

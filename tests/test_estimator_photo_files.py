@@ -13,7 +13,7 @@ from PIL import ExifTags, Image
 
 from estimator.errors import InputError
 from estimator.io.shutter import GLOBAL
-from estimator.photo.calibration import Calibration, calibration_of_film, read_calibration
+from estimator.photo.calibration import Calibration, calibration_of_film, read_calibration, simple_calibration
 from estimator.photo.led_table import read_led_table, read_spots
 from estimator.photo.pictures import read_picture
 from estimator.photo.yaml_subset import YamlError, parse_yaml
@@ -374,3 +374,8 @@ def test_a_calibration_without_a_size_is_taken_as_of_the_picture(tmp_path: Path)
     sized = found.for_size(1280, 960)
     assert sized.size_px == (1280, 960)
     assert "states no size" in sized.remarks[0]
+
+
+def test_a_focal_length_alone_is_a_pinhole_about_the_middle_of_the_picture() -> None:
+    K = simple_calibration(1500.0, (800, 600), "by hand").K
+    assert K.tolist() == [[1500.0, 0.0, 400.0], [0.0, 1500.0, 300.0], [0.0, 0.0, 1.0]]

@@ -107,3 +107,9 @@ def test_slopes_are_what_moving_the_outline_gives() -> None:
         ahead, behind = (cover(rois, outlines(points + sign * step))[0] for sign in (1, -1))
         # Growing, an edge's ends move by 1 % of a pixel differently: within an edge the middle stands for it.
         np.testing.assert_allclose(found, (ahead - behind) / 2e-5, atol=0.02 if parameter == 2 else 1e-4)
+
+
+def test_pixels_that_two_regions_share_are_the_same_pixels_in_each() -> None:
+    of_first, of_second = roi(2, 10, 6, 8).intersection(0, roi(5, 7, 9, 5), 0)
+    assert of_first == (np.s_[3:6], np.s_[0:2])
+    assert of_second == (np.s_[0:3], np.s_[3:5])

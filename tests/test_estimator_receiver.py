@@ -256,6 +256,11 @@ def test_a_packet_is_read_as_it_was_made() -> None:
     assert np.array_equal(FORM.chips(data), chips)
     likeness = FORM.likeness(2.0 * np.roll(chips, 31) - 1)
     assert int(np.argmax(likeness)) == 31
+    # at a packet's start all chips of the preamble agree, and each bit counts one: its two chips differ by 2, halved
+    bits = (FORM.length - len(FORM.preamble)) / 2
+    assert likeness[31] == pytest.approx(len(FORM.preamble) + bits)
+    # steady light is as unlike as can be in each bit, and half of the balanced preamble's chips agree with it
+    np.testing.assert_allclose(FORM.likeness(np.ones(FORM.length)), -bits)
 
 
 def test_erasures_follow_from_the_crc_and_errors_do_not() -> None:

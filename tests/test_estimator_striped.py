@@ -6,6 +6,7 @@ from scipy.stats import chi2
 from striped_images import Array, code, coverage, gains, readout
 
 from estimator.spots.led_light import Readout
+from estimator.spots.line_edges import LineEdges
 from estimator.spots.outlines import EdgeEllipse, EdgeParallelogram
 from estimator.spots.striped import Lamp, find_lamps
 
@@ -174,3 +175,22 @@ def test_moments_are_those_of_the_uniform_area() -> None:
         points = grid[inside]
         assert outline.moments == pytest.approx(points.T @ points / len(points), rel=5e-3, abs=0.05)
         assert outline.extent == pytest.approx(points.max(axis=0), abs=0.04)
+
+
+def test_the_correction_for_blur_is_half_its_variance_times_the_edge_s_curvature() -> None:
+    """The curvature of the ellipse's right edge by differences of a step of 0.01 lines, right to 1e-4 of it."""
+    at, lines, step = (
+        EdgeEllipse(x0=5.0, y0=30.0, slope=0.0, half_chord=20.0, half_extent=25.0),
+        np.arange(20.0, 41),
+        0.01,
+    )
+
+    def edge(y: Array) -> Array:
+        return 5.0 + 20.0 * np.sqrt(1 - ((y - 30.0) / 25.0) ** 2)
+
+    middle = lines + 0.5
+    curvature = (edge(middle + step) - 2 * edge(middle) + edge(middle - step)) / step**2
+    none = np.zeros(len(lines))
+    found = LineEdges(lines, none, none, none, none, 4.0).unblurred(at)
+    np.testing.assert_allclose(found.right, -4.0 / 2 * curvature, rtol=1e-4)
+    np.testing.assert_allclose(found.left, 4.0 / 2 * curvature, rtol=1e-4)

@@ -220,3 +220,12 @@ def test_a_narrow_blur_makes_no_pixel_brighter_than_a_sharp_lens_and_lights_no_h
     blurred = np.nonzero((light > 1e-9 * light.max()).any(axis=0))[0] + patch.column
     # a disc of 0.7 px reaches one pixel farther
     assert blurred.max() <= lit.max() + 1
+
+
+def test_a_narrower_diffraction_pattern_needs_more_parts_of_a_pixel() -> None:
+    """By the number that `split_for` states: its error is at most D / (12 n^2), and D grows as the pattern narrows."""
+    parts = [
+        split_for(Camera(psf="diffraction", f_number=f_number, pixel_pitch_um=1.2), 3.0) for f_number in (1.4, 2.8, 8.0)
+    ]
+    assert parts == sorted(parts, reverse=True)
+    assert parts[0] > parts[-1]
