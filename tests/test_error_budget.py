@@ -50,6 +50,13 @@ def test_the_bound_is_below_the_total_and_near_it(calibrated: vr.ErrorBudget) ->
     assert 0.8 * calibrated.total.total_mm < calibrated.bound.total_mm < calibrated.total.total_mm
 
 
+def test_distortion_is_told_by_its_size_at_the_corner() -> None:
+    """1.2 um at the corner, and 0.36 um of decentering, are 0.1 px and 0.03 px of 12 um."""
+    rows = {row.key: row for row in budget_of("belief.camera={radial_corner_um=1.2,decentering_corner_um=0.36}").rows}
+    assert rows["radial"].sigma == "0.1 px at the corner"
+    assert rows["decentering"].sigma == "0.03 px at the corner"
+
+
 def test_device_and_shot_share_an_unknown_by_their_variances(calibrated: vr.ErrorBudget) -> None:
     """Focal length 0.1 % by device, 0.03 % by shot; accelerometer 0.3 and 0.05 deg."""
     rows = {row.key: row for row in calibrated.rows}

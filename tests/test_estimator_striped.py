@@ -5,6 +5,7 @@ import pytest
 from scipy.stats import chi2
 from striped_images import Array, code, coverage, gains, readout
 
+from estimator.spots.glow import _isophote
 from estimator.spots.led_light import Readout
 from estimator.spots.line_edges import LineEdges
 from estimator.spots.outlines import EdgeEllipse, EdgeParallelogram
@@ -194,3 +195,11 @@ def test_the_correction_for_blur_is_half_its_variance_times_the_edge_s_curvature
     found = LineEdges(lines, none, none, none, none, 4.0).unblurred(at)
     np.testing.assert_allclose(found.right, -4.0 / 2 * curvature, rtol=1e-4)
     np.testing.assert_allclose(found.left, 4.0 / 2 * curvature, rtol=1e-4)
+
+
+def test_an_isophote_is_the_ellipse_of_its_pixels() -> None:
+    """Chords are whole pixels, an edge is right to 0.3 px in rms and the fit of 40 lines to half a pixel at most."""
+    y, x = np.mgrid[0:60, 0:50] + 0.5
+    found = _isophote(((x - 24.3) / 14.0) ** 2 + ((y - 30.6) / 21.0) ** 2 < 1)
+    assert found is not None
+    assert (found.x0, found.y0, found.half_chord, found.half_extent) == pytest.approx((24.3, 30.6, 14.0, 21.0), abs=0.5)
