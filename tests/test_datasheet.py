@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from vlcrender.cli import main
 from vlcrender.core.quantity import Quantity, line
 from vlcrender.emva1288.datasheet import LABELS, SIGMAS, Datasheet, Row, cells, compare, load_sensor, make_datasheet
-from vlcrender.emva1288.page import page
+from vlcrender.emva1288.page import BOTTOM, HEIGHT, LEFT, RIGHT, TOP, WIDTH, page
 from vlcrender.emva1288.photon_transfer import Measurement, Shoot, measure, take_pair
 from vlcrender.errors import InputError
 from vlcrender.sensor.nonuniformity import patterns, response_variance
@@ -326,6 +327,25 @@ def test_the_page_stands_alone_and_shows_every_row(full: Datasheet) -> None:
         assert f">{row.key}<" in text
         assert f">{cells(row)[1]}<" in text
     assert not [word for word in ("http", "url(", "<script", "nan", "inf ") if word in text.split("</style>")[1]]
+
+
+@pytest.mark.slow
+def test_the_grids_of_the_plots_fill_their_frames(full: Datasheet) -> None:
+    """The last decade of photons is at the right edge; no line of a grid or curve is outside."""
+    for plot in page(full).split("<svg")[1:]:
+        rules = [
+            [float(value) for value in re.findall(r'[xy][12]="([-0-9.]+)"', line)]
+            for line in re.findall(r'<line class="rule"[^>]*>', plot)
+        ]
+        xs, ys = [x for x1, _, x2, _ in rules for x in (x1, x2)], [y for _, y1, _, y2 in rules for y in (y1, y2)]
+        assert (min(xs), max(xs)) == (LEFT, WIDTH - RIGHT)
+        assert min(ys) >= TOP
+        assert max(ys) == HEIGHT - BOTTOM
+        curve = np.array(
+            [place.split(",") for path in re.findall(r'd="M([^"]*)"', plot) for place in path.split()], float
+        )
+        assert curve[:, 0].min() >= LEFT
+        assert curve[:, 0].max() <= WIDTH - RIGHT
 
 
 def test_the_text_of_the_page_is_the_data_sheet(full: Datasheet) -> None:
