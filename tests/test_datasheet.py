@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from html_text import texts
 from numpy.typing import NDArray
+from scipy.stats import norm
 
 from vlcrender.cli import main
 from vlcrender.core.quantity import Quantity, line
@@ -19,7 +20,7 @@ from vlcrender.emva1288.datasheet import LABELS, SIGMAS, Datasheet, Row, cells, 
 from vlcrender.emva1288.page import BOTTOM, HEIGHT, LEFT, RIGHT, TOP, WIDTH, page
 from vlcrender.emva1288.photon_transfer import Measurement, Shoot, measure, take_pair
 from vlcrender.errors import InputError
-from vlcrender.sensor.nonuniformity import patterns, response_variance
+from vlcrender.sensor.nonuniformity import UNSEEN_DN2, patterns, response_variance
 from vlcrender.sensor.saturation import clipped, full_well_e, saturation_e
 from vlcrender.sensor.sensor import Sensor
 
@@ -435,3 +436,12 @@ def test_the_command_refuses_in_one_line(
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1
     assert mention in lines[0]
+
+
+def test_a_variance_that_rounding_hides_has_the_standard_error_of_what_may_be_hidden() -> None:
+    """Of 5e5 normal numbers one is expected beyond half a DN: the variance is anything up to that, uniformly.
+
+    The constants have two and three digits: 1 %.
+    """
+    largest_dn2 = (0.5 / norm.isf(0.5 / 5e5)) ** 2
+    assert pytest.approx(largest_dn2 / 3**0.5, rel=0.01) == UNSEEN_DN2

@@ -1,13 +1,16 @@
 """The error budget of a recipe: rows, totals, the command line and the chart."""
 
 import json
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 from conftest import ROOT, SMALL, run
+from matplotlib.figure import Figure
 
 import vlcrender as vr
+from vlcrender.dataset.budget_plot import draw_budget
 
 RECIPE = str(ROOT / "datasets/quickstart.toml")
 OVERRIDES = [*SMALL, "poses.count=3", "belief.preset=calibrated"]
@@ -71,6 +74,18 @@ def test_an_estimator_that_trusts_lens_and_map_is_right_where_they_are_exact() -
     assert {row.key for row in of_tilts.rows} == {"accelerometer_device", "noise"}
     for row in of_tilts.rows:
         assert row.trusting.total_mm == pytest.approx(row.share.total_mm, rel=1e-9)
+
+
+def test_bars_of_the_chart_do_not_overlap(
+    calibrated: vr.ErrorBudget, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[Figure] = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
+    draw_budget(calibrated, tmp_path / "chart.svg")
+    spans = sorted((bar.get_y(), bar.get_y() + bar.get_height()) for bar in drawn[0].axes[0].patches)
+    assert len(spans) == 2 * len(calibrated.rows)
+    for (_, end), (start, _) in pairwise(spans):
+        assert start > end - 1e-9
 
 
 @pytest.mark.slow

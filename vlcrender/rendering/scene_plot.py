@@ -111,7 +111,7 @@ def _draw_plan(axes: Axes, scene: Scene, posed: PosedCamera) -> EllipseCollectio
         ylabel="y, m (down, as in the image)",
     )
     axes.set_aspect("equal")
-    axes.set_title(f"{scene.name}: {x_m:g} x {y_m:g} x {z_m:g} m seen from below, {len(leds)} LEDs; blue: the image")
+    axes.set_title(f"{scene.name}: {x_m:g} x {y_m:g} x {z_m:g} m,\n{len(leds)} LEDs seen from below; blue: the image")
     return discs
 
 
