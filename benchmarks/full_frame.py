@@ -102,9 +102,9 @@ def main() -> None:
 
             ours = compare(lambda: write_preview(png, [(whole, dn)], whole, sensor.largest_dn), picture)
             targets.at_most("preview / OpenCV's area means and PNG", ours, 1.3)
-    for name, integrator, samples in (("direct", direct, 16), ("path, 8 bounces,", path, 16)):
-        other = compare(lambda i=integrator, n=samples: render(loaded, i, n), frame, 1)
-        print(f"Mitsuba {name} at {samples} samples a pixel / full frame {other:12.1f}")
+        for name, integrator, samples in (("direct", direct, 16), ("path, 8 bounces,", path, 16)):
+            other = compare(lambda i=integrator, n=samples: render(loaded, i, n), frame, 1)
+            print(f"Mitsuba {name} at {samples} samples a pixel / full frame {other:12.1f}")
     targets.finish()
 
 
