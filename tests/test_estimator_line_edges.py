@@ -1,0 +1,60 @@
+"""Edges of an LED image in its lines: which lines have edges at all."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from estimator.spots.line_edges import MIN_EDGE_SNR, LineEdges, edges_of
+from estimator.spots.striped_blobs import BlobLight, StripedBlob
+
+Array = NDArray[np.float64]
+ROWS, COLUMNS, FIRST, LAST = 20, 60, 20, 40
+"""A bar of 20 lines, lit from one column to before another."""
+
+
+def bar(level: Array, background_e2: float = 0.0, whole: bool = False) -> LineEdges | None:
+    """Edges of a bar with a level for each line, (ROWS,), and this variance of the pixels beside it.
+
+    `whole`: the box holds nothing but pixels of the LED image.
+    """
+    columns = np.arange(COLUMNS)
+    own = np.tile((columns >= FIRST) & (columns < LAST), (ROWS, 1))
+    signal = own * level[:, None]
+    variance = np.where(own, signal + background_e2, background_e2)
+    if whole:
+        own = np.ones_like(own)
+    blob = StripedBlob(0, 0, COLUMNS, ROWS, own, np.zeros_like(own), int(own.sum()))
+    light = BlobLight(signal, variance, np.ones_like(own), np.full(ROWS, background_e2 / COLUMNS))
+    return edges_of(light, blob, np.zeros_like(own))
+
+
+@pytest.mark.parametrize(("share", "seen"), [(0.99, True), (1.01, False)])
+def test_a_line_has_edges_where_its_half_level_is_four_sigma(share: float, seen: bool) -> None:
+    """At half level p / 2 a pixel has the variance p / 2 of its light and B of the background beside it, and the mean
+    of three a third of that: p / 2 = 4 sqrt((p / 2 + B) / 3) where B = 3 (p / 8)^2 - p / 2.
+    """
+    level = 100.0
+    limit_e2 = 3 * (level / (2 * MIN_EDGE_SNR)) ** 2 - level / 2
+    found = bar(np.full(ROWS, level), share * limit_e2)
+    assert (found is not None) == seen
+    if found is not None:
+        assert found.left == pytest.approx(np.full(ROWS, FIRST))
+        assert found.right == pytest.approx(np.full(ROWS, LAST))
+
+
+def test_an_image_that_fills_its_box_has_the_noise_of_its_light_alone() -> None:
+    """Twice that of the half level: no pixel beside it tells the background's, and no line of it is lost by that."""
+    found = bar(np.full(ROWS, 1000.0), whole=True)
+    assert found is not None
+    assert len(found.lines) == ROWS
+
+
+def test_lines_below_a_twentieth_of_the_bright_ones_are_background() -> None:
+    """Dark lines of an LED hold the blur and the glare of the lit ones beside them, whose edges are not the LED's. Their
+    share is at most HALO_SHARE, a twentieth, as the likelihood of pixels assumes of halos.
+    """
+    level = np.full(ROWS, 1e6)
+    level[3], level[8] = 0.048 * 1e6, 0.052 * 1e6
+    found = bar(level)
+    assert found is not None
+    assert sorted(set(range(ROWS)) - set(found.lines.astype(int).tolist())) == [3]
