@@ -13,7 +13,13 @@ from estimator.camera.pose import Pose
 from estimator.camera.projection import project
 from estimator.io.device import DeviceFrame
 from estimator.pixels.led_model import IMAGE_PARAMETERS, PROFILE_PARAMETERS, ImageState
-from estimator.pixels.led_pixels import MAX_IMAGE_SIGMA_PX, LedPixels, gather_led_pixels, leds_in_view
+from estimator.pixels.led_pixels import (
+    MAX_IMAGE_SIGMA_PX,
+    LedPixels,
+    ReadingGains,
+    gather_led_pixels,
+    leds_in_view,
+)
 from estimator.pixels.likelihood import (
     BACKGROUND_SIGMAS,
     COEFFICIENTS,
@@ -210,3 +216,20 @@ def test_saturated_leds_are_left_out_beside_others(bright: int) -> None:
     frame = replace(frame, sensor=frame.sensor.model_copy(update={"full_well_e": full_well_e}))
     pixels = gathered(frame, true_pose(frame))
     assert [pixels.leds[k].id for k in pixels.led] == ([12, 13, 14, 15] if bright == 2 else [10, 11, 12, 13, 14, 15])
+
+
+def test_a_phase_that_the_light_does_not_tell_is_that_of_the_prior() -> None:
+    """The prior of a wave's phase is about the decoded one, 0, whatever the fit before said: light that does not change
+    with the phase leaves it there, after steps of half a line at most.
+    """
+    frame = drawn(4000.0, 1)
+    pixels, before = explained(frame)
+    groups = len(pixels.led)
+    waves = ReadingGains((lambda lines: np.ones(len(lines)),) * groups, np.zeros(len(pixels.electrons)), pixels.starts)
+    pixels = replace(pixels, gains=waves)
+    used = np.ones(len(pixels.leds), dtype=bool)
+    for start, expected in ((0.4, 0.0), (-0.4, 0.0), (0.7, 0.2)):
+        begun = replace(before, phase=np.full(groups, start))
+        found = fit_photometry(pixels, pixels.rendered, used, Noise.of(frame), begun)
+        # The amplitudes of the two fits, whose ratio is a factor of the step, agree to far better than that.
+        np.testing.assert_allclose(found.phase, expected, atol=1e-6)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from estimator.spots.line_edges import MIN_EDGE_SNR, LineEdges, edges_of
+from estimator.spots.line_edges import LineEdges, edges_of
 from estimator.spots.striped_blobs import BlobLight, StripedBlob
 
 Array = NDArray[np.float64]
@@ -34,7 +34,7 @@ def test_a_line_has_edges_where_its_half_level_is_four_sigma(share: float, seen:
     of three a third of that: p / 2 = 4 sqrt((p / 2 + B) / 3) where B = 3 (p / 8)^2 - p / 2.
     """
     level = 100.0
-    limit_e2 = 3 * (level / (2 * MIN_EDGE_SNR)) ** 2 - level / 2
+    limit_e2 = 3 * (level / 8) ** 2 - level / 2
     found = bar(np.full(ROWS, level), share * limit_e2)
     assert (found is not None) == seen
     if found is not None:
@@ -50,8 +50,8 @@ def test_an_image_that_fills_its_box_has_the_noise_of_its_light_alone() -> None:
 
 
 def test_lines_below_a_twentieth_of_the_bright_ones_are_background() -> None:
-    """Dark lines of an LED hold the blur and the glare of the lit ones beside them, whose edges are not the LED's. Their
-    share is at most HALO_SHARE, a twentieth, as the likelihood of pixels assumes of halos.
+    """Dark lines hold the blur and the glare of the lit ones beside them, whose edges are not the LED's: up to a
+    twentieth of its light, which is the share that `estimator.pixels.likelihood` allows a halo (HALO_SHARE).
     """
     level = np.full(ROWS, 1e6)
     level[3], level[8] = 0.048 * 1e6, 0.052 * 1e6

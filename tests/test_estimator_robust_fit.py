@@ -15,6 +15,7 @@ from estimator.methods.gravity_fit import agreement, ambiguous
 from estimator.solvers.observations import Observations, observe
 from estimator.solvers.reprojection import Fit
 from estimator.solvers.robust_fit import Consensus, consensus, minima
+from estimator.solvers.robust_fit import _plausible as plausible
 from estimator.solvers.robust_fit import _snooped as data_snooping
 
 LEDS = grid(3, 3, 0.3, (3, 2, 3.0))
@@ -133,6 +134,14 @@ def test_data_snooping_leaves_out_the_spot_that_is_off() -> None:
     found = data_snooping(observed(offsets, np.full(9, 0.2)), TRUTH, np.ones(9, dtype=bool), adapted=False)
     assert found is not None
     assert np.flatnonzero(~found[2]).tolist() == [4]
+
+
+@pytest.mark.parametrize(("share", "expected"), [(0.99, True), (1.01, False)])
+def test_a_reading_of_gravity_is_plausible_up_to_one_in_a_million(share: float, expected: bool) -> None:
+    """Two tilts: chi-square of two degrees of freedom, however many the spots have."""
+    best = fitted(share * LIMIT, np.zeros(9), share * LIMIT)
+    found = Consensus(best, (), np.ones(9, dtype=bool), gravity=True)
+    assert plausible(found, observed(np.zeros((9, 2)), np.ones(9))) == expected
 
 
 def sure_of(found: Consensus) -> float:

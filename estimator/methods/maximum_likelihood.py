@@ -210,25 +210,11 @@ def _revealed(frame: DeviceFrame, gravity: Gravity, priors: Priors, found: Maxim
     radius_px = pixels.radius_px[result.used]
 
     def reveals(columns: list[int], tolerance: Floats, more: float = 0.0, freedom: int = 0) -> bool:
-        """Whether the LEDs' parameters of these columns differ from 0 by more than the noise and a tolerance (n,)."""
-        D, g = information[:, columns][:, :, columns], gradient[:, columns]
-        spread = (
-            D
-            + D @ D * tolerance[:, None, None] ** 2
-            + 1e-12 * np.trace(D, axis1=1, axis2=2)[:, None, None] * np.eye(len(columns))
-        )
-        total = np.einsum("ni,ni->", g, np.linalg.solve(spread, g[:, :, None])[:, :, 0]) + more
-        return bool(total > chi2.isf(REVEALED_PROBABILITY, g.size + freedom))
+        return _differ(information[:, columns][:, :, columns], gradient[:, columns], tolerance, more, freedom)
 
     of_profile = [IMAGE_PARAMETERS + k for k in range(PROFILE_PARAMETERS)]
-    z = result.nuisances.standardized(had.added(priors).only(pixels.index))
-    of_priors = gravity.deviance(result.pose.rig_angles(frame.camera)) + float(
-        (z.camera**2).sum()
-        + (z.datum**2).sum()
-        + (z.luminaires**2).sum()
-        + (z.leds[result.used, :3] ** 2).sum()
-        + (z.motion**2).sum()
-    )
+    placed = result.nuisances.standardized(had.added(priors).only(pixels.index))
+    of_priors = gravity.deviance(result.pose.rig_angles(frame.camera)) + _of_places(placed, result.used)
     ones = np.ones(len(radius_px))
     new = {}
     if had.place_m == 0 and reveals(shift, SHIFT_TOLERANCE_PX * ones, of_priors, 2):
@@ -238,6 +224,26 @@ def _revealed(frame: DeviceFrame, gravity: Gravity, priors: Priors, found: Maxim
     if had.profile == 0 and reveals(of_profile, PROFILE_TOLERANCE * ones):
         new["profile"] = START_COMPONENTS.profile
     return replace(had, **new)
+
+
+def _differ(information: Floats, gradient: Floats, tolerance: Floats, more: float, freedom: int) -> bool:
+    """Whether k parameters of n LEDs differ from 0 by more than their noise and a tolerance (n,).
+
+    By their information (n, k, k) and gradient (n, k), and a chi-square `more` of `freedom` degrees of freedom.
+    """
+    spread = (
+        information
+        + information @ information * tolerance[:, None, None] ** 2
+        + 1e-12 * np.trace(information, axis1=1, axis2=2)[:, None, None] * np.eye(information.shape[1])
+    )
+    total = np.einsum("ni,ni->", gradient, np.linalg.solve(spread, gradient[:, :, None])[:, :, 0]) + more
+    return bool(total > chi2.isf(REVEALED_PROBABILITY, gradient.size + freedom))
+
+
+def _of_places(z: Nuisances, used: Mask) -> float:
+    """Sum of squares of what moves images: standardized nuisances of camera, motion, map, and of the LEDs used (n,)."""
+    moving = z.camera, z.datum, z.luminaires, z.leds[used, :3], z.motion
+    return float(sum((one**2).sum() for one in moving))
 
 
 def maximize(frame: DeviceFrame, gravity: Gravity, priors: Priors, start: Start) -> Maximum:

@@ -155,7 +155,7 @@ class Search:
             priors = components.added(stated)
             of_priors = self._gravity.deviance(angles) + nuisances.deviance(priors)
             min_deviance = candidate.deviance + of_priors / len(pixels.electrons)
-            factor = 1.0 if before is None else self._damping(step, before, factor)
+            factor = 1.0 if before is None else step_factor(step, before, factor)
             moved_px = self._movement_px(accepted, step, factor, priors)
             factor *= min(1.0, pixels.max_move_px / max(moved_px, 1e-12))
             short = moved_px < pixels.max_move_px
@@ -187,12 +187,6 @@ class Search:
         return ScoringResult(
             pose, nuisances, converged, step, components, photometry, used, faint, excess, moved, damping
         )
-
-    def _damping(self, step: Solution, before: Solution, factor: float) -> float:
-        """Factor of a step: a half where it takes back much of the one before."""
-        inner = step.view_step @ step.information @ before.view_step * factor
-        length2 = before.view_step @ step.information @ before.view_step * factor**2
-        return 0.5 if inner < -MAX_RETURN * length2 else 1.0
 
     def _with_edge_errors(self, photometry: PhotometricFit) -> Priors:
         """The priors, with the errors of the sizes that an imperfect background causes."""
@@ -228,6 +222,13 @@ class Search:
         centres_m = self._centres_m + state.shifts_m
         points_m = centres_m[:, None] + state.rims_m(self._rims_m)
         return state.project(points_m.reshape(-1, 3)).pixels.reshape(-1, RIM_POINTS, 2)
+
+
+def step_factor(step: Solution, before: Solution, factor: float) -> float:
+    """Factor of a step: a half where it takes back much of the one before, which had a `factor`."""
+    inner = step.view_step @ step.information @ before.view_step * factor
+    length2 = before.view_step @ step.information @ before.view_step * factor**2
+    return 0.5 if inner < -MAX_RETURN * length2 else 1.0
 
 
 def unexplained(result: ScoringResult) -> Mask:

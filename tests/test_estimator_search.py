@@ -1,0 +1,70 @@
+"""Search of the most likely pose: the length of its steps, and LEDs that it leaves out."""
+
+import numpy as np
+import pytest
+from estimator_synthetic import Array
+
+from estimator.pixels.nuisances import Nuisances, Solution
+from estimator.pixels.search import ScoringResult, step_factor, unexplained
+
+
+def step_of(length: float) -> Solution:
+    """A step of the first parameter of the view, in standard deviations."""
+    step, none = np.zeros(6), np.zeros(0)
+    step[0] = length
+    zero = Nuisances(none, none, none, none)
+    return Solution(step, zero, np.eye(6), np.zeros((0, 9)), length**2, np.eye(6))
+
+
+@pytest.mark.parametrize("curvature", [0.8, 1.0, 1.4, 2.2, 3.0, 3.8])
+def test_steps_end_where_the_likelihood_is_curved_up_to_four_times_as_the_information_says(curvature: float) -> None:
+    """From x a step is -c x. Full steps leave (1 - c) x: they take back the share c - 1 of the one before, and from
+    c = 2 on they grow. Half steps leave (1 - c / 2) x, which is less up to c = 4.
+    """
+    x, factor, before = 1.0, 1.0, None
+    for _ in range(200):
+        step = step_of(-curvature * x)
+        factor = 1.0 if before is None else step_factor(step, before, factor)
+        x, before = x + factor * step.view_step[0], step
+    assert abs(x) < 1e-3
+
+
+def test_a_step_that_takes_back_less_than_half_is_a_full_one() -> None:
+    """Halved, a search with a curvature of less than 1.5 would leave more than with full steps."""
+    assert step_factor(step_of(-0.49), step_of(1.0), 1.0) == 1.0
+    assert step_factor(step_of(-0.51), step_of(1.0), 1.0) == 0.5
+    assert step_factor(step_of(-0.24), step_of(1.0), 0.5) == 1.0  # of half a step before
+    assert step_factor(step_of(-0.26), step_of(1.0), 0.5) == 0.5
+
+
+def result_of(excess: Array, used: Array, faint: Array) -> ScoringResult:
+    """What `unexplained` needs of a search's result."""
+    made = object.__new__(ScoringResult)
+    for name, value in {"excess": excess, "used": used, "faint": faint}.items():
+        object.__setattr__(made, name, value)
+    return made
+
+
+def test_of_unexplained_leds_those_with_a_quarter_of_the_largest_excess_are_left_out() -> None:
+    """Three like LEDs fix a common shift of their images. One that is d off moves the pose by d / 3, stays 2 d / 3 off
+    itself, and the true ones are d / 3 off: a quarter of its square, and less among more LEDs. One with more is wrong
+    itself.
+    """
+    none = np.zeros(4, dtype=bool)
+    excess = np.array([100.0, 26.0, 24.0, -5.0])
+    assert unexplained(result_of(excess, ~none, none)).tolist() == [True, True, False, False]
+    # an LED that is left out already does not count, nor do those that are explained
+    assert unexplained(result_of(excess, np.array([False, True, True, True]), none)).tolist() == [
+        False,
+        True,
+        True,
+        False,
+    ]
+    assert not unexplained(result_of(-excess[:3], ~none[:3], none[:3])).any()
+
+
+def test_faint_leds_are_left_out_before_others() -> None:
+    faint = np.array([False, False, True])
+    assert (
+        unexplained(result_of(np.array([100.0, 0.0, -1.0]), np.ones(3, dtype=bool), faint)).tolist() == faint.tolist()
+    )
