@@ -447,6 +447,28 @@ def test_a_led_raised_into_its_panel_is_not_hidden_by_it() -> None:
     assert seen > 10
 
 
+def test_a_stated_factor_leaves_the_true_sigmas() -> None:
+    """Each table has its own factor, or the common one: what a device is told changes by it, the truth does not.
+
+    Powers of 2 are exact.
+    """
+    recipe = plan(*CALIBRATED).recipe
+    alone = Belief.preset("calibrated")
+    leds = alone.leds.model_copy(update={"stated_factor": 0.5})
+    belief = alone.model_copy(update={"stated_factor": 4.0, "leds": leds})
+    true = belief.true_sigmas(recipe.cameras, recipe.accelerometer)
+    stated = belief.stated_sigmas(recipe.cameras, recipe.accelerometer)
+    expected = alone.true_sigmas(recipe.cameras, recipe.accelerometer)
+    for name in ("luminaire_m", "luminaire_rotation_deg", "accelerometer_device_deg", "accelerometer_shot_deg"):
+        np.testing.assert_array_equal(getattr(true, name), getattr(expected, name))
+        np.testing.assert_array_equal(getattr(stated, name), 4.0 * np.asarray(getattr(true, name)))
+    for name in ("led_m", "led_size", "led_gradient"):
+        np.testing.assert_array_equal(getattr(true, name), getattr(expected, name))
+        np.testing.assert_array_equal(getattr(stated, name), 0.5 * np.asarray(getattr(true, name)))
+    np.testing.assert_array_equal(true.cameras["main"].device, expected.cameras["main"].device)
+    np.testing.assert_array_equal(stated.cameras["main"].device, 4.0 * true.cameras["main"].device)
+
+
 def test_a_stated_factor_changes_what_is_stated_and_nothing_else(made: Path, tmp_path: Path) -> None:
     directory = tmp_path / "factor"
     factors = ("belief.stated_factor=3", "belief.leds.stated_factor=0.5")

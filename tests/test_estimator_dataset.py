@@ -282,7 +282,7 @@ def test_all_wrong_types_everywhere_in_the_json_are_input_errors(folder: Path) -
 WRONG_ROWS: list[tuple[str, Callable[[Rows], object]]] = [
     ("row 1", lambda rows: rows[1].update(frame=2)),
     ("3 rows", lambda rows: rows.append({**rows[0], "frame": 3})),
-    ("shot 2", lambda rows: rows[1].update(shot=2)),
+    ("shot 2; shots have to be 0, 1, 2", lambda rows: rows[1].update(shot=2)),
     ("camera 'other'", lambda rows: rows[0].update(camera="other")),
     ("2.sha256", lambda rows: rows[2].update(sha256="0123")),
     ("0.exposure_s", lambda rows: rows[0].update(exposure_s=0.0)),

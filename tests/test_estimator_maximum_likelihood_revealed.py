@@ -48,9 +48,9 @@ def test_what_moves_images_counts_by_its_square_and_unused_leds_and_shapes_do_no
 
 @pytest.mark.parametrize("axis", [0, 1])
 def test_images_off_along_one_axis_reveal_a_wrong_map(axis: int) -> None:
-    """A camera that looks straight up, and LEDs that are 80 um off, 0.04 px, in turns to both sides: along v as along u.
-    That is less than what an LED may be off and still be explained. An image of 10 px in diameter and 4000 e a pixel has
-    some 16 px of edge across either axis with a noise of 63 / 4000 px each, 0.004 px together: ten sigma, of six LEDs.
+    """A camera that looks straight up, and LEDs that are 80 um off, 0.04 px, in turns to both sides, along u or v:
+    less than an LED may be off and still be explained. An image of 10 px in diameter and 4000 e a pixel has some 16 px
+    of edge across either axis with a noise of 63 / 4000 px each, 0.004 px together: ten sigma, of six LEDs.
     """
     view = view_of(TARGET, 3.0)
     frame = nearly_exact(view, SIX)

@@ -3,6 +3,7 @@
 import signal
 import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from pathlib import Path
 
@@ -12,9 +13,9 @@ from conftest import copy_of
 
 from estimator.errors import InputError
 from estimator.evaluate import workers
-from estimator.evaluate.batch import estimate_dataset
+from estimator.evaluate.batch import Observed, Rows, ShotResult, estimate_dataset
 from estimator.evaluate.workers import _interrupts_deferred, estimate_with_workers
-from estimator.io.dataset import read_dataset
+from estimator.io.dataset import FrameRecord, read_dataset
 from estimator.io.estimates import EstimateRow
 from estimator.methods.catalogue import VARIANTS
 from vlcrender.dataset.generate import _interrupts_deferred as _interrupts_of_generate_deferred
@@ -41,6 +42,26 @@ def test_any_number_of_workers_gives_the_same_answers_in_order(folder: Path, wor
     assert without_times(shared) == without_times(alone)
     assert [row.frame for row in shared["pnp"]] == [0, 1, 2]
     assert len(done) == 2 * 3  # a variant of all frames of a device is among them
+
+
+def test_frames_of_a_device_are_solved_in_order_and_counted(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Workers are threads here, and their work is to hand over numbers: what is held is how results are collected."""
+    solved: list[list[int]] = []
+
+    def work(records: tuple[FrameRecord, ...]) -> ShotResult:
+        return ShotResult({}, {"all": [Observed(one.frame, one.device, None, 0.0) for one in records]})
+
+    def solve(observed: dict[str, list[Observed]]) -> Rows:
+        solved.append([one.frame for one in observed["all"]])
+        return {}
+
+    monkeypatch.setattr(workers, "ProcessPoolExecutor", lambda count, *_: ThreadPoolExecutor(count))
+    monkeypatch.setattr(workers, "_work", work)
+    monkeypatch.setattr(workers, "_solve", solve)
+    done: list[None] = []
+    assert estimate_with_workers(read_dataset(folder), [], 2, on_frame=lambda: done.append(None)) == {}
+    assert solved == [[0, 1, 2]]
+    assert len(done) == 2 * 3
 
 
 def test_an_unknown_name_is_refused_before_a_process_starts(folder: Path) -> None:

@@ -80,18 +80,3 @@ def test_a_disc_with_other_keys_than_its_own_is_refused(made: Path, tmp_path: Pa
     path.write_text(json.dumps(tree))
     with pytest.raises(InputError, match=r"led_map\[0\]"):
         read_dataset_file(tmp_path / "set")
-
-
-def test_an_unfinished_set_of_other_bits_is_refused(made: Path, tmp_path: Path) -> None:
-    """A plan of the former data version: frames of two kinds must not meet in one set."""
-    provenance = json.loads((made / "dataset.json").read_text())["provenance"]
-    for former in (DATA_VERSION - 1, None):
-        directory = tmp_path / f"{former}"
-        directory.mkdir()
-        (directory / "plan.json").write_text(json.dumps({"provenance": {**provenance, "data_version": former}}))
-        with pytest.raises(InputError, match="an unfinished dataset of another recipe, scene or version"):
-            generate(plan(), directory)
-    resumable = tmp_path / "same"
-    resumable.mkdir()
-    (resumable / "plan.json").write_text(json.dumps({"provenance": provenance}))
-    assert generate(plan(), resumable)

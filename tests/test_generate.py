@@ -21,6 +21,7 @@ from conftest import HANG_S, ROOT, SMALL, small_plan, started, wait_until
 from vlcrender.dataset.generate import generate
 from vlcrender.dataset.progress import Progress, ProgressCallback
 from vlcrender.dataset.recipe import load_plan
+from vlcrender.dataset.schema import DATA_VERSION, FrameRecord
 from vlcrender.dataset.verify import verify
 from vlcrender.errors import InputError
 
@@ -157,6 +158,41 @@ def test_foreign_files_are_never_overwritten(made: Path, tmp_path: Path, state: 
         generate(plan, directory)
     assert "\n" not in str(refusal.value)
     assert {p: p.read_bytes() for p in [directory, *directory.rglob("*")] if p.is_file()} == before
+
+
+@pytest.mark.parametrize("file", ["dataset.json", "plan.json"])
+def test_a_set_of_another_version_is_left_alone(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, file: str
+) -> None:
+    """The same recipe gives other bits since: a finished set does not count as made, an unfinished one is not resumed."""
+    provenance = json.loads((made / "dataset.json").read_text())["provenance"]
+    (tmp_path / file).write_text(json.dumps({"provenance": provenance}))
+    monkeypatch.setattr("vlcrender.dataset.generate.DATA_VERSION", DATA_VERSION + 1)
+    with pytest.raises(InputError, match="another recipe, scene or version; nothing was changed"):
+        generate(small_plan("expected=true"), tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == [file]
+
+
+def records_of(directory: Path) -> list[FrameRecord]:
+    """The frames of a finished set as its journal had them."""
+    tables = [pq.read_table(directory / name).to_pylist() for name in ("frames.parquet", "truth.parquet")]
+    rows = [{"device": device, "truth": truth} for device, truth in zip(*tables, strict=True)]
+    return [FrameRecord.model_validate_json(json.dumps(row)) for row in rows]
+
+
+def test_a_frame_is_in_the_journal_before_it_is_reported(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A run that is killed then loses no frame that it reported. The frames here are those of another set."""
+    monkeypatch.setattr("vlcrender.dataset.generate._records", lambda *_: iter(records_of(made)))
+    lines: list[int] = []
+
+    def count(report: Progress) -> None:
+        if report.stage == "frames":
+            lines.append((tmp_path / "set/journal.jsonl").read_bytes().count(b"\n"))
+
+    generate(small_plan("expected=true"), tmp_path / "set", progress=count)
+    assert lines == [1, 2, 3]
 
 
 def test_impossible_poses_are_refused_before_the_first_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -382,12 +418,11 @@ def test_a_lost_preview_or_expected_image_is_found(made: Path, tmp_path: Path) -
 def test_a_frame_whose_preview_was_lost_is_made_again(made: Path, tmp_path: Path) -> None:
     """An unfinished run goes on: a journal of all three frames, and one preview gone."""
     generate(small_plan("expected=true"), tmp_path / "set")
-    tables = [pq.read_table(tmp_path / "set" / name).to_pylist() for name in ("frames.parquet", "truth.parquet")]
-    rows = [{"device": device, "truth": truth} for device, truth in zip(*tables, strict=True)]
+    lines = [record.model_dump_json() + "\n" for record in records_of(tmp_path / "set")]
     provenance = json.loads((tmp_path / "set/dataset.json").read_text())["provenance"]
     (tmp_path / "set/dataset.json").unlink()
     (tmp_path / "set/plan.json").write_text(json.dumps({"provenance": provenance}))
-    (tmp_path / "set/journal.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    (tmp_path / "set/journal.jsonl").write_text("".join(lines))
     (tmp_path / "set/previews/000001.png").unlink()
     done: list[float] = []
     generate(small_plan("expected=true"), tmp_path / "set", progress=frame_counts(done))
