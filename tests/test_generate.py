@@ -164,7 +164,7 @@ def test_foreign_files_are_never_overwritten(made: Path, tmp_path: Path, state: 
 def test_a_set_of_another_version_is_left_alone(
     made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, file: str
 ) -> None:
-    """The same recipe gives other bits since: a finished set does not count as made, an unfinished one is not resumed."""
+    """The recipe gives other bits since: a finished set does not count as made, an unfinished one is not resumed."""
     provenance = json.loads((made / "dataset.json").read_text())["provenance"]
     (tmp_path / file).write_text(json.dumps({"provenance": provenance}))
     monkeypatch.setattr("vlcrender.dataset.generate.DATA_VERSION", DATA_VERSION + 1)
