@@ -2,7 +2,6 @@
 
 import contextlib
 import copy
-import hashlib
 import json
 import re
 import shutil
@@ -15,14 +14,12 @@ import OpenEXR
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from estimator_synthetic import FRAMES_SCHEMA, write_exr
+from estimator_synthetic import FRAMES_SCHEMA
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from estimator.errors import InputError
 from estimator.io.dataset import FrameRecord, read_dataset, read_frame
-from estimator.io.device import Identity
-from estimator.io.estimates import EstimateRow, LedRange, estimates_path, read_estimates, write_estimates
 
 Rows = list[dict[str, Any]]
 
@@ -396,144 +393,10 @@ def test_damaged_bytes_are_read_or_refused(good: Path, tmp_path: Path, file: str
         read_or_refuse(folder)
 
 
-def refused_frame(folder: Path, **changes: Any) -> str:
-    dataset = read_dataset(folder)
-    record = dataset.frames[0].model_copy(update=changes)
-    with pytest.raises(InputError) as caught:
-        read_frame(dataset, record)
-    assert "frames/000000.exr" in str(caught.value)
-    return str(caught.value)
-
-
-def rehash(folder: Path) -> dict[str, str]:
-    return {"sha256": hashlib.sha256((folder / "frames/000000.exr").read_bytes()).hexdigest()}
-
-
-def test_a_missing_truncated_or_changed_image_is_refused(folder: Path) -> None:
-    path = folder / "frames/000000.exr"
-    content = path.read_bytes()
-    path.write_bytes(content[: len(content) // 2])
-    assert "damaged" in refused_frame(folder)
-    refused_frame(folder, **rehash(folder))
-    flipped = bytearray(content)
-    flipped[-100] ^= 1
-    path.write_bytes(flipped)
-    assert "damaged" in refused_frame(folder)
-    path.write_bytes(b"no image")
-    assert "not a readable EXR" in refused_frame(folder, **rehash(folder))
-    path.unlink()
-    assert "No such file" in refused_frame(folder)
-
-
-def test_an_image_of_another_size_kind_or_range_is_refused(folder: Path) -> None:
-    path = folder / "frames/000000.exr"
-    write_exr(path, np.zeros((300, 399), np.uint32))
-    assert "399 x 300 pixels, but the camera has 400 x 300" in refused_frame(folder, **rehash(folder))
-    write_exr(path, np.zeros((300, 400), np.float32))  # type: ignore[arg-type]
-    assert "unsigned integers" in refused_frame(folder, **rehash(folder))
-    write_exr(path, np.full((300, 400), 65536, np.uint32))
-    assert "16 bits end at 65535" in refused_frame(folder, **rehash(folder))
-    header = {"type": OpenEXR.scanlineimage}
-    with OpenEXR.File(header, {"Z": np.zeros((300, 400), np.uint32)}) as file:
-        file.write(str(path))
-    assert "needed Y alone" in refused_frame(folder, **rehash(folder))
-    roi = (np.array([0, 0], np.int32), np.array([499, 299], np.int32))
-    with OpenEXR.File({**header, "displayWindow": roi}, {"Y": np.zeros((300, 400), np.uint32)}) as file:
-        file.write(str(path))
-    assert "displayWindow" in refused_frame(folder, **rehash(folder))
-
-
-def write_parts(path: Path, boxes: list[tuple[int, int, int, int]]) -> None:
-    """Parts of (row, column, rows, columns) on a display of 400 x 300."""
-    display = (np.array([0, 0], np.int32), np.array([399, 299], np.int32))
-    parts = []
-    for number, (row, column, rows, columns) in enumerate(boxes):
-        data = (np.array([column, row], np.int32), np.array([column + columns - 1, row + rows - 1], np.int32))
-        header = {"type": OpenEXR.scanlineimage, "displayWindow": display, "dataWindow": data}
-        image = np.full((rows, columns), number + 1, np.uint32)
-        parts.append(OpenEXR.Part(header, {"Y": image}, name=f"region {number}"))
-    OpenEXR.File(parts).write(str(path))
-
-
-def test_regions_are_read_with_their_positions(folder: Path) -> None:
-    write_parts(folder / "frames/000000.exr", [(10, 20, 30, 40), (100, 0, 5, 6), (200, 380, 100, 20)])
-    dataset = read_dataset(folder)
-    frame = read_frame(dataset, dataset.frames[0].model_copy(update=rehash(folder)))
-    assert [(part.row, part.column, *part.image_dn.shape) for part in frame.parts] == [
-        (10, 20, 30, 40),
-        (100, 0, 5, 6),
-        (200, 380, 100, 20),
-    ]
-    assert [part.image_dn.max() for part in frame.parts] == [1, 2, 3]
-
-
-def test_regions_that_overlap_or_lie_beyond_the_sensor_are_refused(folder: Path) -> None:
-    path = folder / "frames/000000.exr"
-    write_parts(path, [(10, 20, 30, 40), (39, 59, 5, 5)])
-    assert "overlaps another" in refused_frame(folder, **rehash(folder))
-    write_parts(path, [(-1, 20, 30, 40)])
-    assert "beyond the sensor" in refused_frame(folder, **rehash(folder))
-    dataset = read_dataset(folder)
-    beyond = dataset.frames[0].model_copy(update={**rehash(folder), "capturable": False})
-    assert read_frame(dataset, beyond).parts[0].row == -1
-    write_parts(path, [(0, -1000, 1, 17), (5, 0, 1400, 1400)])
-    assert "16 times the sensor" in refused_frame(folder, **rehash(folder), capturable=False)
-
-
 def test_records_are_unchangeable(good: Path) -> None:
     record: FrameRecord = read_dataset(good).frames[0]
     with pytest.raises(ValueError, match="frozen"):
         record.frame = 7  # type: ignore[misc]
-
-
-ROWS = (
-    EstimateRow(frame=0, status="ok", reason="", position_m=(1.0, 2.0, 0.5), ranges=(), time_s=0.1),
-    EstimateRow(
-        frame=1,
-        status="failed",
-        reason="position: why",
-        position_m=None,
-        ranges=(LedRange(led=10, range_m=3.5),),
-        time_s=0.2,
-        identities=(
-            Identity(led=10, u_px=1.5, v_px=2.5, correlation=0.99, bits="01-1", position_m=(1.0, 2.0, 3.5)),
-            Identity(led=None, u_px=7.0, v_px=8.0, correlation=0.5),
-        ),
-    ),
-)
-
-
-def test_estimates_come_back_as_written_in_the_formats_types(folder: Path) -> None:
-    path = write_estimates(folder, "some", ROWS)
-    assert path == estimates_path(folder, "some") == folder / "estimates/some.parquet"
-    assert read_estimates(path, 2) == ROWS
-    types = {field.name: str(field.type) for field in pq.read_schema(path)}
-    assert types == {
-        "frame": "int64",
-        "status": "string",
-        "reason": "string",
-        "position_m": "list<element: double>",
-        "covariance_m2": "list<element: double>",
-        "ambiguous": "bool",
-        "ranges": "list<element: struct<led: int64, range_m: double>>",
-        "time_s": "double",
-        "identities": "list<element: struct<led: int64, u_px: double, v_px: double, correlation: double, "
-        "bits: string, position_m: list<element: double>>>",
-    }
-    assert [entry.name for entry in path.parent.iterdir()] == ["some.parquet"]
-
-
-def test_estimates_for_other_frames_are_refused(folder: Path) -> None:
-    path = write_estimates(folder, "some", ROWS)
-    with pytest.raises(InputError, match="2 rows, needed one for each of the 3 frames"):
-        read_estimates(path, 3)
-
-
-def test_a_failed_row_has_a_reason_and_no_position() -> None:
-    good = ROWS[0].model_dump()
-    for change in ({"status": "failed"}, {"reason": "x: y"}, {"position_m": None}, {"status": "unsure"}):
-        with pytest.raises(ValueError, match="1 validation error"):
-            EstimateRow(**{**good, **change})
 
 
 def test_another_version_is_refused_in_one_line_that_names_4(folder: Path) -> None:
@@ -541,57 +404,6 @@ def test_another_version_is_refused_in_one_line_that_names_4(folder: Path) -> No
         change_json(folder, lambda c, version=version: c.update(version=version, led_map=None))
         with pytest.raises(InputError, match=f"version {version} of the format, needed 4$"):
             read_dataset(folder)
-
-
-def test_a_frame_is_read_with_those_of_the_rig_s_other_cameras(folder: Path) -> None:
-    change_json(folder, lambda c: c["cameras"].update(right=c["cameras"]["main"]))
-    records = pq.read_table(folder / "frames.parquet")
-    rows = records.to_pylist()
-    rows[1].update(shot=0, burst=0, camera="right")
-    rows[2].update(shot=1, burst=1)
-    pq.write_table(pa.Table.from_pylist(rows, records.schema), folder / "frames.parquet")
-    dataset = read_dataset(folder)
-    first, second = (read_frame(dataset, number) for number in (0, 1))
-    (other,) = first.other_cameras
-    assert np.array_equal(other.parts[0].image_dn, second.parts[0].image_dn)
-    assert other.other_cameras == ()
-    assert read_frame(dataset, 2).other_cameras == ()
-    assert read_frame(dataset, 0, with_other_cameras=False).other_cameras == ()
-
-
-def test_each_frame_of_a_shot_has_all_the_others_and_itself_not(folder: Path) -> None:
-    """Three cameras of a rig, with focal lengths that tell them apart, in the first and only shot."""
-    focal_px = {"main": 1500.0, "left": 1501.0, "right": 1502.0}
-
-    def mounted(content: dict[str, Any]) -> None:
-        main = content["cameras"]["main"]
-        content["cameras"] = {
-            name: {**main, "K": [[f, 0.0, 200.0], [0.0, f, 150.0], [0.0, 0.0, 1.0]]} for name, f in focal_px.items()
-        }
-
-    change_json(folder, mounted)
-    change_rows(
-        folder, lambda rows: [row.update(shot=0, burst=0, camera=n) for row, n in zip(rows, focal_px, strict=True)]
-    )
-    dataset = read_dataset(folder)
-    for number, own in enumerate(focal_px.values()):
-        frame = read_frame(dataset, number)
-        assert frame.camera.K[0][0] == own
-        assert [other.camera.K[0][0] for other in frame.other_cameras] == [f for f in focal_px.values() if f != own]
-
-
-def test_a_digest_in_capital_letters_is_the_same_digest(folder: Path) -> None:
-    before = read_frame(read_dataset(folder), 0).parts[0].image_dn
-    change_rows(folder, lambda rows: [row.update(sha256=row["sha256"].upper()) for row in rows])
-    assert np.array_equal(read_frame(read_dataset(folder), 0).parts[0].image_dn, before)
-
-
-def test_estimates_in_another_order_are_refused(folder: Path) -> None:
-    """As many rows as frames: a row counts for the frame that it names, not for its place."""
-    rows = [ROWS[0].model_copy(update={"frame": frame}) for frame in (0, 2, 1)]
-    path = write_estimates(folder, "shuffled", rows)
-    with pytest.raises(InputError, match=r"shuffled\.parquet: 3 rows, needed one for each of the 3 frames, in order"):
-        read_estimates(path, 3)
 
 
 def test_a_dataset_may_be_empty(folder: Path) -> None:
@@ -616,99 +428,3 @@ def test_a_message_quotes_at_most_60_characters_of_a_value(folder: Path, length:
     """58 characters and two quotation marks are 60: shown whole. Of longer ones, 57 characters and three dots."""
     change_json(folder, lambda c: c.update(frame_count="x" * length))
     assert refused(folder).endswith(f"(got '{shown})")
-
-
-STATED_CAMERA = {
-    "parameters": ["cx_px", "cy_px", "focal", "aspect", "k1", "p1", "p2"],
-    "device_sigma": [5.0, 6.0, 1e-3, 1e-4, 0.01, 2e-4, 3e-4],
-    "shot_sigma": [3.0, 3.5, 3e-4, 0.0, 0.0, 0.0, 0.0],
-    "offset_sigma_m": 2e-4,
-    "rotation_sigma_deg": 0.05,
-}
-STATED_LUMINAIRE = {
-    **{"id": 3, "position_m": [1.0, 2.0, 3.5]},
-    **{"sigma_m": [0.003, 0.004, 0.005], "sigma_rotation_deg": [0.2, 0.3, 0.4]},
-}
-STATED_LED = {"luminaire": 3, "sigma_m": [3e-4, 4e-4, 5e-4], "radius_sigma_m": 2e-4, "gradient_sigma": 0.05}
-
-
-def state_all(content: dict[str, Any]) -> None:
-    """State how well everything is known."""
-    content["cameras"]["main"]["uncertainty"] = copy.deepcopy(STATED_CAMERA)
-    content["luminaires"] = [copy.deepcopy(STATED_LUMINAIRE)]
-    content["led_map"][0].update(copy.deepcopy(STATED_LED))
-    content["map_datum"] = {"sigma_m": [0.001, 0.002, 0.003], "scale_sigma_ppm": 20.0}
-    content["accelerometer"].update({"error_deg": 0.5, "device_error_deg": 0.3, "shot_error_deg": 0.4})
-
-
-def test_stated_uncertainties_are_read(folder: Path) -> None:
-    """Each value by itself, none equal to another; parameters of the camera in an order of their own."""
-    change_json(folder, state_all)
-    change_rows(folder, lambda rows: [row.update(device=7 + row["frame"]) for row in rows])
-    dataset = read_dataset(folder)
-    frame = read_frame(dataset, 1)
-    assert frame.device == 8
-    stated = frame.camera.uncertainty
-    assert stated is not None
-    np.testing.assert_array_equal(stated.device_sigmas(), [1e-3, 1e-4, 5.0, 6.0, 0.01, 2e-4, 3e-4])
-    np.testing.assert_array_equal(stated.shot_sigmas(), [3e-4, 0.0, 3.0, 3.5, 0.0, 0.0, 0.0])
-    assert (stated.offset_sigma_m, stated.rotation_sigma_deg) == (2e-4, 0.05)
-    assert frame.luminaires[3].sigma_m == (0.003, 0.004, 0.005)
-    assert frame.luminaires[3].sigma_rotation_deg == (0.2, 0.3, 0.4)
-    led, other = frame.leds[10], frame.leds[11]
-    assert (led.luminaire, led.sigma_m, led.gradient_sigma) == (3, (3e-4, 4e-4, 5e-4), 0.05)
-    assert led.size_sigma_m == 2e-4
-    assert (other.luminaire, other.sigma_m, other.gradient_sigma, other.size_sigma_m) == (None, None, None, None)
-    assert frame.map_datum is not None
-    assert (frame.map_datum.sigma_m, frame.map_datum.scale_sigma_ppm) == ((0.001, 0.002, 0.003), 20.0)
-    assert (frame.accelerometer.device_error_deg, frame.accelerometer.shot_error_deg) == (0.3, 0.4)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        pytest.param(
-            lambda c: c["cameras"]["main"]["uncertainty"]["shot_sigma"].pop(),
-            "uncertainty: Value error, device_sigma and shot_sigma need one number for each of parameters",
-            id="a sigma too few",
-        ),
-        pytest.param(
-            lambda c: c["cameras"]["main"]["uncertainty"]["parameters"].__setitem__(0, "cy_px"),
-            "parameters have to be unique",
-            id="a parameter twice",
-        ),
-        pytest.param(
-            lambda c: c["cameras"]["main"]["uncertainty"]["device_sigma"].__setitem__(2, -1.0),
-            "cameras.main.uncertainty.device_sigma.2: Input should be greater than or equal to 0",
-            id="a negative sigma",
-        ),
-        pytest.param(
-            lambda c: c["cameras"]["main"].update(projection="equidistant"),
-            'sigmas of k1, p1 and p2 have to be 0 with projection "equidistant"',
-            id="distortion of a fish-eye",
-        ),
-        pytest.param(
-            lambda c: c["luminaires"].append(STATED_LUMINAIRE), "luminaire ids have to be unique", id="one id twice"
-        ),
-        pytest.param(
-            lambda c: c["led_map"][1].update(luminaire=4),
-            "LED 11 names luminaire 4, which is not in luminaires",
-            id="an unknown luminaire",
-        ),
-        pytest.param(
-            lambda c: c["led_map"][0].update(sigma_m=[1e-3, 1e-3]), "led_map.0.sigma_m.2: Field required", id="a pair"
-        ),
-        pytest.param(
-            lambda c: c["accelerometer"].update(shot_error_deg=-0.1), "accelerometer.shot_error_deg", id="accelerometer"
-        ),
-    ],
-)
-def test_a_wrong_statement_is_refused_by_name(
-    folder: Path, change: Callable[[dict[str, Any]], object], message: str
-) -> None:
-    def both(content: dict[str, Any]) -> None:
-        state_all(content)
-        change(content)
-
-    change_json(folder, both)
-    assert message in refused(folder)
