@@ -1,4 +1,4 @@
-"""Rolling shutters: gains of lines against sums over time, the room's flicker, lines of a moving camera, what is refused."""
+"""Rolling shutters: gains of lines against sums over time, the room's flicker, moving cameras, what is refused."""
 
 from pathlib import Path
 
