@@ -2,6 +2,7 @@
 
 import re
 import subprocess
+from functools import cache
 
 import pytest
 from conftest import ROOT
@@ -23,17 +24,22 @@ RETIRED = {
 TEXT = ("*.py", "*.md", "*.toml", "*.cff", "Makefile")
 
 
+@cache
+def texts() -> dict[str, str]:
+    """Of every file of the checkout but this one, by its name."""
+    listed = subprocess.run(["git", "ls-files", *TEXT], cwd=ROOT, capture_output=True, text=True, check=True)
+    names = [name for name in listed.stdout.splitlines() if name != "tests/test_vocabulary.py"]
+    return {name: (ROOT / name).read_text(encoding="utf-8") for name in names if (ROOT / name).is_file()}
+
+
 @pytest.mark.parametrize(("retired", "used"), RETIRED.items(), ids=RETIRED.values())
 def test_retired_words_are_not_used(retired: str, used: str) -> None:
     """`used` is the field's word."""
-    listed = subprocess.run(["git", "ls-files", *TEXT], cwd=ROOT, capture_output=True, text=True, check=True)
+    as_written = re.compile(rf"(?<![A-Za-z_.])({retired})(?![A-Za-z_.(=\]])")
+    in_lower_case = re.compile(rf"(?<![a-z_.])({retired})(?![a-z_.(=\]])")
     places = []
-    for name in listed.stdout.splitlines():
-        if name == "tests/test_vocabulary.py" or not (ROOT / name).is_file():
-            continue
-        for number, line in enumerate((ROOT / name).read_text(encoding="utf-8").splitlines(), start=1):
-            found = re.search(rf"(?<![A-Za-z_.])({retired})(?![A-Za-z_.(=\]])", line)
-            found = found or re.search(rf"(?<![a-z_.])({retired})(?![a-z_.(=\]])", line.lower())
-            if found:
-                places.append(f"{name}:{number}: {found[0]} -> {used}: {line.strip()[:100]}")
+    for name, text in texts().items():
+        for found in (*as_written.finditer(text), *in_lower_case.finditer(text.lower())):
+            number = text.count("\n", 0, found.start())
+            places.append(f"{name}:{number + 1}: {found[0]} -> {used}: {text.splitlines()[number].strip()[:100]}")
     assert not places, "\n".join(places)
