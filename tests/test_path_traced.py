@@ -72,8 +72,9 @@ def test_furniture_occludes_leds_and_is_lit_as_in_the_reference(tmp_path: Path) 
     ours, reference, variance, lit = both_ways(
         scene, Camera(**SMALL_VIEW), Pose((1.5, 1.5, 0.4), 4.0, -6.0, 30.0), samples
     )
+    few = {"texel_m": 0.5, "paths": 8}  # whatever the light of the room
     alone = (
-        Renderer(scene_of(led=leds))
+        Renderer(scene_of(led=leds, bake=few))
         .expected_image(PosedCamera(Camera(**SMALL_VIEW), Pose((1.5, 1.5, 0.4), 4.0, -6.0, 30.0)))
         .patches
     )
@@ -116,7 +117,8 @@ def test_light_reflected_by_a_glazing_agrees_with_the_reference() -> None:
     allowed = 5 * np.sqrt(variance.mean() / variance.size) + 0.009 * reference.mean()
     assert abs((ours - reference).mean()) < allowed
     # the reflected light exceeds the tolerance
-    without = Renderer(scene_of(led=[led], room=dark, ambient=scene.settings.ambient.model_dump()))
+    few = {"texel_m": 0.1, "paths": 64}  # one bounce in a dark room
+    without = Renderer(scene_of(led=[led], room=dark, ambient=scene.settings.ambient.model_dump(), bake=few))
     plain = without.background_cd_m2(PosedCamera(Camera(**SMALL_VIEW), Pose((1.0, 1.5, 2.2), 180.0)))
     assert ours.mean() - plain.mean() > 3 * allowed
 

@@ -118,13 +118,14 @@ def test_centroid_of_a_level_led_is_its_projection(renderer: Renderer) -> None:
 SMALL_VIEW = {"width_px": 120, "height_px": 90, "pixel_pitch_um": 40.0}
 STRAIGHT = Pose((3.5, 3.2, 0.5), 5, 10, 30)
 VIEWS = {
-    "off centre": (Camera(**SMALL_VIEW, principal_point_px=(50.0, 52.0)), STRAIGHT),
+    "skewed, off centre": (Camera(**SMALL_VIEW, principal_point_px=(50.0, 52.0), skew_px=40.0), STRAIGHT),
     "tilted": (Camera(**SMALL_VIEW), Pose((1.0, 3.0, 1.2), 40, -30, 170)),
-    "wide, with walls": (Camera(**{**SMALL_VIEW, "pixel_pitch_um": 130.0}), Pose((1.3, 1.3, 1.2), 25, -20, 0)),
+    "wide and distorted, with walls": (
+        Camera(**{**SMALL_VIEW, "pixel_pitch_um": 130.0}, distortion={"k1": -0.2, "p1": 0.01}),
+        Pose((1.3, 1.3, 1.2), 25, -20, 0),
+    ),
     "glazing": (Camera(**{**SMALL_VIEW, "pixel_pitch_um": 130.0}), Pose((3.0, 3.5, 1.2), 0, -72, 0)),
     "defocused": (Camera(**SMALL_VIEW, focus_distance_m="infinity", f_number=1.0), STRAIGHT),
-    "distorted": (Camera(**{**SMALL_VIEW, "pixel_pitch_um": 130.0}, distortion={"k1": -0.2, "p1": 0.01}), STRAIGHT),
-    "skewed": (Camera(**SMALL_VIEW, skew_px=40.0), STRAIGHT),
     "fish-eye": (
         Camera(**{**SMALL_VIEW, "pixel_pitch_um": 300.0}, projection="equidistant"),
         Pose((2.6, 3.1, 1.0), 10, 5, 30),
@@ -134,10 +135,11 @@ VIEWS = {
 
 @pytest.fixture(scope="module")
 def daylight() -> Renderer:
-    """The office with a glazing in the wall x = 0 and daylight that counts."""
+    """The office with a glazing in the wall x = 0 and daylight that counts; a quarter of the usual paths."""
     tree = read_toml(ROOT / "scenes/office.toml")
     glazing = {"wall": "x=0", "corner_m": [1.5, 0.9], "size_m": [4.0, 2.0], "luminance_cd_m2": 300.0}
-    return Renderer(build_scene(check({**tree, "glazing": [glazing]}, SceneSettings, "daylight"), "daylight"))
+    changed = {**tree, "glazing": [glazing], "bake": {"paths": 256}}
+    return Renderer(build_scene(check(changed, SceneSettings, "daylight"), "daylight"))
 
 
 @pytest.mark.slow
@@ -168,17 +170,19 @@ def test_agrees_with_mitsubas_path_integrator(name: str, office_renderer: Render
     assert abs(z.mean()) < 5 / np.sqrt(len(z))
 
     # 2. The room, in blocks of 10 x 10 pixels without LED light: their means differ by the reference's noise, the
-    # lightmap's (0.7 lux of 440: 0.15 %, all of a block alike) and interpolation between vertices 0.25 m apart (0.3 %).
+    # lightmap's (0.7 lux of 440: 0.15 %, or twice that with a quarter of its paths, all of a block alike) and
+    # interpolation between vertices 0.25 m apart (0.3 %).
+    of_lightmap = np.hypot(0.0015 if name != "glazing" else 0.003, 0.003)
     blocks = [np.s_[r : r + 10, c : c + 10] for r in range(0, 90, 10) for c in range(0, 120, 10)]
     means = np.array(
         [[ours[b].mean(), reference[b].mean(), variance[b].mean() / 100] for b in blocks if not lit[b].any()]
     )
     assert len(means) > 5
-    z = (means[:, 0] - means[:, 1]) / np.sqrt(means[:, 2] + (0.0034 * means[:, 1]) ** 2)
+    z = (means[:, 0] - means[:, 1]) / np.sqrt(means[:, 2] + (of_lightmap * means[:, 1]) ** 2)
     # 8 batches: Student's t with 7 degrees of freedom, of which one in 10 000 is beyond 7.9 where noise rules
     assert np.abs(z).max() < 7.9
     noise = np.sqrt(means[:, 2].mean() / len(means))
-    assert abs((means[:, 0] - means[:, 1]).mean()) < 5 * noise + 0.0034 * means[:, 1].mean()
+    assert abs((means[:, 0] - means[:, 1]).mean()) < 5 * noise + of_lightmap * means[:, 1].mean()
 
 
 @pytest.mark.slow
