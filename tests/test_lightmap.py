@@ -121,7 +121,7 @@ def test_white_furnace(albedo: float) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("reflectance", [None, 0.5, 0.95, 0.99])
+@pytest.mark.parametrize("reflectance", [None, 0.5, 0.95])
 def test_energy_balance(tmp_path: Path, reflectance: float | None) -> None:
     """The surfaces absorb the flux that the LEDs emit; None stands for the reflectances of Table 1's room."""
     finish = {"floor": 0.2, "ceiling": 0.8, "walls": 0.5} if reflectance is None else dict.fromkeys(FACES, reflectance)
