@@ -34,14 +34,14 @@ def gate_px(width_px: int) -> float:
 
 
 def identify(
-    spots: Sequence[Spot], decoded: Sequence[DecodedSpot], leds: Mapping[int, Led], gate_px: float
+    spots: Sequence[Spot], decoded: Sequence[DecodedSpot], leds: Mapping[int, Led], gate_px: float, cut_too: bool = False
 ) -> tuple[Correspondence, ...]:
     """Match spots and decoded identities one to one; the result is in the order of `decoded`.
 
     An identity is assigned its nearest spot, at most `gate_px` away, unless another spot is within CLEARANCE times that
     distance, another identity has the same nearest spot, or one without a spot lies in this one: a merged blob is
     assigned to no LED. Spots that touch the image's border take part, so that their identity is not assigned to another
-    spot, and are then left out because their centroid is biased. Raises EstimationFailure, with the number of
+    spot, and are then left out, unless `cut_too`, because their centroid is biased. Raises EstimationFailure, with the number of
     identities by cause, if no correspondence is left.
     """
     if not decoded:
@@ -64,7 +64,7 @@ def identify(
             beyond += 1
         elif not clear:
             unclear += 1
-        elif spot.touches_border:
+        elif spot.touches_border and not cut_too:
             cut += 1
         else:
             correspondences.append(Correspondence(leds[identity.led], spot))
