@@ -39,9 +39,7 @@ VARIANTS = {
     )
 }
 """Variants that run by default."""
-PUBLISHED_SINCE = {
-    variant.name: variant for variant in (GOPA, ECA_RSSR, R_P3P, V_P4L, V_PCA, CIRCLE_CENTRE, LC_VLP)
-}
+PUBLISHED_SINCE = {variant.name: variant for variant in (GOPA, ECA_RSSR, R_P3P, V_P4L, V_PCA, CIRCLE_CENTRE, LC_VLP)}
 """Methods published since the paper, in the order of publication. They run where they are named.
 
 Each needs what many datasets lack (one luminance of all LEDs, square faces, LED images of some size), and the four that

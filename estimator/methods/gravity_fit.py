@@ -139,5 +139,5 @@ GRAVITY_FIT = Variant(
     "gravity-fit",
     "reprojection fit of position and orientation, gravity as a prior, wrong LEDs left out, with covariance",
     gravity_fit,
-    needs=Needs(3, sensors=("accelerometer",)),
+    needs=Needs(3, optional=("accelerometer", "gyroscope")),
 )

@@ -310,5 +310,5 @@ ML = Variant(
     "ml",
     "maximum likelihood on the pixels: true faces under the pose, Poisson, gravity as a prior, with covariance",
     ml,
-    needs=Needs(2, sizes=True, sensors=("accelerometer",)),
+    needs=Needs(2, sizes=True, sensors=("accelerometer",), optional=("gyroscope",)),
 )

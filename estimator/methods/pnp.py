@@ -137,7 +137,7 @@ def candidates(model: Floats, image: Floats, method: int, refined: bool) -> list
     return poses
 
 
-FOUR_LEDS = Needs(4)
+FOUR_LEDS = Needs(4, optional=("gyroscope",))
 PNP = Variant(
     "pnp",
     "perspective-n-point (SQPNP, IPPE, Levenberg-Marquardt) on raw centroids, no gravity",

@@ -117,5 +117,5 @@ SELF_CALIBRATED = Variant.over_device(
     "self-calibrated",
     "all frames of a device at once: gravity-fit with the errors of camera, accelerometer and map as unknowns",
     DeviceMethod(fit_frame, fit_device),
-    Needs(3, sensors=("accelerometer",)),
+    Needs(3, optional=("accelerometer", "gyroscope")),
 )

@@ -170,5 +170,5 @@ UP2P = Variant(
     "up2p",
     "PoseLib's upright two-point solver in RANSAC, tilt from gravity, then a fit of the spots that agree",
     up2p,
-    needs=Needs(3, sensors=("accelerometer",)),
+    needs=Needs(3, sensors=("accelerometer",), optional=("gyroscope",)),
 )

@@ -31,6 +31,8 @@ Floats = NDArray[np.float64]
 
 # Share of a side at each of its ends whose points may belong to the next side.
 CORNER_SHARE = 0.1
+# Half of them, the share that outliers leave at least, determine a plane.
+MIN_SIDE_POINTS = 6
 # Tolerance of the hull's four sides, in shares of its circumference, from the smallest one on.
 HULL_TOLERANCES = np.geomspace(0.005, 0.1, 14)
 QUARTER_TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -69,7 +71,7 @@ def sides_of(contour: Floats) -> list[Floats]:
     nearest = np.where((shares > 0) & (shares < 1), across, np.inf).argmin(axis=1)
     inner = (np.abs(shares - 0.5) < 0.5 - CORNER_SHARE)[np.arange(len(contour)), nearest]
     sides = [contour[inner & (nearest == k)] for k in range(4)]
-    if min(len(side) for side in sides) < 2:
+    if min(len(side) for side in sides) < MIN_SIDE_POINTS:
         raise EstimationFailure("contour", "the outline of a square LED has not four sides")
     return sides
 

@@ -59,7 +59,9 @@ class Needs:
     sizes: bool = False
     """Whether the map has to say the sizes of the LEDs."""
     sensors: tuple[Literal["accelerometer", "second camera", "fish-eye lens"], ...] = ()
-    """Sensors beside one camera with a normal lens."""
+    """Sensors beside one camera that have to be there."""
+    optional: tuple[Literal["accelerometer", "gyroscope"], ...] = ()
+    """Sensors whose readings are used where they are there."""
     attitude: Literal["any", "level"] = "any"
     """Attitude of the camera that the method allows."""
 

@@ -17,14 +17,14 @@ Floats = NDArray[np.float64]
 
 # Random samples of five points: with 40 % of the points on another edge, one sample of 13 has none of them.
 SAMPLES = 100
-# Weighted fits after the best sample; each leaves a hundredth of the change of the one before it.
+# Fits without the outliers of the one before: an outlier that moves a fit hides others.
 ROUNDS = 6
 # Points this many standard deviations off, by the median of the distances, are on another edge.
 OUTLIER_SIGMA = 3.0
 
 
 def fit_cone(image: Floats) -> Floats:
-    """Cone Q (3, 3), negative inside, whose ellipse most of the points (n, 2) at unit depth lie on.
+    """Cone Q (3, 3), negative inside, whose ellipse most of the points (n, 2) at unit depth, n >= 12, lie on.
 
     Of the ellipses through five points each the one with the smallest median of distances (Rousseeuw 1984) is refined
     by least squares of the distances to first order (Sampson 1982), without outliers, so that an arc suffices if it
@@ -99,10 +99,10 @@ def discs(cone: Floats) -> tuple[Floats, Floats]:
 
 
 def fit_plane(image: Floats) -> Floats:
-    """Unit normal (3,) of the plane through the projection centre and most of the points (n, 2) at unit depth."""
+    """Unit normal (3,) of the plane through the projection centre and most of the points (n, 2) at unit depth, n >= 6."""
     rays = np.column_stack([image, np.ones(len(image))])
     kept = np.ones(len(rays), dtype=bool)
-    for _ in range(2):
+    for _ in range(ROUNDS):
         normal = np.linalg.svd(rays[kept], full_matrices=False)[2][2]
         distances = np.abs(rays @ normal)
         kept = distances <= OUTLIER_SIGMA * 1.4826 * np.median(distances)

@@ -23,9 +23,7 @@ RAW = DENOISERS["none"]
 MAX_STEADY_OFF = 0.2
 
 
-def find_correspondences(
-    frame: DeviceFrame, denoiser: Denoiser = RAW, cut_too: bool = False
-) -> list[Correspondence]:
+def find_correspondences(frame: DeviceFrame, denoiser: Denoiser = RAW, cut_too: bool = False) -> list[Correspondence]:
     """Spots in a frame that are identified as LEDs, with `cut_too` also those that a region's border may cut.
 
     Under a rolling shutter, spots of LED images with stripes are the centres of their outlines

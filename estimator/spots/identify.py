@@ -34,7 +34,11 @@ def gate_px(width_px: int) -> float:
 
 
 def identify(
-    spots: Sequence[Spot], decoded: Sequence[DecodedSpot], leds: Mapping[int, Led], gate_px: float, cut_too: bool = False
+    spots: Sequence[Spot],
+    decoded: Sequence[DecodedSpot],
+    leds: Mapping[int, Led],
+    gate_px: float,
+    cut_too: bool = False,
 ) -> tuple[Correspondence, ...]:
     """Match spots and decoded identities one to one; the result is in the order of `decoded`.
 
