@@ -30,8 +30,8 @@ def in_camera(view: View, point_m: Array) -> Array:
     return np.asarray(view.R_cam_world @ (point_m - view.position_m))
 
 
-# The smallest eigenvalue of a cone is (r / d)^2 = 1 / 4900 of the others, whose rounding, some 1e-15, changes the radius
-# by as much of itself as of the eigenvalue: 5e-12, and depth in the same proportion.
+# The smallest eigenvalue of a cone is (r / d)^2 = 1 / 4900 of the others, whose rounding, some 1e-15, changes the
+# radius by as much of itself as of the eigenvalue: 5e-12, and depth in the same proportion.
 ROUNDING_M = 3.5 * 5e-12
 
 

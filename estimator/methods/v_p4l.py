@@ -1,5 +1,5 @@
-"""V-P4L: Bai, "Novel visible light communication assisted perspective-four-line algorithm for indoor localization", arXiv
-2009.12320, 2020: the pose of one rectangular luminaire from the planes of its edges.
+"""V-P4L: Bai, "Novel visible light communication assisted perspective-four-line algorithm for indoor localization",
+arXiv 2009.12320, 2020: the pose of one rectangular luminaire from the planes of its edges.
 
 Published, as far as known from its abstract: a single rectangular luminaire; plane and solid geometry give its
 orientation and its place in camera axes; with the coordinates that light tells, single-view geometry and linear least
@@ -77,9 +77,10 @@ def sides_of(contour: Floats) -> list[Floats]:
 
 
 def pose_from_sides(sides: list[Floats], centre_m: Floats, half_m: float, others_m: Floats, image: Floats) -> Pose:
-    """Pose from points (n, 2) at unit depth on the sides, in order, of a square at `centre_m` (3,) of half side `half_m`.
+    """Pose from points (n, 2) at unit depth on the four sides, in order, of a square of half side `half_m`.
 
-    Spots `image` (n, 2) of the LEDs `others_m` (n, 3) decide between four yaws. Raises EstimationFailure.
+    `centre_m` (3,) is its centre in the world. Spots `image` (n, 2) of the LEDs `others_m` (n, 3) decide between four
+    yaws. Raises EstimationFailure.
     """
     planes = np.array([fit_plane(side) for side in sides])
     first, second = np.cross(planes[0], planes[2]), np.cross(planes[1], planes[3])

@@ -1,7 +1,7 @@
 """Cones and planes through the projection centre: of the image of a disc, and of a straight edge.
 
-A disc and the projection centre span a cone; in the image plane at unit depth the cone is an ellipse, `x^T Q x = 0` with
-x = (x, y, 1). A straight edge spans a plane with the normal m, `m . x = 0`.
+A disc and the projection centre span a cone; in the image plane at unit depth the cone is an ellipse, `x^T Q x = 0`
+with x = (x, y, 1). A straight edge spans a plane with the normal m, `m . x = 0`.
 
 A cone has two directions of planes that cut it in circles (Apollonius). With eigenvalues l1 >= l2 > 0 > l3 of Q and its
 eigenvectors as axes they are the planes `a x +- b z = const` with a^2 = l1 - l2 and b^2 = l2 - l3, because
@@ -99,7 +99,7 @@ def discs(cone: Floats) -> tuple[Floats, Floats]:
 
 
 def fit_plane(image: Floats) -> Floats:
-    """Unit normal (3,) of the plane through the projection centre and most of the points (n, 2) at unit depth, n >= 6."""
+    """Unit normal (3,) of the plane through the projection centre and most of n >= 6 points (n, 2) at unit depth."""
     rays = np.column_stack([image, np.ones(len(image))])
     kept = np.ones(len(rays), dtype=bool)
     for _ in range(ROUNDS):

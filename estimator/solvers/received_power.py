@@ -39,6 +39,9 @@ _AREAS = {"disc": np.pi, "square": 4.0}
 
 
 def predicted_fluxes(vectors_m: Floats, up: Floats) -> Floats:
-    """`fluxes` (n,) of horizontal faces of radiance 1 / D at `vectors_m` (n, 3), camera axes; `up` (3,) is the world's z."""
+    """`fluxes` (n,) of horizontal faces at `vectors_m` (n, 3), up to a factor; `up` (3,) is the world's z.
+
+    Both are in camera axes.
+    """
     distances2 = (vectors_m**2).sum(axis=1)
     return np.asarray((vectors_m @ up) * vectors_m[:, 2] / distances2**2)

@@ -96,7 +96,7 @@ def _own(electrons: Floats, peak_e: float, centre_px: Sequence[float], radius_px
         low = np.maximum(np.subtract(centre_px, radius_px).astype(int), 0)
         high = np.add(centre_px, radius_px).astype(int) + 1
         counts = np.bincount(labels[low[1] : high[1], low[0] : high[0]].ravel(), minlength=2)
-        own = (labels == 1 + int(counts[1:].argmax())) & bool(counts[1:].any())
+        own = np.asarray((labels == 1 + int(counts[1:].argmax())) & bool(counts[1:].any()))
         plateau_e = float(np.median(electrons[own])) if own.any() else plateau_e
     return own
 

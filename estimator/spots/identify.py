@@ -45,8 +45,8 @@ def identify(
     An identity is assigned its nearest spot, at most `gate_px` away, unless another spot is within CLEARANCE times that
     distance, another identity has the same nearest spot, or one without a spot lies in this one: a merged blob is
     assigned to no LED. Spots that touch the image's border take part, so that their identity is not assigned to another
-    spot, and are then left out, unless `cut_too`, because their centroid is biased. Raises EstimationFailure, with the number of
-    identities by cause, if no correspondence is left.
+    spot, and are then left out, unless `cut_too`, because their centroid is biased. Raises EstimationFailure, with the
+    number of identities by cause, if no correspondence is left.
     """
     if not decoded:
         raise EstimationFailure("identify", "no identity was decoded")
