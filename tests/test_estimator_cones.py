@@ -170,5 +170,5 @@ def test_what_has_no_contour_is_refused_by_name() -> None:
         find_contours(frame, "square")
     with pytest.raises(EstimationFailure, match="contour: the map does not say how large its LEDs are"):
         find_contours(frame_of(image, LED.model_copy(update={"radius_m": None}), (40.0, 40.0)))
-    with pytest.raises(EstimationFailure, match="contour: LED images are too small: fewer than 16 points"):
+    with pytest.raises(EstimationFailure, match="contour: LED images are too small: none has 16 points"):
         find_contours(frame_of(disc_image(80, (40.0, 40.0), 2.0), LED, (40.0, 40.0)))

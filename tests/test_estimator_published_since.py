@@ -27,6 +27,7 @@ from estimator.solvers.cones import ellipse_centre, fit_cone
 from estimator.solvers.observations import observe
 from estimator.solvers.received_power import fluxes, predicted_fluxes, with_power
 from estimator.solvers.trilateration import position_from_ranges
+from estimator.spots.contours import Contour
 from estimator.spots.detect import Spot
 from estimator.spots.identify import Correspondence
 
@@ -276,10 +277,10 @@ def test_a_disc_and_a_square_give_the_pose_whatever_the_start(view: View) -> Non
     """The fit ends where a step changes the position by 1e-12 of itself or the cost by as much, whose root is 1e-6 of
     the first step of 5 cm.
     """
-    curves = [
-        Curve(SQUARE[0], RADIUS_M, 2.0, rim(view, SQUARE[0])),
-        Curve(SQUARE[3], 0.1, np.inf, square_rim(view, SQUARE[3], 0.1)),
-    ]
+    disc = DiscLed(id=1, position_m=tuple(SQUARE[0].tolist()), radius_m=RADIUS_M)
+    square = SquareLed(id=2, position_m=tuple(SQUARE[3].tolist()), side_m=0.2)
+    images = rim(view, SQUARE[0]), square_rim(view, SQUARE[3], 0.1)
+    curves = [Curve.of(Contour(led, spot(1.0), image)) for led, image in zip((disc, square), images, strict=True)]
     found = fit_curves(curves, off_by_a_degree(view))
     np.testing.assert_allclose(found.position_m, view.position_m, atol=5e-8)
     np.testing.assert_allclose(found.R_cam_world, view.R_cam_world, atol=5e-8)

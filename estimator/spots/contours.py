@@ -56,15 +56,16 @@ def find_contours(frame: DeviceFrame, shape: str | None = None, cut_too: bool = 
         raise EstimationFailure("contour", "the map does not say how large its LEDs are")
     contours = [one for one in (_contour(frame, one) for one in sized) if len(one.image) >= MIN_POINTS]
     if not contours:
-        raise EstimationFailure("contour", f"LED images are too small: fewer than {MIN_POINTS} points on each edge")
+        raise EstimationFailure("contour", f"LED images are too small: none has {MIN_POINTS} points on its edge")
     return contours
 
 
 def _contour(frame: DeviceFrame, correspondence: Correspondence) -> Contour:
-    pixels = edge_pixels(frame, correspondence.spot)
+    spot = correspondence.spot
+    pixels = frame.once(("edge", spot.u_px, spot.v_px), lambda: edge_pixels(frame, spot))
     pixels = pixels[has_pinhole_image(pixels, frame.camera)] if len(pixels) else pixels
     image = pinhole_image(pixels, frame.camera) if len(pixels) else pixels
-    return Contour(correspondence.led, correspondence.spot, image)
+    return Contour(correspondence.led, spot, image)
 
 
 def edge_pixels(frame: DeviceFrame, spot: Spot) -> Floats:
