@@ -39,7 +39,7 @@ def fit_cone(image: Floats) -> Floats:
     ellipses = samples[samples[:, 0] * samples[:, 2] > samples[:, 1] ** 2]
     if not len(ellipses):
         raise EstimationFailure("contour", "no ellipse fits the edge of an LED image")
-    medians = [float(np.median(_distances(design, one)[0])) for one in ellipses]
+    medians = np.median(_distances(design, ellipses)[0], axis=1)
     best = ellipses[int(np.argmin(medians))]
     for _ in range(ROUNDS):
         distances, slopes = _distances(design, best)
@@ -53,12 +53,12 @@ def fit_cone(image: Floats) -> Floats:
     return np.asarray(cone / np.linalg.norm(cone) * np.sign(cone[0, 0]))
 
 
-def _distances(design: Floats, conic: Floats) -> tuple[Floats, Floats]:
-    """Distances (n,) of points from a conic to first order, and the lengths (n,) of its gradient there."""
+def _distances(design: Floats, conics: Floats) -> tuple[Floats, Floats]:
+    """Distances (..., n) of points from conics (..., 6) to first order, and lengths (..., n) of the gradients there."""
     x, y = design[:, 3] / 2, design[:, 4] / 2
-    a, b, c, d, e, _ = conic
+    a, b, c, d, e, _ = np.moveaxis(conics[..., None], -2, 0)
     slopes = np.maximum(2 * np.hypot(a * x + b * y + d, b * x + c * y + e), np.finfo(float).tiny)
-    return np.abs(design @ conic) / slopes, slopes
+    return np.abs(conics @ design.T) / slopes, slopes
 
 
 def ellipse_centre(cone: Floats) -> Floats:

@@ -116,13 +116,12 @@ def edges(electrons: Floats, own: Mask) -> Floats:
 
 def _right_edges(electrons: Floats, own: Mask, used: Mask) -> Floats:
     """Points (n, 2), (x, y), of the edges in `used` that have `own` pixels on their left."""
-    if own.shape[1] < 2 * SIDE_PX:
-        return np.empty((0, 2))
-    inside = np.lib.stride_tricks.sliding_window_view(own, 2 * SIDE_PX, axis=1)
-    edge = inside[:, :, :SIDE_PX].all(axis=2) & ~inside[:, :, SIDE_PX:].any(axis=2)
-    edge &= used[:, SIDE_PX - 1 : own.shape[1] - SIDE_PX]
-    rows, first = np.nonzero(edge)
-    light = electrons[rows[:, None], first[:, None] + np.arange(2 * SIDE_PX)]
+    rows, last = np.nonzero(own[:, :-1] & ~own[:, 1:] & used[:, :-1])
+    whole = (last >= SIDE_PX - 1) & (last < own.shape[1] - SIDE_PX)
+    row, column = rows[whole, None], last[whole, None] + np.arange(1 - SIDE_PX, SIDE_PX + 1)
+    inside, light = own[row, column], electrons[row, column]
+    clear = inside[:, :SIDE_PX].all(axis=1) & ~inside[:, SIDE_PX:].any(axis=1)
+    row, column, light = row[clear, 0], column[clear], light[clear]
     plateau, background = light[:, :2].mean(axis=1), light[:, -2:].mean(axis=1)
     lit = (light[:, 2:-2] - background[:, None]).sum(axis=1) / (plateau - background)
-    return np.column_stack([first + 2 + lit, rows + 0.5])
+    return np.column_stack([column[:, 2] + lit, row + 0.5])
