@@ -43,10 +43,11 @@ app = App(
 @app.command
 def variants() -> None:
     """List the variants, a line each, with the package of those that other packages register."""
-    from estimator.methods.catalogue import PUBLISHED_SINCE
+    from estimator.methods.catalogue import OWN, PUBLISHED_SINCE
     from estimator.methods.registry import Registry
 
-    registry, usable = Registry.read(), [*estimator.variants(), *PUBLISHED_SINCE.values()]
+    registry, plugins = Registry.read(), [one for one in estimator.variants() if one.name not in OWN]
+    usable = [*OWN.values(), *plugins]
     width = max(len(variant.name) for variant in usable)
     for variant in usable:
         source = registry.source(variant.name)
