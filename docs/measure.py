@@ -392,13 +392,13 @@ def published_since(measure: Measurement) -> None:
             ["gopa", "eca-rssr", "r-p3p", "v-pca", "circle-centre", "lc-vlp", *fits],
         ),
     }
-    heading("recipe", "frames", "variant", "failed", "median", "RMSE", "maximum", "time a frame, median")
+    heading("recipe", "frames", "variant", "failed", "median", "RMSE", "maximum", "time over `pnp`'s")
     for name, (folder, variants) in sets.items():
-        for k, (variant, score) in enumerate(measure.scores(folder, variants).iterrows()):
+        scores = measure.scores(folder, variants)
+        for k, (variant, score) in enumerate(scores.iterrows()):
             errors = (length(score[f"error_3d_{kind}_m"]) for kind in ("median", "rmse", "max"))
-            time_ms = f"{1e3 * score['median_time_s']:.0f} ms" if np.isfinite(score["median_time_s"]) else ""
-            of_set = (name, score["frames"]) if k == 0 else ("", "")
-            row(*of_set, f"`{variant}`", score["failed"], *errors, time_ms)
+            times = f"{score['median_time_s'] / scores.loc['pnp', 'median_time_s']:.1f}"
+            row(*((name, score["frames"]) if k == 0 else ("", "")), f"`{variant}`", score["failed"], *errors, times)
 
 
 def self_calibrated(measure: Measurement) -> None:
