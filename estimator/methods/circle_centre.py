@@ -21,8 +21,7 @@ from estimator.camera.pose import Pose
 from estimator.io.device import DeviceFrame
 from estimator.methods.pnp import pose_from_pixels
 from estimator.methods.variant import Estimate, Needs, Variant
-from estimator.solvers.cones import ellipse_centre, ellipse_centres, fit_cone
-from estimator.spots.contours import find_contours
+from estimator.solvers.cones import disc_cones, ellipse_centre, ellipse_centres
 
 Floats = NDArray[np.float64]
 
@@ -34,11 +33,9 @@ MAX_ROUNDS = 10
 
 def circle_centre(frame: DeviceFrame) -> Estimate:
     """Position from the centres of discs' images; raises EstimationFailure."""
-    contours = find_contours(frame, "disc")
-    centres = np.array([ellipse_centre(fit_cone(one.image)) for one in contours])
-    leds_m = np.array([one.led.position_m for one in contours])
-    radii_m = np.array([one.led.half_width_m for one in contours])
-    return Estimate(pose_from_centres(leds_m, radii_m, centres).position_m)
+    found = disc_cones(frame)
+    centres = np.array([ellipse_centre(cone) for cone in found.cones])
+    return Estimate(pose_from_centres(found.leds_m, found.radii_m, centres).position_m)
 
 
 def pose_from_centres(leds_m: Floats, radii_m: Floats, centres: Floats) -> Pose:

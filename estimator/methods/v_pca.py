@@ -13,6 +13,8 @@ of the nearest normals. Leveled by it, the vectors to the centres give yaw and p
 is needed: one has no yaw and two solutions.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,8 +24,7 @@ from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame
 from estimator.methods.kim import position_from_vectors
 from estimator.methods.variant import Estimate, Needs, Variant
-from estimator.solvers.cones import discs, fit_cone
-from estimator.spots.contours import find_contours
+from estimator.solvers.cones import disc_cones, discs
 
 Floats = NDArray[np.float64]
 
@@ -32,17 +33,15 @@ MIN_LEDS = 2
 
 def v_pca(frame: DeviceFrame) -> Estimate:
     """Position from the cones of discs; raises EstimationFailure."""
-    contours = find_contours(frame, "disc", cut_too=True)
-    leds_m = np.array([one.led.position_m for one in contours])
-    radii_m = np.array([one.led.half_width_m for one in contours])
-    vectors_m, up = decide(leds_m, radii_m, [fit_cone(one.image) for one in contours])
+    found = disc_cones(frame, cut_too=True)
+    vectors_m, up = decide(found.leds_m, found.radii_m, found.cones)
     level = vectors_m @ rotation(*tilt_from_gravity((float(up[0]), float(up[1]), float(up[2]))))
     distances_m = np.linalg.norm(vectors_m, axis=1)
-    ranges_m = {one.led.id: float(d) for one, d in zip(contours, distances_m, strict=True)}
-    return Estimate(position_from_vectors(leds_m, level), ranges_m)
+    ranges_m = {led: float(d) for led, d in zip(found.ids, distances_m, strict=True)}
+    return Estimate(position_from_vectors(found.leds_m, level), ranges_m)
 
 
-def decide(leds_m: Floats, radii_m: Floats, cones: list[Floats]) -> tuple[Floats, Floats]:
+def decide(leds_m: Floats, radii_m: Floats, cones: Sequence[Floats] | Floats) -> tuple[Floats, Floats]:
     """Vectors (n, 3) to the centres of discs at `leds_m` (n, 3) on their cones, and the world's z (3,), camera axes.
 
     Raises EstimationFailure for fewer than two discs.

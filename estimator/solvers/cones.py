@@ -8,10 +8,14 @@ eigenvectors as axes they are the planes `a x +- b z = const` with a^2 = l1 - l2
 x^T Q x = l2 |x|^2 + (a x - b z) (a x + b z): on such a plane the cone is part of a sphere.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from estimator.errors import EstimationFailure
+from estimator.io.device import DeviceFrame
+from estimator.spots.contours import find_contours
 
 Floats = NDArray[np.float64]
 
@@ -21,6 +25,34 @@ SAMPLES = 100
 ROUNDS = 6
 # Points this many standard deviations off, by the median of the distances, are on another edge.
 OUTLIER_SIGMA = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class DiscCones:
+    """Discs of the map, in view: ids, centres `leds_m` (n, 3) and radii (n,), metres, and their cones (n, 3, 3)."""
+
+    ids: tuple[int, ...]
+    leds_m: Floats
+    radii_m: Floats
+    cones: Floats
+
+
+def disc_cones(frame: DeviceFrame, cut_too: bool = False) -> DiscCones:
+    """Cones of the identified discs whose contour is an ellipse; with `cut_too` also of those that a border may cut.
+
+    Raises EstimationFailure, also if there is none.
+    """
+    leds, cones = [], []
+    for contour in find_contours(frame, "disc", cut_too):
+        try:
+            cones.append(fit_cone(contour.image))
+        except EstimationFailure:
+            continue
+        leds.append(contour.led)
+    if not leds:
+        raise EstimationFailure("contour", "no ellipse fits the edge of an LED image")
+    leds_m, radii_m = np.array([led.position_m for led in leds]), np.array([led.half_width_m for led in leds])
+    return DiscCones(tuple(led.id for led in leds), leds_m, radii_m, np.array(cones))
 
 
 def fit_cone(image: Floats) -> Floats:
