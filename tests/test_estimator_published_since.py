@@ -28,6 +28,7 @@ from estimator.solvers.observations import observe
 from estimator.solvers.received_power import fluxes, predicted_fluxes, with_power
 from estimator.solvers.trilateration import position_from_ranges
 from estimator.spots.contours import Contour
+from estimator.spots.correspondences import find_correspondences
 from estimator.spots.detect import Spot
 from estimator.spots.identify import Correspondence
 
@@ -384,6 +385,20 @@ def test_an_obstacle_before_a_third_of_a_disc_leaves_v_pca_where_it_was(imaged: 
     moved = OWN["v-pca"].estimate(hidden).position_m - OWN["v-pca"].estimate(frame).position_m
     assert np.linalg.norm(moved) < 1e-3
     assert np.linalg.norm(OWN["pnp"].estimate(hidden).position_m - view.position_m) > 1e-2
+
+
+def test_v_pca_uses_a_disc_that_the_border_of_the_region_cuts(imaged: list[DeviceFrame]) -> None:
+    """The disc furthest to the right loses a third; its arc gives its range as the others do, to a millimetre."""
+    frame, view = imaged[1], IMAGED[1]
+    last = max(frame.spots, key=lambda one: one.u_px).led
+    led_m = np.array(frame.leds[last].position_m)
+    border = int(view.project(led_m[None])[0, 0]) + 8
+    part = replace(frame.parts[0], image_dn=np.ascontiguousarray(frame.parts[0].image_dn[:, :border]))
+    cut = replace(frame, parts=(part,))
+    assert last not in [one.led.id for one in find_correspondences(cut)]
+    estimate = OWN["v-pca"].estimate(cut)
+    assert estimate.ranges_m[last] == pytest.approx(np.linalg.norm(led_m - view.position_m), abs=2e-3)
+    assert np.linalg.norm(estimate.position_m - view.position_m) < 2e-3
 
 
 # Needs
