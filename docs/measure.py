@@ -379,6 +379,28 @@ def rivals(measure: Measurement) -> None:
     figure("fisheye, nakazawa2013, vertical, median", length(fisheye.loc["nakazawa2013", "vertical_median_m"]))
 
 
+def published_since(measure: Measurement) -> None:
+    """Methods published since the paper, on images of a sixteenth of the pixels."""
+    fits = ["pnp", "ml"]
+    sets = {
+        "`hall`, scale 4": (
+            measure.dataset("hall-quarter", "hall", scale=4),
+            ["gopa", "eca-rssr", "r-p3p", "v-p4l", "lc-vlp", *fits],
+        ),
+        "`quickstart`, scale 4": (
+            measure.dataset("quickstart-quarter", "quickstart", scale=4),
+            ["gopa", "eca-rssr", "r-p3p", "v-pca", "circle-centre", "lc-vlp", *fits],
+        ),
+    }
+    heading("recipe", "frames", "variant", "failed", "median", "RMSE", "maximum", "time over `pnp`'s")
+    for name, (folder, variants) in sets.items():
+        scores = measure.scores(folder, variants)
+        for k, (variant, score) in enumerate(scores.iterrows()):
+            errors = (length(score[f"error_3d_{kind}_m"]) for kind in ("median", "rmse", "max"))
+            times = f"{score['median_time_s'] / scores.loc['pnp', 'median_time_s']:.1f}"
+            row(*((name, score["frames"]) if k == 0 else ("", "")), f"`{variant}`", score["failed"], *errors, times)
+
+
 def self_calibrated(measure: Measurement) -> None:
     """Frames of a device together: 80 frames of each of five devices, at three levels of knowledge."""
     heading("level", "variant", "failed", "median (95 % interval)", "RMSE (95 % interval)", "NEES (99 % interval)")
@@ -397,7 +419,7 @@ SECTIONS: dict[str, Callable[[Measurement], None]] = {
     section.__name__: section
     for section in (
         *(office200, office20, draws, blur, quickstart, table1, stages, accelerometer, rivals),
-        self_calibrated,
+        *(published_since, self_calibrated),
     )
 }
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from estimator.io.dataset import Dataset, read_dataset, read_frame
     from estimator.io.device import DeviceFrame, frame
     from estimator.methods.registry import estimate, estimate_device, variants
-    from estimator.methods.variant import DeviceMethod, Estimate, Variant
+    from estimator.methods.variant import DeviceMethod, Estimate, Needs, Variant
     from estimator.receiver.receive import receive_frames
 
     __version__: str
@@ -33,6 +33,7 @@ __all__ = [
     "Estimate",
     "EstimationFailure",
     "InputError",
+    "Needs",
     "Scores",
     "Variant",
     "__version__",
@@ -54,6 +55,7 @@ _MODULES = {
     "Estimate": "estimator.methods.variant",
     "EstimationFailure": "estimator.errors",
     "InputError": "estimator.errors",
+    "Needs": "estimator.methods.variant",
     "Scores": "estimator.evaluate.score",
     "Variant": "estimator.methods.variant",
     "estimate": "estimator.methods.registry",

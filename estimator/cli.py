@@ -43,14 +43,17 @@ app = App(
 @app.command
 def variants() -> None:
     """List the variants, a line each, with the package of those that other packages register."""
+    from estimator.methods.catalogue import OWN, PUBLISHED_SINCE
     from estimator.methods.registry import Registry
 
-    registry, usable = Registry.read(), estimator.variants()
+    registry, plugins = Registry.read(), [one for one in estimator.variants() if one.name not in OWN]
+    usable = [*OWN.values(), *plugins]
     width = max(len(variant.name) for variant in usable)
     for variant in usable:
         source = registry.source(variant.name)
+        remark = " (where named)" if variant.name in PUBLISHED_SINCE else source and f" (external: {source})"
         summary = " ".join(variant.summary.split())  # a plug-in's may have several lines
-        print(f"{variant.name:{width}}  {summary}{source and f' (external: {source})'}")
+        print(f"{variant.name:{width}}  {summary}{remark}")
 
 
 @app.command
@@ -69,7 +72,7 @@ def run(
     dataset
         Folder of a dataset.
     variant
-        Variant to run; may be given several times. Default: all variants.
+        Variant to run; may be given several times. Default: all that `estimator variants` does not mark "where named".
     workers
         Number of processes; the estimates do not depend on it.
     centroid_sigma

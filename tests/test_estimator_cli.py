@@ -15,7 +15,7 @@ from conftest import copy_of
 import estimator
 from estimator.cli import _fitting, main
 from estimator.io.estimates import EstimateRow, write_estimates
-from estimator.methods.catalogue import VARIANTS
+from estimator.methods.catalogue import OWN, VARIANTS
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def test_a_centroid_sigma_without_a_use_is_refused(
 
 def test_variants_are_listed_a_line_each(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["variants"]) == 0
-    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == list(VARIANTS)
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == list(OWN)
 
 
 def test_score_prints_a_row_a_variant(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -5,7 +5,7 @@ import itertools
 import pytest
 
 from estimator.errors import InputError
-from estimator.methods.catalogue import VARIANTS, variant_named
+from estimator.methods.catalogue import OWN, variant_named
 from estimator.methods.huynh2016 import AS_PRINTED, DEFAULTS, STAGES, Huynh2016
 from estimator.methods.options import read_options
 
@@ -64,8 +64,8 @@ def test_all_choices_are_file_names() -> None:
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("best", f"variant best: unknown; allowed: {', '.join(VARIANTS)}"),
-        ("best:spot=centroid", f"variant best:spot=centroid: unknown; allowed: {', '.join(VARIANTS)}"),
+        ("best", f"variant best: unknown; allowed: {', '.join(OWN)}"),
+        ("best:spot=centroid", f"variant best:spot=centroid: unknown; allowed: {', '.join(OWN)}"),
         (
             "pnp:spot=centroid",
             "variant pnp:spot=centroid: pnp has no options; those that have: huynh2016, gravity-fit, up2p",
@@ -90,9 +90,9 @@ def test_names_there_are_none_of(name: str, message: str) -> None:
     assert str(error.value) == message
 
 
-@pytest.mark.parametrize("name", VARIANTS)
+@pytest.mark.parametrize("name", OWN)
 def test_plain_names_are_variants(name: str) -> None:
-    assert variant_named(name) is VARIANTS[name]
+    assert variant_named(name) is OWN[name]
 
 
 def test_a_centroid_sigma_is_part_of_the_name() -> None:

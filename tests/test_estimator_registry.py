@@ -14,7 +14,7 @@ import pytest
 from conftest import HANG_S, ROOT, copy_of, started, wait_until
 
 from estimator.cli import main
-from estimator.methods.catalogue import VARIANTS
+from estimator.methods.catalogue import OWN, PUBLISHED_SINCE, VARIANTS
 from estimator.methods.registry import GROUP, Registry
 
 DOCUMENT = Path(__file__).parent.parent / "docs/own_variant.md"
@@ -55,9 +55,10 @@ def test_the_document_s_example_runs_and_is_good(
     install(project["project"]["name"], code, project["project"]["entry-points"][GROUP])
     assert main(["variants"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines] == [*VARIANTS, "turned"]
+    assert [line.split()[0] for line in lines] == [*OWN, "turned"]
     assert lines[-1].endswith("scale the height. (external: turned 0.1)")
     assert "external" not in "".join(lines[:-1])
+    assert [line.split()[0] for line in lines if line.endswith(" (where named)")] == list(PUBLISHED_SINCE)
     folder = copy_of(synthetic_set, tmp_path / "set")
     assert main(["run", str(folder), "--variant", "turned"]) == 0
     found = pq.read_table(folder / "estimates/turned.parquet")["position_m"].to_pylist()
@@ -97,14 +98,14 @@ def test_a_bad_plugin_is_one_line_and_the_others_run(
     install("fine", '"""Fine."""\n\ndef f(frame):\n    """Says nothing.\n\n    At length."""\n', {"fine": "fine:f"})
     assert main(["variants"]) == 0
     output = capsys.readouterr()
-    assert [line.split()[0] for line in output.out.splitlines()] == [*VARIANTS, "fine"]
+    assert [line.split()[0] for line in output.out.splitlines()] == [*OWN, "fine"]
     assert "Says nothing. (external: fine 0.1)" in output.out
     assert output.err.count("\n") == 1
     assert output.err.startswith("estimator: warning: variant ")
     assert words in output.err
     (name,) = entries
     folder = copy_of(synthetic_set, tmp_path / "set")
-    assert main(["run", str(folder), "--variant", name]) == (0 if name in VARIANTS else 2)
+    assert main(["run", str(folder), "--variant", name]) == (0 if name in OWN else 2)
     output = capsys.readouterr()
     assert output.err.count("\n") == 1
 

@@ -50,7 +50,7 @@ def test_poselib_s_two_points_alone_give_the_pose() -> None:
         leds = grid(2, 1, 0.3, (3.5, 3.6, 3.5)) + rng.uniform(-0.1, 0.1, (2, 3))
         view = random_view(rng, leds)
         seen = observe(device(view, 0.0), simulated(view, leds))
-        poses = estimator.methods.up2p._from_pairs(seen)
+        poses = estimator.methods.up2p.pair_poses(seen)
         assert min(np.abs(pose.position_m - view.position_m).max() for pose in poses) < 1e-8
         assert min(np.abs(pose.R_cam_world - view.R_cam_world).max() for pose in poses) < 1e-8
 

@@ -14,7 +14,7 @@ from estimator.evaluate.batch import estimate_dataset, estimate_frame
 from estimator.io.dataset import read_dataset, read_frame
 from estimator.io.device import DeviceFrame
 from estimator.io.estimates import EstimateRow
-from estimator.methods.catalogue import VARIANTS, variant_named
+from estimator.methods.catalogue import OWN, PUBLISHED_SINCE, VARIANTS, variant_named
 from estimator.methods.variant import Estimate, Variant
 from estimator.spots.correspondences import centroids_px, find_correspondences
 from estimator.spots.denoise import DENOISERS
@@ -211,4 +211,7 @@ def test_the_catalogue_keys_are_the_names() -> None:
     rivals = ["yoshino2008", "nakazawa2013", "rahman2011", "kim"]
     fits = ["pnp", "ippe", "sqpnp", "up2p", "gravity-fit", "ml", "self-calibrated"]
     assert list(VARIANTS) == ["huynh2016", "huynh2016-as-printed", *rivals, *fits]
-    assert all(variant.name == name and "\n" not in variant.summary for name, variant in VARIANTS.items())
+    since = ["gopa", "eca-rssr", "r-p3p", "v-p4l", "v-pca", "circle-centre", "lc-vlp"]
+    assert list(PUBLISHED_SINCE) == since
+    assert list(OWN) == [*VARIANTS, *since]
+    assert all(variant.name == name and "\n" not in variant.summary for name, variant in OWN.items())

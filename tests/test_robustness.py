@@ -21,7 +21,7 @@ from estimator.evaluate.batch import estimate_dataset, estimate_frame
 from estimator.io.dataset import read_dataset, read_frame
 from estimator.io.device import Accelerometer, Camera, DecodedSpot, DeviceFrame, DiscLed, Part, Sensor
 from estimator.io.estimates import EstimateRow
-from estimator.methods.catalogue import VARIANTS
+from estimator.methods.catalogue import PUBLISHED_SINCE, VARIANTS
 from estimator.spots.correspondences import find_correspondences
 from estimator.spots.detect import detect
 from estimator.spots.led_light import Readout
@@ -244,6 +244,17 @@ def test_an_answer_is_right_or_a_failure_has_a_name(name: str, variant: str) -> 
     if variant in WRONG_ALWAYS or (variant not in ROBUST and name in MAY_BE_WRONG):
         return
     assert error_m(row, case) < RIGHT_M
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
+def test_the_methods_published_since_answer_or_a_failure_has_a_name(name: str) -> None:
+    """Their answers may be wrong: of tiny LED images, of identities that none of them doubts, of powers that differ."""
+    case, _ = answers(name)
+    for variant in PUBLISHED_SINCE.values():
+        row = estimate_frame(variant, case.frame, 0)
+        assert (row.status == "ok") == (row.position_m is not None)
+        assert "crashed" not in row.reason
 
 
 @pytest.mark.parametrize("variant", sorted(ROBUST))

@@ -31,7 +31,7 @@ def run(
     directory
         Folder of the dataset.
     variants
-        Names of variants, or Variant objects; all registered variants if None.
+        Names of variants, or Variant objects; those that run by default if None.
     workers
         Number of processes; the estimates do not depend on it. More than 1 needs variants given by name.
     progress
@@ -80,7 +80,7 @@ def run(
 
 
 def _chosen(selection: Sequence[str | Variant] | None) -> dict[str, Variant]:
-    """Variants by name, each once; all registered ones for None."""
+    """Variants by name, each once; those that run by default for None."""
     if selection is None:
         found = variants()
     elif isinstance(selection, str):

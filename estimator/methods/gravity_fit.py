@@ -23,7 +23,7 @@ from estimator.io.device import DeviceFrame
 from estimator.methods.centroid_sigma import with_centroid_sigma
 from estimator.methods.pnp import candidates, in_a_plane
 from estimator.methods.up2p import upright_pairs, upright_pose
-from estimator.methods.variant import Estimate, Variant
+from estimator.methods.variant import Estimate, Needs, Variant
 from estimator.solvers.observations import Observations, centroid_images, observe
 from estimator.solvers.robust_fit import Consensus, consensus
 from estimator.solvers.trilateration import determine_orientation
@@ -139,4 +139,5 @@ GRAVITY_FIT = Variant(
     "gravity-fit",
     "reprojection fit of position and orientation, gravity as a prior, wrong LEDs left out, with covariance",
     gravity_fit,
+    needs=Needs(3, optional=("accelerometer", "gyroscope")),
 )

@@ -19,7 +19,7 @@ from estimator.camera.undistort import pinhole_pixels
 from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame
 from estimator.methods.options import read_options
-from estimator.methods.variant import Estimate, Variant
+from estimator.methods.variant import Estimate, Needs, Variant
 from estimator.solvers.ranging import PairLaw, law_of_sines, led_ranges, printed_eq3
 from estimator.solvers.trilateration import position_by_range_fit, position_by_shifted_leds, position_from_ranges
 from estimator.spots.correspondences import centroids_px, find_correspondences, led_positions_m
@@ -90,9 +90,11 @@ HUYNH2016 = Variant(
     "huynh2016",
     "Huynh & Yoo 2016, corrected: denoise, centroids, level by gravity, ranges from pairs, trilateration",
     Huynh2016(**DEFAULTS),
+    needs=Needs(3, sensors=("accelerometer",)),
 )
 HUYNH2016_AS_PRINTED = Variant(
     "huynh2016-as-printed",
     "Huynh & Yoo 2016 as printed: Algorithm 1, brightest pixels, Eq. 6, Eq. 3, LEDs moved in z",
     Huynh2016(**AS_PRINTED),
+    needs=Needs(4, sensors=("accelerometer",)),
 )

@@ -18,7 +18,7 @@ from estimator.camera.leveling import tilt_from_gravity
 from estimator.camera.pose import rotation
 from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame
-from estimator.methods.variant import Estimate, Variant
+from estimator.methods.variant import Estimate, Needs, Variant
 from estimator.solvers.stereo import led_vectors
 from estimator.spots.correspondences import led_positions_m
 
@@ -61,4 +61,9 @@ def position_from_vectors(leds_m: Floats, vectors_m: Floats) -> Floats:
     return np.asarray(led_m - rotation(0.0, 0.0, yaw).T @ vector_m)
 
 
-KIM = Variant("kim", "Kim et al. (Table 3 of Huynh & Yoo 2016): vectors from two parallel level cameras", kim)
+KIM = Variant(
+    "kim",
+    "Kim et al. (Table 3 of Huynh & Yoo 2016): vectors from two parallel level cameras",
+    kim,
+    needs=Needs(2, sensors=("second camera", "accelerometer"), attitude="level"),
+)

@@ -33,7 +33,7 @@ from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame
 from estimator.methods.gravity_fit import agreement_of, ambiguous
 from estimator.methods.up2p import upright_pose
-from estimator.methods.variant import Estimate, Variant
+from estimator.methods.variant import Estimate, Needs, Variant
 from estimator.pixels.initial import START_SIGMA_SHARE, Start, gravity_of, start_at_spots
 from estimator.pixels.led_model import IMAGE_PARAMETERS, PROFILE_PARAMETERS, SIZE_PARAMETER, rim
 from estimator.pixels.led_pixels import LedPixels, LedsInView, gather_led_pixels, leds_in_view
@@ -316,4 +316,5 @@ ML = Variant(
     "ml",
     "maximum likelihood on the pixels: true faces under the pose, Poisson, gravity as a prior, with covariance",
     ml,
+    needs=Needs(2, sizes=True, sensors=("accelerometer",), optional=("gyroscope",)),
 )

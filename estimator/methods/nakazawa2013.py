@@ -15,7 +15,7 @@ value as in `yoshino2008`.
 from estimator.camera.projection import Equidistant, projection_of
 from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame
-from estimator.methods.variant import Estimate, Variant
+from estimator.methods.variant import Estimate, Needs, Variant
 from estimator.solvers.collinearity import position_by_collinearity
 from estimator.spots.correspondences import centroids_px, find_correspondences, led_positions_m
 
@@ -31,5 +31,8 @@ def nakazawa2013(frame: DeviceFrame) -> Estimate:
 
 
 NAKAZAWA2013 = Variant(
-    "nakazawa2013", "Nakazawa et al. 2013: collinearity equations, a fish-eye lens, no gravity", nakazawa2013
+    "nakazawa2013",
+    "Nakazawa et al. 2013: collinearity equations, a fish-eye lens, no gravity",
+    nakazawa2013,
+    needs=Needs(4, sensors=("fish-eye lens",)),
 )

@@ -18,7 +18,7 @@ from estimator.camera.undistort import pinhole_pixels
 from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame, normalized
 from estimator.io.records import is_covariance
-from estimator.methods.variant import Estimate, Variant
+from estimator.methods.variant import Estimate, Needs, Variant
 from estimator.solvers.observations import observe
 from estimator.solvers.ordinary_covariance import ordinary_covariance
 from estimator.solvers.shutter_motion import motion_prior
@@ -137,6 +137,17 @@ def candidates(model: Floats, image: Floats, method: int, refined: bool) -> list
     return poses
 
 
-PNP = Variant("pnp", "perspective-n-point (SQPNP, IPPE, Levenberg-Marquardt) on raw centroids, no gravity", pnp)
-IPPE = Variant("ippe", "perspective-n-point for LEDs in a plane: IPPE, Levenberg-Marquardt, no gravity", ippe)
-SQPNP = Variant("sqpnp", "perspective-n-point: SQPNP, Levenberg-Marquardt, no gravity", sqpnp)
+FOUR_LEDS = Needs(4, optional=("gyroscope",))
+PNP = Variant(
+    "pnp",
+    "perspective-n-point (SQPNP, IPPE, Levenberg-Marquardt) on raw centroids, no gravity",
+    pnp,
+    needs=FOUR_LEDS,
+)
+IPPE = Variant(
+    "ippe",
+    "perspective-n-point for LEDs in a plane: IPPE, Levenberg-Marquardt, no gravity",
+    ippe,
+    needs=FOUR_LEDS,
+)
+SQPNP = Variant("sqpnp", "perspective-n-point: SQPNP, Levenberg-Marquardt, no gravity", sqpnp, needs=FOUR_LEDS)

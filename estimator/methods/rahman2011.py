@@ -18,7 +18,7 @@ import numpy as np
 
 from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame
-from estimator.methods.variant import Estimate, Variant
+from estimator.methods.variant import Estimate, Needs, Variant
 from estimator.solvers.stereo import led_vectors
 from estimator.solvers.trilateration import position_from_ranges
 from estimator.spots.correspondences import led_positions_m
@@ -35,4 +35,9 @@ def rahman2011(frame: DeviceFrame) -> Estimate:
         raise EstimationFailure(failure.stage, failure.why, ranges_m) from None
 
 
-RAHMAN2011 = Variant("rahman2011", "Rahman et al. 2011: ranges from two parallel cameras, least squares", rahman2011)
+RAHMAN2011 = Variant(
+    "rahman2011",
+    "Rahman et al. 2011: ranges from two parallel cameras, least squares",
+    rahman2011,
+    needs=Needs(3, sensors=("second camera",)),
+)

@@ -16,7 +16,7 @@ from estimator.errors import EstimationFailure, InputError
 from estimator.io.device import DeviceFrame
 from estimator.io.estimates import NAME
 from estimator.io.records import first_line
-from estimator.methods.catalogue import VARIANTS, variant_named
+from estimator.methods.catalogue import OWN, VARIANTS, variant_named
 from estimator.methods.variant import Estimate, Variant
 from estimator.receiver.receive import with_identities
 
@@ -43,7 +43,7 @@ class Registry:
         problems = []
         for name in dict.fromkeys(name for name, _ in found):
             points = [point for (of_name, _), point in found.items() if of_name == name]
-            if name in VARIANTS:
+            if name in OWN:
                 problems += [f"{_title(point)}: not used, the estimator has a variant of that name" for point in points]
             elif not re.fullmatch(NAME, name) or OPTIONS in name:
                 problems += [f"{_title(point)}: not used, the name may hold A-Z a-z 0-9 . _ , + -" for point in points]
@@ -58,12 +58,12 @@ class Registry:
         """The variant of a name; a plug-in is imported. Raises InputError."""
         if name in self.plugins:
             return _load(self.plugins[name])
-        if name.split(OPTIONS)[0] not in VARIANTS:
-            raise InputError(f"variant {name}: unknown; allowed: {', '.join([*VARIANTS, *self.plugins])}")
+        if name.split(OPTIONS)[0] not in OWN:
+            raise InputError(f"variant {name}: unknown; allowed: {', '.join([*OWN, *self.plugins])}")
         return variant_named(name)
 
     def all(self) -> tuple[list[Variant], tuple[str, ...]]:
-        """This package's own variants and every usable plug-in, and a message for each plug-in that cannot be used."""
+        """Variants that run by default, plug-ins among them, and a message for each plug-in that cannot be used."""
         variants, problems = list(VARIANTS.values()), list(self.problems)
         for name in self.plugins:
             try:
@@ -78,9 +78,10 @@ class Registry:
 
 
 def variants() -> list[Variant]:
-    """All variants: this package's own, then the usable plug-ins of other packages.
+    """Variants that run by default: most of this package's own, then the usable plug-ins of other packages.
 
-    A plug-in that cannot be used is left out, with a warning in the log.
+    A plug-in that cannot be used is left out, with a warning in the log. The methods published since the paper
+    (docs/rivals.md) run where they are named.
 
     Returns
     -------

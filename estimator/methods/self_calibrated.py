@@ -20,7 +20,7 @@ from estimator.camera.undistort import has_pinhole_image
 from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame
 from estimator.methods.gravity_fit import agreement, agreement_of, ambiguous
-from estimator.methods.variant import DeviceMethod, Estimate, Variant
+from estimator.methods.variant import DeviceMethod, Estimate, Needs, Variant
 from estimator.solvers.device_equations import DeviceView
 from estimator.solvers.observations import MIN_CENTROID_SIGMA_PX, Observations, observe
 from estimator.solvers.robust_fit import Consensus
@@ -117,4 +117,5 @@ SELF_CALIBRATED = Variant.over_device(
     "self-calibrated",
     "all frames of a device at once: gravity-fit with the errors of camera, accelerometer and map as unknowns",
     DeviceMethod(fit_frame, fit_device),
+    Needs(3, optional=("accelerometer", "gyroscope")),
 )

@@ -22,7 +22,7 @@ from estimator.camera.pose import Pose, rotation
 from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame
 from estimator.methods.centroid_sigma import with_centroid_sigma
-from estimator.methods.variant import Estimate, Variant
+from estimator.methods.variant import Estimate, Needs, Variant
 from estimator.solvers.observations import Observations, observe
 from estimator.solvers.robust_fit import consensus
 from estimator.solvers.trilateration import determine_orientation
@@ -51,9 +51,14 @@ def up2p(frame: DeviceFrame, centroid_sigma_px: float = 0.0) -> Estimate:
 
     `centroid_sigma_px` is the standard deviation of centroids by errors that the device does not state.
     """
+    check_poselib()
+    return fit_correspondences(frame, find_correspondences(frame), centroid_sigma_px)
+
+
+def check_poselib() -> None:
+    """Raise EstimationFailure if PoseLib is not installed."""
     if poselib is None:
         raise EstimationFailure("up2p", "PoseLib is not installed (pip install vlcrender[poselib])")
-    return fit_correspondences(frame, find_correspondences(frame), centroid_sigma_px)
 
 
 def fit_correspondences(
@@ -63,14 +68,14 @@ def fit_correspondences(
     if frame.accelerometer is None:
         raise EstimationFailure("leveling", "the device has no accelerometer")
     observations = observe(frame, correspondences, centroid_sigma_px)
-    starts = _from_pairs(observations)
+    starts = pair_poses(observations)
     if determine_orientation(observations.leds_m) and not observations.displaced:
         observations = observations.without_gravity()
     agreed = consensus(observations, starts[:1], lambda: [*starts[1:], *upright_pairs(observations)])
     return Estimate(agreed.best.pose.position_m, covariance_m2=agreed.covariance_m2)
 
 
-def _from_pairs(observations: Observations) -> list[Pose]:
+def pair_poses(observations: Observations) -> list[Pose]:
     """Poses from two spots each with the smallest truncated reprojection errors of all spots, best first."""
     level, above = _leveled(observations)
     tilt_x, tilt_y = observations.tilt_rad.tolist()
@@ -162,5 +167,8 @@ def up2p_with(name: str) -> Variant:
 
 
 UP2P = Variant(
-    "up2p", "PoseLib's upright two-point solver in RANSAC, tilt from gravity, then a fit of the spots that agree", up2p
+    "up2p",
+    "PoseLib's upright two-point solver in RANSAC, tilt from gravity, then a fit of the spots that agree",
+    up2p,
+    needs=Needs(3, sensors=("accelerometer",), optional=("gyroscope",)),
 )

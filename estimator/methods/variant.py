@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,18 +49,38 @@ class DeviceMethod:
 
 
 @dataclass(frozen=True)
+class Needs:
+    """What a method needs of a frame."""
+
+    leds: int
+    """Smallest number of identified LEDs."""
+    faces: Literal["any", "disc", "square"] = "any"
+    """Shape that the face of each LED has to have, or of one LED for `square`."""
+    sizes: bool = False
+    """Whether the map has to say the sizes of the LEDs."""
+    sensors: tuple[Literal["accelerometer", "second camera", "fish-eye lens"], ...] = ()
+    """Sensors beside one camera that have to be there."""
+    optional: tuple[Literal["accelerometer", "gyroscope"], ...] = ()
+    """Sensors whose readings are used where they are there."""
+    attitude: Literal["any", "level"] = "any"
+    """Attitude of the camera that the method allows."""
+
+
+@dataclass(frozen=True)
 class Variant:
     """A positioning method under a name, with a summary of one line; `estimate` raises EstimationFailure.
 
-    A variant that uses all frames of a device has them by `of_device`; its `estimate` uses the one frame alone.
+    A variant that uses all frames of a device has them by `of_device`; its `estimate` uses the one frame alone. `needs`
+    is None where they are not stated.
     """
 
     name: str
     summary: str
     estimate: Callable[[DeviceFrame], Estimate]
     of_device: DeviceMethod | None = None
+    needs: Needs | None = None
 
     @classmethod
-    def over_device(cls, name: str, summary: str, method: DeviceMethod) -> "Variant":
+    def over_device(cls, name: str, summary: str, method: DeviceMethod, needs: Needs | None = None) -> "Variant":
         """The variant of a method over all frames of a device."""
-        return cls(name, summary, method.alone, method)
+        return cls(name, summary, method.alone, method, needs)

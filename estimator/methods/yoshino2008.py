@@ -15,7 +15,7 @@ from estimator.camera.projection import Perspective, projection_of
 from estimator.camera.undistort import pinhole_image
 from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame
-from estimator.methods.variant import Estimate, Variant
+from estimator.methods.variant import Estimate, Needs, Variant
 from estimator.solvers.collinearity import position_by_collinearity
 from estimator.spots.correspondences import centroids_px, find_correspondences, led_positions_m
 
@@ -30,5 +30,8 @@ def yoshino2008(frame: DeviceFrame) -> Estimate:
 
 
 YOSHINO2008 = Variant(
-    "yoshino2008", "Yoshino et al. 2008: collinearity equations, one normal lens, no gravity", yoshino2008
+    "yoshino2008",
+    "Yoshino et al. 2008: collinearity equations, one normal lens, no gravity",
+    yoshino2008,
+    needs=Needs(4),
 )

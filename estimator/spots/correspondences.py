@@ -23,8 +23,8 @@ RAW = DENOISERS["none"]
 MAX_STEADY_OFF = 0.2
 
 
-def find_correspondences(frame: DeviceFrame, denoiser: Denoiser = RAW) -> list[Correspondence]:
-    """Spots in a frame that are identified as LEDs.
+def find_correspondences(frame: DeviceFrame, denoiser: Denoiser = RAW, cut_too: bool = False) -> list[Correspondence]:
+    """Spots in a frame that are identified as LEDs, with `cut_too` also those that a region's border may cut.
 
     Under a rolling shutter, spots of LED images with stripes are the centres of their outlines
     (`estimator.spots.striped`), without denoising, which would mix lines. Raises EstimationFailure if no LED is
@@ -36,10 +36,10 @@ def find_correspondences(frame: DeviceFrame, denoiser: Denoiser = RAW) -> list[C
 
     def identified() -> tuple[Correspondence, ...]:
         spots = _striped(frame) if striped else _detected(frame, denoiser)
-        return identify(spots, frame.spots, frame.leds, _gate_px(frame, denoiser))
+        return identify(spots, frame.spots, frame.leds, _gate_px(frame, denoiser), cut_too)
 
     # The reference does not keep the frame, which holds the results, and no other frame equals it.
-    return list(frame.once(("correspondences", denoiser, weakref.ref(frame)), identified))
+    return list(frame.once(("correspondences", denoiser, cut_too, weakref.ref(frame)), identified))
 
 
 def _gate_px(frame: DeviceFrame, denoiser: Denoiser) -> float:

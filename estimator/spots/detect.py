@@ -65,7 +65,8 @@ class Spot:
     `covariance_px2` (2, 2) is the centroid's covariance by the pixels' noise. The brightest pixel is given by its
     centre; in a flat or clipped LED image noise decides which it is, and of equal ones the first, row by row, is taken.
     `area_px` are the pixels above half level. `touches_border` marks an LED image that may be cut by the border of its
-    region, which biases the centroid; `saturated` one with a pixel that is or may be saturated.
+    region, which biases the centroid; `saturated` one with a pixel that is or may be saturated. `flux_e` is the sum of
+    its light, electrons; NaN where it was not measured.
     """
 
     u_px: float
@@ -77,6 +78,7 @@ class Spot:
     peak_e: float
     touches_border: bool
     saturated: bool
+    flux_e: float = math.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -350,5 +352,6 @@ def _measure(readout: Readout, ellipse: Ellipse, others: list[Ellipse], denoise_
         peak_e=float(light.electrons[brightest]),
         touches_border=bool((low < 0).any() or high[0] > width_px or high[1] > height_px),
         saturated=bool(readout.clipped[light.roi][inside].any()),
+        flux_e=light.flux_e,
     )
     return _Measured(spot, moments, light.moment_sigmas_px2(centroid, moments))

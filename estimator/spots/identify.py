@@ -34,15 +34,19 @@ def gate_px(width_px: int) -> float:
 
 
 def identify(
-    spots: Sequence[Spot], decoded: Sequence[DecodedSpot], leds: Mapping[int, Led], gate_px: float
+    spots: Sequence[Spot],
+    decoded: Sequence[DecodedSpot],
+    leds: Mapping[int, Led],
+    gate_px: float,
+    cut_too: bool = False,
 ) -> tuple[Correspondence, ...]:
     """Match spots and decoded identities one to one; the result is in the order of `decoded`.
 
     An identity is assigned its nearest spot, at most `gate_px` away, unless another spot is within CLEARANCE times that
     distance, another identity has the same nearest spot, or one without a spot lies in this one: a merged blob is
     assigned to no LED. Spots that touch the image's border take part, so that their identity is not assigned to another
-    spot, and are then left out because their centroid is biased. Raises EstimationFailure, with the number of
-    identities by cause, if no correspondence is left.
+    spot, and are then left out because their centroid is biased; with `cut_too` they stay, and may be further away by
+    their radius. Raises EstimationFailure, with the number of identities by cause, if no correspondence is left.
     """
     if not decoded:
         raise EstimationFailure("identify", "no identity was decoded")
@@ -50,7 +54,9 @@ def identify(
     decoded_px = np.array([(identity.u_px, identity.v_px) for identity in decoded])
     distance_px = np.linalg.norm(decoded_px[:, None] - spots_px[None], axis=2)
     nearest = np.argmin(distance_px, axis=1)
-    inside = distance_px.min(axis=1) <= gate_px
+    # The centroid of a cut LED image may be off by its radius.
+    off_px = [np.sqrt(spot.area_px / np.pi) if cut_too and spot.touches_border else 0.0 for spot in spots]
+    inside = distance_px.min(axis=1) <= (gate_px + np.array(off_px))[nearest]
     identities_of_spot = np.bincount(nearest[inside], minlength=len(spots))
     half_length_px = MERGED_RADII * np.sqrt([spot.area_px / np.pi for spot in spots])
     identities_of_spot += (distance_px[~inside] < half_length_px).sum(axis=0)
@@ -64,7 +70,7 @@ def identify(
             beyond += 1
         elif not clear:
             unclear += 1
-        elif spot.touches_border:
+        elif spot.touches_border and not cut_too:
             cut += 1
         else:
             correspondences.append(Correspondence(leds[identity.led], spot))
