@@ -526,9 +526,9 @@ def test_lines_of_the_room_have_their_own_pose(office: Scene, small_camera: Came
 def test_edges_of_leds_are_those_of_their_line_s_pose(sending: Scene, small_camera: Camera, direction: str) -> None:
     """Lines of an LED's light, over its brightest, against cameras at rest at the poses of the lines.
 
-    Between knots 1/8 px apart, of a coverage with a kink at which its slope changes by 1 a pixel, interpolation errs by a
-    quarter of 1/8 px at most; where the edge is not along the lines, the coverage has no kink. The relative illumination
-    changes by less than 1e-3 in 1/8 px.
+    Between knots 1/8 px apart, of a coverage with a kink at which its slope changes by 1 a pixel, interpolation errs by
+    a quarter of 1/8 px at most; where the edge is not along the lines, the coverage has no kink. The relative
+    illumination changes by less than 1e-3 in 1/8 px.
     """
     camera = Camera(**{**small_camera.model_dump(), "shutter": rolling(direction, 100.0)})
     (mounted,) = mounted_cameras(camera, ())

@@ -21,9 +21,9 @@ STEP_PX = 0.5
 """Largest motion of an image point from one pose to the next, pixels. The midpoint rule then smooths an edge by at most
 (1/4 px) / sqrt(3) in addition to the pixel's own area."""
 KNOTS_A_STEP = 4
-"""Knots of a rolling readout for each STEP_PX of motion. An edge pixel then errs by at most a quarter of the 1/8 px between
-two knots, at a kink of its coverage: 3 % of its light, and 1 % rms. At 1/2 px the errors of edge pixels exceed their shot
-noise at some 1000 electrons, and a position by all pixels errs by twice its bound."""
+"""Knots of a rolling readout for each STEP_PX of motion. Of 1/8 px between two knots, a pixel of an edge errs by a
+quarter at most, 3 % of the LED's light, where its coverage has a kink. With 1/2 px such errors exceed the shot noise of
+LEDs of some 1000 electrons."""
 MAX_STEPS = 2000
 """Largest number of poses in an exposure, or of steps in a readout."""
 MAX_LINE_PX = 0.5
