@@ -113,8 +113,11 @@ def ml(frame: DeviceFrame) -> Estimate:
     """The most likely position and its covariance; raises EstimationFailure.
 
     The initial pose is that of `gravity_fit`, which also decides whether the estimate is ambiguous and whether gravity
-    is used. With two spots the initial pose is the fit to them and gravity. LEDs without a size have no model.
+    is used. With two spots the initial pose is the fit to them and gravity. LEDs without a size have no model, nor has
+    the noise of a sensor without a gain, such as a photograph's.
     """
+    if frame.sensor.gain_e_per_dn is None:
+        raise EstimationFailure("fit", "the sensor states no gain, so that the noise of its pixels is not known")
     if not all(led.has_size for led in frame.leds.values()):
         raise EstimationFailure("fit", "the map does not say how large its LEDs are")
     frame = with_known_gains(frame)
