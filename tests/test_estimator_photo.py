@@ -235,6 +235,20 @@ def test_a_lamp_that_the_border_cuts_is_used_by_its_visible_part(folder: Path, t
     assert error @ np.linalg.solve(answer(found).covariance, error) < chi2.isf(1e-3, 3)
 
 
+@pytest.mark.slow
+def test_a_faded_lamp_whose_lines_are_cut_is_left_out(folder: Path, tmp_path: Path) -> None:
+    """The isophotes of a lamp with its centre 14 px beside the left border end at the border."""
+    places = {hz: (x * (1.1 if hz == 3500 else 1.0), y) for hz, (x, y) in LAMPS_CM.items()}
+    u_px = pixels_of(np.array(list(places.values())), 0.5)[:, 0].min()
+    shift_cm = (u_px - 14.0) / FOCAL_PX * (HEIGHT_CM - POSITION_CM[2])
+    position_cm = (POSITION_CM[0] + shift_cm, *POSITION_CM[1:])
+    write_picture(tmp_path / "cut.png", photograph(places, position_cm=position_cm))
+    table = read_led_table(write_map(tmp_path / "map.csv", places), "cm")
+    found = locate(tmp_path / "cut.png", table, None, LEVEL, KNOWN)
+    assert len(found.solved.spots) == 4
+    assert [row[-1] for row in lamp_rows(found, table)].count("cut by the border too much, left out") == 1
+
+
 def test_ml_says_why_it_does_not_answer(located: Located) -> None:
     assert answer(located, "ml").failure == (
         "fit: the sensor states no gain, so that the noise of its pixels is not known"
