@@ -5,8 +5,8 @@
 Sections: `waves` (integrals of the waves against numerical ones), `codes` (parts of codes that are found twice),
 `flicker` (modulation against IEEE 1789), `burst_cost` (time of a further frame of a burst), `bit_errors` (against
 theory), `identities` (decoded from codes), `panels` (decoded from packets; packets found in random chips),
-`motion` (positions by a rolling shutter in motion), `striped` (centres of striped LED images), `tones` (frequencies of
-LED images), `photograph` (a real one; its path is given by --photograph).
+`motion` (positions by a rolling shutter in motion), `striped` (centres of striped LED images), `cut` (those that the
+border cuts), `tones` (frequencies of LED images), `photograph` (a real one; its path is given by --photograph).
 """
 
 import argparse
@@ -185,6 +185,11 @@ def striped(chosen: Chosen) -> None:
     measure_striped.print_centres(chosen.measurement)
 
 
+def cut(chosen: Chosen) -> None:
+    """Centres of lamps that the border of the picture cuts, px."""
+    measure_striped.print_cut()
+
+
 def tones(chosen: Chosen) -> None:
     """Frequencies of tones in an LED image."""
     measure_striped.print_tones()
@@ -208,6 +213,7 @@ SECTIONS: dict[str, Callable[[Chosen], None]] = {
         panels,
         motion,
         striped,
+        cut,
         tones,
         photograph,
     )

@@ -218,10 +218,10 @@ def test_a_saved_dataset_is_read_and_estimated_as_any_other(
 @pytest.mark.slow
 @pytest.mark.parametrize("bell", [True, False])
 def test_a_lamp_that_the_border_cuts_is_used_by_its_visible_part(folder: Path, tmp_path: Path, bell: bool) -> None:
-    """The uppermost lamp's centre is 17 px below the border, half of its radius."""
+    """The uppermost lamp's centre is 24 px below the border, of a radius of 34 px."""
     places = {hz: (x, y * (1.09 if y < 0 else 1.0)) for hz, (x, y) in LAMPS_CM.items()}
     v_px = pixels_of(np.array(list(places.values())), 0.5)[:, 1]
-    shift_cm = (v_px.min() - 17.0) / FOCAL_PX * (HEIGHT_CM - POSITION_CM[2])
+    shift_cm = (v_px.min() - 24.0) / FOCAL_PX * (HEIGHT_CM - POSITION_CM[2])
     position_cm = (POSITION_CM[0], POSITION_CM[1] + shift_cm, POSITION_CM[2])
     write_picture(tmp_path / "cut.png", photograph(places, bell=bell, position_cm=position_cm))
     table = read_led_table(write_map(tmp_path / "map.csv", places), "cm")

@@ -295,7 +295,8 @@ def _check_fit(frame: DeviceFrame, answers: Sequence[Answer]) -> Floats:
     """Distances (n,) of the spots from the best variant's model, pixels; refuses a map that fits none of them."""
     usable = [answer for answer in answers if answer.residuals_px is not None]
     if not usable:
-        why = "; ".join(dict.fromkeys(answer.failure for answer in answers))
+        # Of a photograph's pixels `ml` never has a position: the reason is not in the picture.
+        why = "; ".join(dict.fromkeys(answer.failure for answer in answers if answer.variant != "ml"))
         raise EstimationFailure("position", f"no variant has a position ({why})")
     limit_px = _limit_px(frame)
     distances = [np.linalg.norm(one.residuals_px, axis=1) for one in usable if one.residuals_px is not None]

@@ -52,8 +52,10 @@ SMOOTHING_PX = 5
 MAX_BLUR = 0.15
 # Share of the edges that a single LED image leaves at most: more are of two LED images, or of none.
 MAX_OUTLIERS = 0.35
-# The centre of a cut outline is this share of its half extent inside the region: the visible part then tells it.
+# The centre of a cut outline is this share of its larger half extent inside the region: the visible part then tells it.
+# Isophotes scatter by their stripes, and end where a stripe does: docs/measure_downlink.py cut.
 MIN_ARC = 0.25
+MIN_FADED_ARC = 0.6
 # The root mean square of the inliers' residuals of an LED image, as a share of its half extent.
 MAX_RESIDUAL = 0.06
 
@@ -190,7 +192,7 @@ def _lamp(
     high = centre + extent + (blob.left, blob.top)
     size = turned.electrons.shape[::-1]
     touches = bool((low < 0).any() or (high > size).any())
-    at, least = centre + (blob.left, blob.top), MIN_ARC * extent
+    at, least = centre + (blob.left, blob.top), (MIN_ARC if uniform else MIN_FADED_ARC) * extent.max()
     inside = bool(((at > least) & (at < size - least)).all())
     # Edges need both ends of a line; isophotes would take the border for one.
     lines_cut = (blob.left == 0 and blob.own[:, 0].any()) or (blob.right == size[0] and blob.own[:, -1].any())
