@@ -5,8 +5,8 @@
 Sections: `waves` (integrals of the waves against numerical ones), `codes` (parts of codes that are found twice),
 `flicker` (modulation against IEEE 1789), `burst_cost` (time of a further frame of a burst), `bit_errors` (against
 theory), `identities` (decoded from codes), `panels` (decoded from packets; packets found in random chips),
-`motion` (positions by a rolling shutter in motion), `striped` (centres of striped LED images), `tones` (frequencies of
-LED images), `photograph` (a real one; its path is given by --photograph).
+`motion` (positions by a rolling shutter in motion), `striped` (centres of striped LED images), `cut` (those that the
+border cuts), `tones` (frequencies of LED images), `photograph` (a real one; its path is given by --photograph).
 """
 
 import argparse
@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from time import perf_counter
+from time import perf_counter, process_time
 
 import measure_motion
 import measure_receiver
@@ -132,10 +132,10 @@ def flicker(chosen: Chosen) -> None:
 
 
 def burst_cost(chosen: Chosen) -> None:
-    """Time of a further frame of a burst over that of the first, in one process; recipe downlink_codes, no bound."""
+    """CPU time (wall time) of a further frame of a burst over that of the first; recipe downlink_codes, no bound."""
     plan = vr.load_recipe("downlink_codes")
     burst = Burst(frames=1 + FURTHER_FRAMES, frame_rate_hz=30.0)
-    heading("what is read out", "bursts", "first frame", "a further frame", "ratio (median; smallest to largest)")
+    heading("what is read out", "bursts", "first frame", "a further frame", "ratio (smallest to largest); wall")
     for name, regions in (("full frame", None), ("regions of LEDs", plan.recipe.regions)):
         recipe = plan.recipe.model_copy(update={"burst": burst, "bound": False, "regions": regions})
         with TemporaryDirectory(dir=chosen.measurement.out) as folder:
@@ -143,15 +143,17 @@ def burst_cost(chosen: Chosen) -> None:
                 (Path(folder) / part).mkdir()
             settings = plan.scene.settings.model_dump_json()
             job = Job(recipe.model_dump_json(), settings, str(plan.scene.folder), folder)
-            seconds = np.zeros((1 + BURSTS, burst.frames))
-            for number in np.ndindex(seconds.shape):
-                start = perf_counter()
+            seconds = np.zeros((1 + BURSTS, burst.frames, 2))
+            for number in np.ndindex(seconds.shape[:2]):
+                start = process_time(), perf_counter()
                 make_frame(job, number[0] * burst.frames + number[1])
-                seconds[number] = perf_counter() - start
+                seconds[number] = np.subtract((process_time(), perf_counter()), start)
         first, further = seconds[1:, 0], seconds[1:, 1:].mean(axis=1)  # the first burst compiles kernels
         ratios = further / first
-        own = [f"{np.median(first):.2f} s", f"{np.median(further):.2f} s"]
-        row(name, BURSTS, *own, f"{np.median(ratios):.2f} ({ratios.min():.2f} to {ratios.max():.2f})")
+        cpu, wall = np.median(ratios, axis=0)
+        own = [f"{np.median(some[:, 0]):.2f} s" for some in (first, further)]
+        ends = f"{ratios[:, 0].min():.2f} to {ratios[:, 0].max():.2f}"
+        row(name, BURSTS, *own, f"{cpu:.2f} ({ends}); {wall:.2f}")
 
 
 def motion(chosen: Chosen) -> None:
@@ -185,6 +187,11 @@ def striped(chosen: Chosen) -> None:
     measure_striped.print_centres(chosen.measurement)
 
 
+def cut(chosen: Chosen) -> None:
+    """Centres of lamps that the border of the picture cuts, px."""
+    measure_striped.print_cut()
+
+
 def tones(chosen: Chosen) -> None:
     """Frequencies of tones in an LED image."""
     measure_striped.print_tones()
@@ -208,6 +215,7 @@ SECTIONS: dict[str, Callable[[Chosen], None]] = {
         panels,
         motion,
         striped,
+        cut,
         tones,
         photograph,
     )

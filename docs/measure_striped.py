@@ -43,6 +43,9 @@ CASES: tuple[tuple[str, tuple[float, float, float], bool, tuple[float, float, fl
 RENDERED_POSES = 20
 TONE_TIMINGS = (((10.0, 40.0), 58), ((10.0, 40.0), 120), ((21.03, 60.0), 85))
 TONES = 300
+CUT_RADIUS_PX = 30.0
+CUT_INSIDE_PX = (3.0, 9.0, 15.0, 24.0)
+CUT_IMAGES = 100
 
 
 def print_centres(measurement: Measurement) -> None:
@@ -171,6 +174,49 @@ def _print_rendered(measurement: Measurement) -> None:
     figure("with one spot", f"{single}, {single / max(whole, 1):.4f}")
     u, v = np.sqrt((np.array(off) ** 2).mean(axis=0))
     figure("rms u, v against the true centroid, px; NEES (expected 2)", f"{u:.4f}, {v:.4f}; {np.mean(nees):.2f}")
+
+
+def print_cut() -> None:
+    """Centres of lamps of CUT_RADIUS_PX that the border cuts: uniform discs of 1 000 electrons, and lamps that fade to
+    their rim, in codes of a picture with sRGB's curve.
+    """
+    heading("lamp", "border", "centre inside by", "found", "measured", "rms u", "rms v", "NEES (expected 2)")
+    for faded in (False, True):
+        for side in ("across the lines", "along the lines"):
+            for inside_px in CUT_INSIDE_PX:
+                _print_cut(faded, side, inside_px)
+
+
+def _print_cut(faded: bool, side: str, inside_px: float) -> None:
+    rng, size = np.random.default_rng([3, faded, round(inside_px)]), 4 * round(CUT_RADIUS_PX)
+    found, off, nees = 0, [], []
+    for _ in range(CUT_IMAGES):
+        near, middle = inside_px + rng.uniform(-0.5, 0.5), size / 2 + rng.uniform(-0.5, 0.5)
+        centre = np.array([middle, near] if side == "across the lines" else [near, middle])
+        gains = _gains(np.array([1.0, 0.0]), 200.0, np.arange(size) * 25 + 1e4 * rng.random(), 60.0)
+        if faded:
+            x, y = np.meshgrid(np.arange(size) + 0.5 - centre[0], np.arange(size) + 0.5 - centre[1])
+            light = 1.6 * np.exp(-3 * (x**2 + y**2) / CUT_RADIUS_PX**2) * gains[:, None]
+            light = np.clip(light + 0.002 + 0.002 * rng.standard_normal(light.shape), 0, 1)
+            coded = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+            image = np.rint(255 * coded).astype(np.float32)
+            readout = Readout(0, 0, image, image, image >= 254, 2.0)
+        else:
+            covered = _coverage(size, centre, (CUT_RADIUS_PX, CUT_RADIUS_PX, 0.0), square=False)
+            image, clipped = _exposed(500.0 * covered * gains[:, None], 1000.0, np.inf, rng)
+            readout = Readout(0, 0, image, image, clipped, READ_NOISE_E**2)
+        lamps = find_lamps([readout], "rows", 260 / 25, SENSOR_PX)
+        found += len(lamps) == 1
+        if len(lamps) == 1 and lamps[0].measured:
+            error = np.array([lamps[0].u_px, lamps[0].v_px]) - centre
+            off.append(error)
+            nees.append(error @ np.linalg.solve(lamps[0].covariance_px2, error))
+    first = ["faded" if faded else "disc", side, f"{inside_px:g} px", f"{found} of {CUT_IMAGES}", len(off)]
+    if not off:
+        row(*first, "", "", "")
+        return
+    u, v = np.sqrt((np.array(off) ** 2).mean(axis=0))
+    row(*first, f"{u:.3f}", f"{v:.3f}", f"{np.mean(nees):.2f}")
 
 
 def print_tones() -> None:

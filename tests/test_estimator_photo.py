@@ -10,6 +10,7 @@ import pytest
 from photographs import (
     EXPOSURE_S,
     FOCAL_PX,
+    HEIGHT_CM,
     LAMPS_CM,
     LINE_RATE_HZ,
     POSITION_CM,
@@ -27,6 +28,7 @@ from estimator.errors import EstimationFailure, InputError
 from estimator.photo.attitude import attitude
 from estimator.photo.led_table import read_led_table
 from estimator.photo.locate import Located, Options, locate
+from estimator.photo.report import lamp_rows
 from estimator.photo.session import exposure_s
 from estimator.photo.solve import Answer
 
@@ -207,10 +209,50 @@ def test_a_saved_dataset_is_read_and_estimated_as_any_other(
     x, y, z = POSITION_CM
     # The saved map is right-handed, in metres: the world of the photograph as it was made.
     assert 100 * est.estimate(frame, "gravity-fit").position_m == pytest.approx([x, y, z], abs=3.0)
-    with pytest.raises(EstimationFailure, match="how large its LEDs are"):
+    with pytest.raises(EstimationFailure, match="states no gain"):
         est.estimate(frame, "ml")
     assert main(arguments) == 2
     assert "is there already" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("bell", [True, False])
+def test_a_lamp_that_the_border_cuts_is_used_by_its_visible_part(folder: Path, tmp_path: Path, bell: bool) -> None:
+    """The uppermost lamp's centre is 24 px below the border, of a radius of 34 px."""
+    places = {hz: (x, y * (1.09 if y < 0 else 1.0)) for hz, (x, y) in LAMPS_CM.items()}
+    v_px = pixels_of(np.array(list(places.values())), 0.5)[:, 1]
+    shift_cm = (v_px.min() - 24.0) / FOCAL_PX * (HEIGHT_CM - POSITION_CM[2])
+    position_cm = (POSITION_CM[0], POSITION_CM[1] + shift_cm, POSITION_CM[2])
+    write_picture(tmp_path / "cut.png", photograph(places, bell=bell, position_cm=position_cm))
+    table = read_led_table(write_map(tmp_path / "map.csv", places), "cm")
+    found = locate(tmp_path / "cut.png", table, None, LEVEL, KNOWN)
+    cut = [one for one in found.lamps if one.lamp.touches_border]
+    assert len(cut) >= 1
+    assert len(found.solved.spots) == 5
+    rows = lamp_rows(found, table)
+    assert [row[-1] for row in rows].count("cut by the border; centre by the visible part") == len(cut)
+    error = answer(found).position - np.array(position_cm)
+    assert error @ np.linalg.solve(answer(found).covariance, error) < chi2.isf(1e-3, 3)
+
+
+@pytest.mark.slow
+def test_a_faded_lamp_whose_lines_are_cut_is_left_out(folder: Path, tmp_path: Path) -> None:
+    """The isophotes of a lamp with its centre 14 px beside the left border end at the border."""
+    places = {hz: (x * (1.1 if hz == 3500 else 1.0), y) for hz, (x, y) in LAMPS_CM.items()}
+    u_px = pixels_of(np.array(list(places.values())), 0.5)[:, 0].min()
+    shift_cm = (u_px - 14.0) / FOCAL_PX * (HEIGHT_CM - POSITION_CM[2])
+    position_cm = (POSITION_CM[0] + shift_cm, *POSITION_CM[1:])
+    write_picture(tmp_path / "cut.png", photograph(places, position_cm=position_cm))
+    table = read_led_table(write_map(tmp_path / "map.csv", places), "cm")
+    found = locate(tmp_path / "cut.png", table, None, LEVEL, KNOWN)
+    assert len(found.solved.spots) == 4
+    assert [row[-1] for row in lamp_rows(found, table)].count("cut by the border too much, left out") == 1
+
+
+def test_ml_says_why_it_does_not_answer(located: Located) -> None:
+    assert answer(located, "ml").failure == (
+        "fit: the sensor states no gain, so that the noise of its pixels is not known"
+    )
 
 
 @pytest.mark.slow

@@ -20,7 +20,7 @@ from test_estimator_device import CAMERA
 
 from estimator.io.device import Camera
 from estimator.receiver.bits import NOT_SEEN, bit_error_rates, bits_seen, chip_levels
-from estimator.receiver.codes import PHASES, code_books, match_code, match_code_of_frames
+from estimator.receiver.codes import MIN_CORRELATION, PHASES, code_books, match_code, match_code_of_frames, match_phase
 from estimator.receiver.packets import MAX_ERASED, PacketFormat, crc, decode_packet, solved_mod_2
 from estimator.receiver.panels import find_groups, same_images
 from estimator.receiver.signal import ChipWave, LedImage, PulseWave, Signal, WaveGains, folded, overlaps
@@ -156,6 +156,60 @@ def test_too_few_lines_are_no_signal() -> None:
     constant = Signal(np.arange(20) * 1e-5, EXPOSURE_S, np.full(20, 5.0), np.ones(20))
     assert match_code(constant, BOOKS) is None
     assert match_code_of_frames([constant, image.signal], BOOKS, 1e-4) == [None, None]
+
+
+def test_a_known_code_needs_fewer_lines_than_an_unknown_one() -> None:
+    """Images of 36 lines, 16 chips of 32: the phases of one code are fewer than those of 200. None is wrong by more
+    than a tenth of the 40 us of exposure, which moves gains by 2 levels.
+    """
+    generator = np.random.default_rng(21)
+    known = unknown = 0
+    for _ in range(20):
+        led = int(generator.integers(100, 300))
+        one = sent(led, generator)
+        signal = led_image(one, generator, radii_px=(20.0, 20.0)).signal
+        match, among_all = match_phase(signal, BOOKS[0], led), match_code(signal, BOOKS)
+        assert match is not None
+        unknown += among_all is not None and among_all.clear
+        if match.clear:
+            known += 1
+            off = match.wave.gains(signal.start_s, EXPOSURE_S) - one.gains(signal.start_s)
+            assert np.abs(off).max() < 2 / 10
+    assert known >= 19
+    assert unknown < known
+
+
+@pytest.mark.slow
+def test_a_few_dim_chips_that_fit_at_two_phases_tell_none() -> None:
+    """Images of 14 and 16 lines with 10 electrons a pixel show 7 chips of 32 or so: some fit a wrong phase with a
+    correlation of 0.9 and more, and the right one nearly as well. Of those that are clear none is wrong.
+    """
+    generator = np.random.default_rng(23)
+    clear = wrong = 0
+    for _ in range(300):
+        led = int(generator.integers(100, 300))
+        one = sent(led, generator)
+        signal = led_image(one, generator, radii_px=(7.5, 7.5), electrons=10.0).signal
+        match = match_phase(signal, BOOKS[0], led)
+        assert match is not None
+        off = np.abs(match.wave.gains(signal.start_s, EXPOSURE_S) - one.gains(signal.start_s)).max() > 0.5
+        clear += match.clear
+        wrong += match.correlation >= MIN_CORRELATION and off
+        assert not (match.clear and off)
+    assert clear > 200
+    assert wrong > 0
+
+
+def test_a_code_that_an_led_does_not_send_has_no_clear_phase() -> None:
+    generator = np.random.default_rng(22)
+    for _ in range(20):
+        signal = led_image(sent(100, generator), generator, radii_px=(30.0, 30.0)).signal
+        match = match_phase(signal, BOOKS[0], int(generator.integers(101, 300)))
+        assert match is not None
+        assert not match.clear
+    constant = Signal(np.arange(20) * 1e-5, EXPOSURE_S, np.full(20, 5.0), np.ones(20))
+    assert match_phase(constant, BOOKS[0], 100) is None
+    assert match_phase(led_image(None, generator, radii_px=(3.0, 3.0)).signal, BOOKS[0], 100) is None
 
 
 @pytest.mark.slow

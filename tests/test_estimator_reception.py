@@ -1,6 +1,7 @@
 """Reception end to end: datasets whose identities are in the pixels, through `run` and `score`."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,12 @@ import estimator as est
 from estimator.errors import EstimationFailure, InputError
 from estimator.evaluate.batch import bursts, estimate_dataset
 from estimator.evaluate.identities import score_identities
+from estimator.io.device import DeviceFrame
 from estimator.io.truth import read_true_map, read_truth
 from estimator.methods.catalogue import VARIANTS
+from estimator.methods.maximum_likelihood import ml
 from estimator.methods.variant import DeviceMethod, Estimate, Variant
+from estimator.receiver.known import with_known_gains
 from estimator.receiver.receive import receive, receive_frames, with_identities
 from estimator.spots.striped import Lamp, find_lamps
 
@@ -137,6 +141,73 @@ def test_packets_tell_the_leds_and_where_they_are(by_packets: Path) -> None:
         sent = Sent(packet(), 50e-6 / (1 - 1e-4), 77.7 - DELAYS[0])
         # A chip's edge is good to a tenth of a line, which a gain rises over by 0.1 * 10 us / 40 us of 2 levels.
         assert np.abs(gains - sent.gains(frame.start_s + np.arange(600) * ROW_TIME_S)).max() < 0.1
+
+
+@pytest.fixture(scope="module")
+def by_tones(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    frequencies = [1500.0 + 300.0 * k for k in range(12)]
+    entry = {"send": "tone", "duty": 0.5, "depth": 1.0, "clock_error": 1e-4, "leds": list(range(10, 22))}
+    downlink = {"demodulation": "pixels", "transmitters": [{**entry, "frequencies_hz": frequencies}]}
+    sent = [Sent("10", 0.5 / hz, 0.7) for hz in frequencies]
+    return write_modulated(tmp_path_factory.mktemp("tones"), sent, downlink, with_map=True)
+
+
+def handed_over(received: DeviceFrame) -> DeviceFrame:
+    """A received frame as if its identities had been handed over."""
+    assert received.downlink is not None
+    downlink = received.downlink.model_copy(update={"demodulation": "given"})
+    return replace(received, downlink=downlink, identities=None, gains={})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["by_codes", "by_packets", "by_tones"])
+def test_identities_handed_over_have_the_gains_of_decoded_ones(kind: str, request: pytest.FixtureRequest) -> None:
+    """By the same lines, but packets by one frame instead of two: their clocks of 1e-4 are 3 us apart after 33 ms, of
+    40 us of exposure. Tones are looked for in the same band, by the same fit.
+    """
+    dataset = est.read_dataset(request.getfixturevalue(kind))
+    received, _ = receive_frames([est.read_frame(dataset, number) for number in (0, 1)])
+    given = handed_over(received)
+    assert given.unknown_gains == received.leds.keys()
+    known = with_known_gains(given)
+    assert known.gains.keys() == received.gains.keys() == received.leds.keys()
+    assert known.unknown_gains == frozenset()
+    assert with_known_gains(received) is received
+    for led, gains in received.gains.items():
+        # The lines of its own image; a chip's edge moves a gain by 2 levels in 40 us, and packets' by 3 us of them.
+        (v_px,) = (spot.v_px for spot in received.spots if spot.led == led)
+        lines = np.arange(int(v_px) - 30, int(v_px) + 30)
+        assert np.abs(known.gains[led](lines) - gains(lines)).max() < (2 * 3 / 40 if kind == "by_packets" else 0.02)
+
+
+@pytest.mark.slow
+def test_ml_is_as_good_with_identities_handed_over(by_codes: Path) -> None:
+    """The same pixels and gains: positions differ by less than a tenth of a standard deviation. With an LED that the
+    light contradicts, by the code of another, that one has no gains and is left out. With two spots and no gains at all
+    there is nothing to fit.
+    """
+    received, _ = receive_frames([est.read_frame(est.read_dataset(by_codes), number) for number in (0, 1)])
+    given = handed_over(received)
+    decoded, known = ml(received), ml(given)
+    assert decoded.covariance_m2 is not None
+    off_m = known.position_m - decoded.position_m
+    assert off_m @ np.linalg.solve(decoded.covariance_m2, off_m) < 0.01
+    assert given.downlink is not None
+    (codes,) = given.downlink.transmitters
+    swapped = codes.model_copy(update={"codes": (CODES[20], *SEEN_CODES[1:])})
+    wrong = replace(given, downlink=given.downlink.model_copy(update={"transmitters": (swapped,)}))
+    assert with_known_gains(wrong).unknown_gains == {10}
+    without = ml(wrong)
+    assert np.linalg.norm(without.position_m - decoded.position_m) < 1e-3
+    hidden = replace(
+        given,
+        spots=given.spots[:2],
+        downlink=wrong.downlink.model_copy(
+            update={"transmitters": (codes.model_copy(update={"codes": CODES[20:32]}),)}
+        ),
+    )
+    with pytest.raises(EstimationFailure, match="phases are not found"):
+        ml(hidden)
 
 
 @pytest.mark.slow

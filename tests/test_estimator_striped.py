@@ -147,6 +147,36 @@ def test_two_lamps_beside_each_other_are_two_and_a_lamp_cut_by_the_border_is_fla
     assert [one.touches_border for one in found].count(True) == len(found) - 2
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("side", ["above", "beside"])
+def test_the_visible_part_of_a_cut_lamp_tells_its_centre(side: str) -> None:
+    """A disc of 30 px radius with its centre 10 px below the upper border, or 22 to 28 px beside the left one, which
+    cuts its longest lines. NEES of two degrees a draw, within its 99.9 % interval; a centroid would be some 10 px off.
+    """
+    rng, nees = np.random.default_rng(31), []
+    for _ in range(12):
+        centre = np.array([60.0, 10.0] if side == "above" else [rng.uniform(22, 28), 60.0]) + rng.random(2)
+        covered = coverage(120, centre, np.array([30.0, 30.0]), 0.0)
+        found = lamps(readout(covered, wave(rng, 120), 1000.0, rng))
+        if side == "beside" and not (found and found[0].measured):
+            continue
+        assert found[0].touches_border
+        assert found[0].measured
+        error = np.array([found[0].u_px, found[0].v_px]) - centre
+        nees.append(error @ np.linalg.solve(found[0].covariance_px2, error))
+    assert len(nees) >= 8
+    assert sum(nees) < chi2.isf(5e-4, 2 * len(nees))
+
+
+def test_a_lamp_cut_beyond_its_centre_is_not_measured() -> None:
+    rng = np.random.default_rng(32)
+    for centre in ([60.0, -3.0], [60.0, 3.0], [-3.0, 60.0]):
+        covered = coverage(120, np.array(centre), np.array([30.0, 30.0]), 0.0)
+        for one in lamps(readout(covered, wave(rng, 120), 1000.0, rng)):
+            assert one.touches_border
+            assert not one.measured
+
+
 def test_noise_alone_has_no_lamp() -> None:
     rng = np.random.default_rng(7)
     image = rng.normal(10, 3, (120, 120)).astype(np.float32)

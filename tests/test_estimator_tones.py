@@ -9,7 +9,6 @@ from striped_images import Array, gains
 from estimator.io.downlink import Downlink
 from estimator.receiver.signal import Signal
 from estimator.receiver.tones import (
-    SquareWave,
     ToneFit,
     band_hz,
     envelope_of,
@@ -109,16 +108,6 @@ def test_no_led_of_28_tones_is_taken_for_another() -> None:
     identified = [match.leds for match in matches if match is not None]
     assert all(match is None or match.leds == (k,) for k, match in zip(sent, matches, strict=True))
     assert len(identified) >= 0.8 * len(sent)
-
-
-def test_the_wave_s_gains_are_the_means_over_exposures() -> None:
-    """Against a sum over 40 000 points of each exposure."""
-    wave = SquareWave(2300.0, 0.3, 0.001, duty=0.3, depth=0.8)
-    start = np.linspace(0, 1e-3, 7)
-    t = start[:, None] + EXPOSURE_S * (np.arange(40_000) + 0.5) / 40_000
-    bright = ((t - 0.001) * 2300 + 0.3) % 1 < 0.3
-    expected = np.where(bright, 1.0, 0.2) / (0.3 + 0.7 * 0.2)
-    assert wave.gains(start, EXPOSURE_S) == pytest.approx(expected.mean(axis=1), abs=1e-3)
 
 
 def test_the_readout_axis_is_the_one_with_the_gradients() -> None:

@@ -555,9 +555,21 @@ class DeviceFrame:
     identities: tuple[Identity, ...] | None = None
     """What a receiver decoded; None where it has not been asked."""
     gains: Mapping[int, LineGains] = field(default_factory=dict)
-    """Gain of an LED, by id, at each line, as its signal was decoded; without an entry an LED counts as steady."""
+    """Gain of an LED, by id, at each line, as its signal was decoded; see `unknown_gains` for one without an entry."""
     shared: SharedResults | None = None
     """Results that the variants of the frame share; None where each computes its own."""
+
+    @property
+    def unknown_gains(self) -> frozenset[int]:
+        """LEDs of the map whose light may have other gains at each line, and is without an entry in `gains`.
+
+        All others are steady for the pixels of an image: they do not send, or the shutter is global. Packets do not
+        say beforehand which LEDs send them.
+        """
+        if self.downlink is None or not self.camera.shutter.rolls:
+            return frozenset()
+        sending = self.leds.keys() if self.downlink.sends_packets else self.downlink.leds
+        return frozenset(sending - self.gains.keys())
 
     def once(self, key: tuple[Hashable, ...], compute: Callable[[], T]) -> T:
         """Result of a computation on the frame's images, once for all variants; raises its EstimationFailure.

@@ -17,6 +17,10 @@ is a focal length where the view does not check it: `estimator.solvers.robust_fi
 With a rolling shutter the velocity of the camera while the frame is read out is estimated with the pose, with the
 gyroscope's reading or a hand's motion as a prior (`estimator.solvers.shutter_motion`); the pose is that at mid-readout.
 
+LEDs that send have the gains of their decoded waves, or, where identities are handed over, of their known waves at the
+phases that their lines show (`estimator.receiver.known`). One whose phase is not found takes part by its spot alone, in
+the initial pose.
+
 Not modelled: light of other sources beside a smooth background, mechanical vignetting (natural vignetting is), and
 motion during the exposure of a line. LEDs that the model does not explain are excluded by their goodness of fit.
 """
@@ -48,6 +52,7 @@ from estimator.pixels.search import (
     image_parameters,
     unexplained,
 )
+from estimator.receiver.known import with_known_gains
 from estimator.solvers import second_order
 from estimator.solvers.observations import Observations, observe
 from estimator.solvers.reprojection import fit
@@ -108,10 +113,14 @@ def ml(frame: DeviceFrame) -> Estimate:
     """The most likely position and its covariance; raises EstimationFailure.
 
     The initial pose is that of `gravity_fit`, which also decides whether the estimate is ambiguous and whether gravity
-    is used. With two spots the initial pose is the fit to them and gravity. LEDs without a size have no model.
+    is used. With two spots the initial pose is the fit to them and gravity. LEDs without a size have no model, nor has
+    the noise of a sensor without a gain, such as a photograph's.
     """
+    if frame.sensor.gain_e_per_dn is None:
+        raise EstimationFailure("fit", "the sensor states no gain, so that the noise of its pixels is not known")
     if not all(led.has_size for led in frame.leds.values()):
         raise EstimationFailure("fit", "the map does not say how large its LEDs are")
+    frame = with_known_gains(frame)
     correspondences = find_correspondences(frame)
     observations = observe(frame, correspondences)
     inliers, use_gravity, is_ambiguous = np.ones(len(observations.leds_m), dtype=bool), True, False

@@ -181,11 +181,11 @@ def _axis(picture: Picture, options: Options) -> tuple[Along, str]:
 
 
 def _centres(lamps: Sequence[FoundLamp]) -> list[Centre]:
-    """Centres of the lamps; one that is cut by the border is no LED's."""
+    """Centres of the lamps; one that the border cuts too much for its visible part to tell the centre is no LED's."""
     centres = []
     for one in lamps:
         (uu, uv), (vu, vv) = one.lamp.covariance_px2.tolist()
-        candidates = () if one.lamp.touches_border else one.candidates
+        candidates = one.candidates if one.lamp.measured else ()
         centres.append(Centre(one.lamp.u_px, one.lamp.v_px, (uu, uv, vu, vv), candidates))
     return centres
 
@@ -196,7 +196,7 @@ def _centres_by_hand(picture: Picture, lamps: Sequence[FoundLamp], options: Opti
     Without a line rate lamps are steady, and are found by their light.
     """
     if lamps:
-        spots = [one.lamp.spot() for one in lamps]
+        spots = [replace(one.lamp.spot(), touches_border=not one.lamp.measured) for one in lamps]
     else:
         coded = picture.coded
         readout = Readout(0, 0, coded, coded, picture.clipped, 2.0)
@@ -236,7 +236,7 @@ def _check_identified(
             "whose stripes are no tone of the map's band",
         ),
         (sum(one.tone is not None and one.tone.clear and not one.candidates for one in lamps), "of another tone"),
-        (sum(bool(one.candidates) for one in lamps), "cut by the border"),
+        (sum(bool(one.candidates) for one in lamps), "cut by the border too much"),
     ]
     told = ", ".join(f"{count} {cause}" for count, cause in causes if count) or "none found"
     found, ratio = readout_ratio(picture)
@@ -261,7 +261,11 @@ def _marks(centres: Sequence[Centre], lamps: Sequence[FoundLamp], solved: Solved
         contour = at + 20 * np.column_stack([np.cos(angle), np.sin(angle)]) if one is None else one.lamp.contour_px()
         name = "?" if led is None else table.label(led)
         tone = f" {one.tone.frequency_hz:.0f} Hz" if one is not None and one.tone is not None else ""
-        why = "" if one is None or led is not None else f"\n{'cut by the border' if one.candidates else one.why_not()}"
+        why = (
+            ""
+            if one is None or led is not None
+            else f"\n{'cut by the border too much' if one.candidates else one.why_not()}"
+        )
         residual = None if led is None else residual_of.get(led)
         off = "" if residual is None else f"\nresidual {residual[0]:+.1f}, {residual[1]:+.1f} px"
         marks.append(Mark(centre.u_px, centre.v_px, contour, f"{name}{tone}{off}{why}", led is not None, residual))

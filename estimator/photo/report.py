@@ -29,8 +29,10 @@ def lamp_rows(located: Located, table: LedTable) -> list[list[str]]:
         led = led_at.get((lamp.u_px, lamp.v_px))
         nominal = None if led is None else table.frequencies_hz().get(led)
         remark = one.why_not()
-        if led is None and not remark:
-            remark = "cut by the border" if lamp.touches_border else "left out"
+        if led is not None and lamp.touches_border:
+            remark = "cut by the border; centre by the visible part"
+        elif led is None and not remark:
+            remark = "left out" if lamp.measured else "cut by the border too much, left out"
         rows.append(
             [
                 "" if led is None else table.label(led),

@@ -21,6 +21,7 @@ from estimator.errors import EstimationFailure
 from estimator.io.device import AnyLed, DeviceFrame
 from estimator.methods import gravity_fit, pnp, up2p
 from estimator.methods.gravity_fit import initial_poses
+from estimator.methods.maximum_likelihood import ml
 from estimator.methods.variant import Estimate
 from estimator.photo.led_table import LedTable, Mirror, mirror_signs
 from estimator.solvers.observations import observe
@@ -44,7 +45,7 @@ MAX_HYPOTHESES = 4096
 # a wide lens.
 MAX_RESIDUAL_SHARE = 1.5e-3
 MIN_INLIER_SHARE = 0.6
-VARIANTS = ("gravity-fit", "up2p", "pnp", "ippe", "sqpnp")
+VARIANTS = ("gravity-fit", "up2p", "ml", "pnp", "ippe", "sqpnp")
 # An error is covered where its chi-square of three degrees of freedom is not beyond 95 %.
 COVERED_CHI2 = 7.815
 
@@ -251,6 +252,7 @@ def _answer(
     methods: dict[str, Callable[[], Estimate]] = {
         "gravity-fit": lambda: gravity_fit.fit_correspondences(frame, correspondences, sigma_px),
         "up2p": lambda: up2p.fit_correspondences(frame, correspondences, sigma_px),
+        "ml": lambda: ml(frame),
         "pnp": lambda: pnp.fit_correspondences(frame, correspondences),
         "ippe": lambda: pnp.fit_correspondences(frame, correspondences, pnp.IPPE_ONLY),
         "sqpnp": lambda: pnp.fit_correspondences(frame, correspondences, pnp.SQPNP_ONLY),
@@ -293,7 +295,8 @@ def _check_fit(frame: DeviceFrame, answers: Sequence[Answer]) -> Floats:
     """Distances (n,) of the spots from the best variant's model, pixels; refuses a map that fits none of them."""
     usable = [answer for answer in answers if answer.residuals_px is not None]
     if not usable:
-        why = "; ".join(dict.fromkeys(answer.failure for answer in answers))
+        # Of a photograph's pixels `ml` never has a position: the reason is not in the picture.
+        why = "; ".join(dict.fromkeys(answer.failure for answer in answers if answer.variant != "ml"))
         raise EstimationFailure("position", f"no variant has a position ({why})")
     limit_px = _limit_px(frame)
     distances = [np.linalg.norm(one.residuals_px, axis=1) for one in usable if one.residuals_px is not None]

@@ -4,7 +4,8 @@ The sum of Poisson variables is a sufficient statistic of a common mean, so the 
 be read one by one: each block of them is one reading. Its expectation is exact, a sum over its pixels.
 
 An LED that sends is brighter in some lines of a rolling shutter than in others: its light in a pixel is multiplied by
-the gain of the pixel's line, as decoded (`DeviceFrame.gains`). Its blocks are of one line each.
+the gain of the pixel's line, as decoded (`DeviceFrame.gains`). Its blocks are of one line each. An LED that may send,
+and whose gains are not known, has no model and is left out.
 """
 
 from collections.abc import Sequence
@@ -46,6 +47,7 @@ MAX_IMAGE_SIGMA_PX = 0.5
 # Share of the pixels inside an LED image that have to be known: read out and not saturated.
 MIN_KNOWN_SHARE = 0.5
 NONE_IN_VIEW = "no LED of the map is in view from the pose that the spots give"
+NO_GAINS = "the LEDs in view send waves whose phases are not found"
 # Step of the phase, in lines, for derivatives of gains.
 PHASE_STEP = 0.25
 # Extent of an LED image in half widths: 1.4 for a square's vertex, and the scale of a tilted view varies over a face.
@@ -308,9 +310,10 @@ def leds_in_view(
 ) -> LedsInView:
     """LEDs of the map, n in all, that are in view under a state of them.
 
-    Left out are LEDs whose image is not determined to MAX_IMAGE_SIGMA_PX by the pose, of covariance (6, 6), or (12, 12)
-    with that of the velocity for a rolling shutter, and by their own position, of standard deviation `sigma_m` (n,),
-    but for those whose image is `located` (n,). Raises EstimationFailure if none is left.
+    Left out are LEDs of unknown gains, and those whose image is not determined to MAX_IMAGE_SIGMA_PX by the pose, of
+    covariance (6, 6), or (12, 12) with that of the velocity for a rolling shutter, and by their own position, of
+    standard deviation `sigma_m` (n,), but for those whose image is `located` (n,). Raises EstimationFailure if none is
+    left.
     """
     low, high = _read_out(frame)
     leds = tuple(frame.leds.values())
@@ -322,9 +325,10 @@ def leds_in_view(
         scale = np.linalg.norm(centres.slopes[:, :, :3], axis=(1, 2))
         extent_px = (MAX_EXTENT * half_widths_m * scale)[:, None]
         near = ((centres.pixels > low - extent_px) & (centres.pixels < high + extent_px)).all(axis=1)
-    candidates = np.flatnonzero(near)
+    unknown = frame.unknown_gains
+    candidates = np.flatnonzero(near & [led.id not in unknown for led in leds])
     if len(candidates) == 0:
-        raise EstimationFailure("fit", NONE_IN_VIEW)
+        raise EstimationFailure("fit", NO_GAINS if near.any() else NONE_IN_VIEW)
     footprints = led_footprints([leds[k] for k in candidates], state.of(candidates))
     slopes = centres.slopes[candidates]
     if centres.motion_slopes is not None:

@@ -191,6 +191,25 @@ def match_code_of_frames(
     return [next(of_signal_number) if any(signal is one for one in used) else None for signal in signals]
 
 
+def match_phase(signal: Signal, book: CodeBook, led: int) -> CodeMatch | None:
+    """The phase of the code that an LED of the book is known to send; its rivals are the other phases of that code.
+
+    None for a signal of few lines or without stripes, as with `match_code`.
+    """
+    if len(signal) < MIN_LINES or not signal.centred.any():
+        return None
+    row = int(np.flatnonzero(book.leds == led)[0])
+    correlations = book.correlations(signal)[row]
+    best = int(correlations.argmax())
+    # The correlation of phases less than a chip from the best is that of the best one.
+    rivals = np.roll(np.arange(len(correlations)), -best)[PHASES : 1 - PHASES]
+    second = int(rivals[correlations[rivals].argmax()])
+    (phase, correlation), (_, rival) = (book.refined(signal, row, one / PHASES) for one in (best, second))
+    misfits = [max(1 - max(one, 0.0) ** 2, MIN_MISFIT) for one in (rival, correlation)]
+    wave = book.wave(row, phase, float(signal.start_s[0]))
+    return CodeMatch(led, correlation, misfits[0] / misfits[1], misfits[0] - misfits[1], wave)
+
+
 def match_code(signal: Signal, books: Sequence[CodeBook]) -> CodeMatch | None:
     """The LED whose code fits a signal best; None for a signal of few lines or without stripes."""
     if len(signal) < MIN_LINES or not signal.centred.any():

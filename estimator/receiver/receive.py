@@ -13,14 +13,14 @@ import numpy as np
 
 from estimator.errors import InputError
 from estimator.io.device import AnyLed, DecodedSpot, DeviceFrame, DiscLed, Identity, Led, Luminaire, SquareLed
-from estimator.io.downlink import INDEX_BITS, Codes, DiscFace, Packets, Tones
+from estimator.io.downlink import INDEX_BITS, Codes, DiscFace, Downlink, Packets, Tones
 from estimator.io.shared import SharedResults
 from estimator.receiver.bits import bits_seen
 from estimator.receiver.codes import code_books, match_code, match_code_of_frames
 from estimator.receiver.packets import PacketFormat, decode_packet
 from estimator.receiver.panels import find_groups, same_images
-from estimator.receiver.signal import ChipWave, Floats, LedImage, PulseWave, WaveGains, led_image
-from estimator.receiver.tones import match_tones
+from estimator.receiver.signal import ChipWave, Floats, LedImage, PulseWave, Signal, WaveGains, led_image
+from estimator.receiver.tones import ToneFit, match_tones
 from estimator.spots.lamps import lamps_of
 from estimator.spots.striped import Lamp
 
@@ -194,16 +194,20 @@ def _by_tones(frame: DeviceFrame, lamps: Sequence[Lamp], images: Sequence[LedIma
     """LED images of a frame, by number, that are identified by a tone that one LED alone has."""
     if frame.downlink is None:
         return
-    tones = {led: one for one in frame.downlink.transmitters if isinstance(one, Tones) for led in one.leds}
     signals = [image.signal for image in images]
     row_time_s = frame.camera.shutter.row_time_s
     for number, match in enumerate(match_tones(signals, frame.downlink, row_time_s)):
         if match is not None and len(match.leds) == 1:
             (led,), signal = match.leds, signals[number]
-            sent = tones[led]
-            wave = PulseWave(match.fit.frequency_hz, sent.duty, sent.depth, float(signal.start_s[0]), match.fit.phase)
+            wave = pulse_wave(signal, match.fit, frame.downlink, led)
             correlation = signal.correlation(wave.gains(signal.start_s, signal.exposure_s))
             yield number, Reception(lamps[number], led, correlation, None, wave)
+
+
+def pulse_wave(signal: Signal, fit: ToneFit, downlink: Downlink, led: int) -> PulseWave:
+    """The wave of an LED of the downlink that sends a tone, by the fit to its signal."""
+    (sent,) = (one for one in downlink.transmitters if isinstance(one, Tones) and led in one.leds)
+    return PulseWave(fit.frequency_hz, sent.duty, sent.depth, float(signal.start_s[0]), fit.phase)
 
 
 def _told(packets: Packets, coordinates: tuple[int, int, int], index: int, leds: Mapping[int, Led]) -> Told | None:

@@ -66,26 +66,6 @@ class ToneFit:
         return not self.at_border and self.share >= MIN_SHARE and self.periods >= MIN_PERIODS
 
 
-@dataclass(frozen=True)
-class SquareWave:
-    """Square wave of mean 1: bright for the share `duty` of a period; the dark level is 1 - `depth` of the bright one.
-
-    At the time `at_s` it is `phase` periods into its period, which begins bright.
-    """
-
-    frequency_hz: float
-    phase: float
-    at_s: float = 0.0
-    duty: float = 0.5
-    depth: float = 1.0
-
-    def gains(self, start_s: Floats, exposure_s: float) -> Floats:
-        """Mean of the wave over exposures that start at (n,), exact."""
-        at = (start_s - self.at_s) * self.frequency_hz + self.phase
-        bright = _bright_share(at, self.frequency_hz * exposure_s, self.duty)
-        return np.asarray((1 - self.depth * (1 - bright)) / (1 - self.depth * (1 - self.duty)))
-
-
 def band_hz(line_time_s: float, exposure_s: float, lines: int) -> tuple[float, float]:
     """Frequencies that an LED image of so many lines can show: lowest and highest."""
     low = MIN_PERIODS / (lines * line_time_s)

@@ -52,6 +52,10 @@ SMOOTHING_PX = 5
 MAX_BLUR = 0.15
 # Share of the edges that a single LED image leaves at most: more are of two LED images, or of none.
 MAX_OUTLIERS = 0.35
+# The centre of a cut outline is this share of its larger half extent inside the region: the visible part then tells it.
+# Isophotes scatter by their stripes, and end where a stripe does: docs/measure_downlink.py cut.
+MIN_ARC = 0.25
+MIN_FADED_ARC = 0.6
 # The root mean square of the inliers' residuals of an LED image, as a share of its half extent.
 MAX_RESIDUAL = 0.06
 
@@ -61,10 +65,11 @@ class Lamp:
     """A striped or steady LED image: centre of its outline, continuous pixels with pixel centres at +0.5.
 
     `covariance_px2` (2, 2) is the centre's, u and v. `along` says what lines are. `touches_border` marks an outline
-    that may be cut by the border of its region, `clipped` one with a pixel that is or may be saturated, `striped` a
-    profile that is not constant, `uniform` a lamp whose outline is by edges, not isophotes. `residual_px` is the root
-    mean square of the edges' residuals; `peak_e` the level of the bright lines; `brightest_px` the centre (u, v) of the
-    brightest pixel.
+    that may be cut by the border of its region, `measured` one whose visible part tells the centre as well as the
+    covariance says: a whole one, or one whose centre is well inside the region and that is by lines that are not cut.
+    `clipped` marks one with a pixel that is or may be saturated, `striped` a profile that is not constant, `uniform` a
+    lamp whose outline is by edges, not isophotes. `residual_px` is the root mean square of the edges' residuals;
+    `peak_e` the level of the bright lines; `brightest_px` the centre (u, v) of the brightest pixel.
     """
 
     u_px: float
@@ -76,6 +81,7 @@ class Lamp:
     residual_px: float
     peak_e: float
     touches_border: bool
+    measured: bool
     clipped: bool
     striped: bool
     uniform: bool
@@ -186,6 +192,10 @@ def _lamp(
     high = centre + extent + (blob.left, blob.top)
     size = turned.electrons.shape[::-1]
     touches = bool((low < 0).any() or (high > size).any())
+    at, least = centre + (blob.left, blob.top), (MIN_ARC if uniform else MIN_FADED_ARC) * extent.max()
+    inside = bool(((at > least) & (at < size - least)).all())
+    # Edges need both ends of a line; isophotes would take the border for one.
+    lines_cut = (blob.left == 0 and blob.own[:, 0].any()) or (blob.right == size[0] and blob.own[:, -1].any())
     x, y = (centre + (blob.left + turned.across, blob.top + turned.line)).tolist()
     moved = moved_outline(outline, blob.left + turned.across, blob.top + turned.line)
     covariance = found.covariance
@@ -206,6 +216,7 @@ def _lamp(
         residual_px=found.residual_px,
         peak_e=peak_e,
         touches_border=touches,
+        measured=not touches or (inside and (uniform or not lines_cut)),
         clipped=bool(profile.clipped.any()),
         striped=is_striped(profile),
         uniform=uniform,

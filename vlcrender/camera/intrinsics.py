@@ -306,14 +306,17 @@ class Camera(Settings):
 
     def field_of_view(self, margin_px: float = 0.0) -> FieldOfView:
         """Directions from which light reaches the sensor or up to `margin_px` beside it."""
-        return _field_of_view(self, margin_px)
+        return self.field_of_view_of(-margin_px, -margin_px, self.width_px + margin_px, self.height_px + margin_px)
+
+    def field_of_view_of(self, left_px: float, top_px: float, right_px: float, bottom_px: float) -> FieldOfView:
+        """Directions from which light reaches a rectangle of pixel positions, on the sensor or close to it."""
+        return _field_of_view(self, left_px, top_px, right_px, bottom_px)
 
 
 @lru_cache(maxsize=64)
-def _field_of_view(camera: Camera, margin_px: float) -> FieldOfView:
+def _field_of_view(camera: Camera, left_px: float, top_px: float, right_px: float, bottom_px: float) -> FieldOfView:
     t = np.linspace(0.0, 1.0, BORDER_POINTS)
-    u = -margin_px + t * (camera.width_px + 2 * margin_px)
-    v = -margin_px + t * (camera.height_px + 2 * margin_px)
+    u, v = left_px + t * (right_px - left_px), top_px + t * (bottom_px - top_px)
     u_border = np.concatenate([u, u, np.full(BORDER_POINTS, u[0]), np.full(BORDER_POINTS, u[-1])])
     v_border = np.concatenate([np.full(BORDER_POINTS, v[0]), np.full(BORDER_POINTS, v[-1]), v, v])
     return camera.lens_projection.field_of_view(*camera.sensor_position(u_border, v_border))

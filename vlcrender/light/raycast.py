@@ -37,7 +37,7 @@ class Hit:
     """Results of rays: Dr.Jit arrays with one entry per ray."""
 
     value: Any
-    """Interpolated value (see `Room.values`), with reflections in glazing and textures."""
+    """Interpolated value (see `Room.values`), or a pair of them, with reflections in glazing and textures."""
     surface: Any
     """Number of the surface hit: surfaces, then furniture, then glazing, then `Room.nothing`."""
     distance_m: Any
@@ -100,8 +100,8 @@ class Room:
     ) -> Hit:
         """Trace rays from Dr.Jit points along unit directions, world.
 
-        values: by `values`. spread: change of the direction over one pixel, along rows and along columns; textures
-        need it.
+        values: by `values`, or a pair of such in one array of two components. spread: change of the direction over one
+        pixel, along rows and along columns; textures need it.
         """
         value, surface, distance = self._intersect(origin, direction, values, coherent, mi.Bool(True))
         path = distance
@@ -130,7 +130,8 @@ class Room:
         valid = hit.is_valid() & active
         triangle = dr.select(valid, hit.prim_index, self._triangles)
         b1, b2 = hit.prim_uv.x, hit.prim_uv.y
-        at = [dr.gather(mi.Float, values, dr.gather(mi.UInt32, c, triangle, valid), valid) for c in self._vertices]
+        corners = [dr.gather(mi.UInt32, c, triangle, valid) for c in self._vertices]
+        at = [dr.gather(type(values), values, corner, valid) for corner in corners]
         value = dr.fma(b2, at[2] - at[0], dr.fma(b1, at[1] - at[0], at[0]))
         return dr.select(valid, value, 0.0), dr.gather(mi.UInt32, self._owners, triangle), dr.select(valid, hit.t, 1e9)
 

@@ -34,12 +34,18 @@ MAX_RATES = 8
 class BackgroundRegion:
     """The room in one region: the mean over each pixel, electrons a second, and the surface at its centre.
 
-    Both (rows, columns); surfaces are numbered as in `raycast.Hit`.
+    Images, one for each of the rates that were asked for, and surfaces are (rows, columns); surfaces are numbered as in
+    `raycast.Hit`.
     """
 
     roi: Roi
-    image: Image
+    images: tuple[Image, ...]
     surfaces: NDArray[np.uint32]
+
+    @property
+    def image(self) -> Image:
+        """The first of the images."""
+        return self.images[0]
 
 
 class Background:
@@ -49,7 +55,7 @@ class Background:
         """Prepare a scene with its baked light."""
         self.room = Room(light.mesh, scene.glazings, scene.surfaces)
         self._light = light
-        self._values: dict[ElectronRates, Any] = {}
+        self._values: dict[tuple[ElectronRates, ...], Any] = {}
         self.cameras_vary = False
         """Whether each view has a camera of its own, so that a camera's numbers are data of the kernels."""
 
@@ -64,18 +70,21 @@ class Background:
         posed: PosedCamera,
         u: Any,
         v: Any,
-        rates: ElectronRates = DARK,
+        *rates: ElectronRates,
         size_px: float = 1.0,
         lines: LinePoses | None = None,
     ) -> Hit:
         """Surfaces and light seen by squares of `size_px` around the pixel positions (u, v), Dr.Jit arrays.
 
-        lines: poses of the sensor's lines, in place of the pose of `posed`; positions are then on the sensor. The value
-        is in electrons a second and includes the lens's relative illumination.
+        rates: none for rays whose light is not needed, one, or two, whose values are a pair. lines: poses of the
+        sensor's lines, in place of the pose of `posed`; positions are then on the sensor. The value is in electrons a
+        second and includes the lens's relative illumination.
         """
         camera = CameraData.of(posed.camera, mi.Float) if self.cameras_vary else posed.camera
+        rates = rates or (DARK,)
         if rates not in self._values:
-            self._values[rates] = self.room.values(self._light, rates.led, rates.ambient)
+            values = [self.room.values(self._light, one.led, one.ambient) for one in rates]
+            self._values[rates] = values[0] if len(values) == 1 else mi.Vector2f(*values)
             while len(self._values) > MAX_RATES:
                 del self._values[next(iter(self._values))]
         if lines is None:
@@ -103,33 +112,37 @@ class Background:
         return replace(hit, value=value)
 
     def regions(
-        self, posed: PosedCamera, rois: Sequence[Roi], rates: ElectronRates, lines: LinePoses | None = None
+        self, posed: PosedCamera, rois: Sequence[Roi], *rates: ElectronRates, lines: LinePoses | None = None
     ) -> list[BackgroundRegion]:
-        """The room in each region. `lines`: as in `trace`; the regions are then on the sensor."""
+        """The room in each region, with an image for each of the one or two rates.
+
+        lines: as in `trace`; the regions are then on the sensor.
+        """
         sensor = Roi.of_sensor(posed.camera)
         # The neighbours of a region's border pixels tell whether surfaces meet there; pixels beyond the sensor do not.
         padded = [roi.padded(1).intersection(sensor) if sensor.contains(roi) else roi.padded(1) for roi in rois]
         with exact_math():
-            hit = self.trace(posed, *_pixel_centers(padded, sensor), rates, lines=lines)
+            hit = self.trace(posed, *_pixel_centers(padded, sensor), *rates, lines=lines)
             dr.eval(hit.value, hit.surface)
-            values, surfaces = hit.value.numpy(), hit.surface.numpy()
+            values, surfaces = np.atleast_2d(hit.value.numpy()), hit.surface.numpy()
             starts = np.cumsum([0, *(roi.pixels for roi in padded)])
             regions, edges = [], []
             for outer, roi, start in zip(padded, rois, starts, strict=False):
                 pixels, inner = slice(start, start + outer.pixels), outer.slices(roi)
                 labels = surfaces[pixels].reshape(outer.rows, outer.columns)
-                image = values[pixels].reshape(outer.rows, outer.columns)[inner]
-                regions.append(BackgroundRegion(roi, image, labels[inner]))
+                images = [value[pixels].reshape(outer.rows, outer.columns)[inner] for value in values]
+                regions.append(BackgroundRegion(roi, tuple(images), labels[inner]))
                 edges.append(np.nonzero(_edges(labels, outer, sensor)[inner]))
             rows = np.concatenate([r + roi.row for (r, _), roi in zip(edges, rois, strict=True)])
             columns = np.concatenate([c + roi.column for (_, c), roi in zip(edges, rois, strict=True)])
             if len(rows):
                 u, v = sub_pixels(rows, columns)
-                rays = self.trace(posed, u, v, rates, 1 / EDGE_GRID, lines).value.numpy()
-                means = rays.reshape(len(rows), -1).mean(axis=1)
-                parts = np.split(means, np.cumsum([len(r) for r, _ in edges])[:-1])
+                rays = self.trace(posed, u, v, *rates, size_px=1 / EDGE_GRID, lines=lines).value.numpy()
+                means = rays.reshape(len(rates), len(rows), -1).mean(axis=2)
+                parts = np.split(means, np.cumsum([len(r) for r, _ in edges])[:-1], axis=1)
                 for region, edge, mean in zip(regions, edges, parts, strict=True):
-                    region.image[edge] = mean
+                    for image, of_image in zip(region.images, mean, strict=True):
+                        image[edge] = of_image
             return regions
 
 

@@ -216,7 +216,7 @@ def glare_halo(
     def room(rates: ElectronRates) -> Array:
         with exact_math():
             across, down = np.meshgrid(u.astype(np.float32), v.astype(np.float32))
-            hit = background.trace(posed, mi.Float(across.ravel()), mi.Float(down.ravel()), rates, float(cell))
+            hit = background.trace(posed, mi.Float(across.ravel()), mi.Float(down.ravel()), rates, size_px=float(cell))
             dr.eval(hit.value)
             light = hit.value.numpy().reshape(len(v), len(u)).astype(np.float64)
         return sharp * grid.gathered(light * areas, v, u)

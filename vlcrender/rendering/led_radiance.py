@@ -91,7 +91,7 @@ def led_images(
     overscan = regions is not None and regions.overscan
     margin_px = _overscan_px(camera) if overscan else blurs.radius_px
     imaged = []
-    for i in leds.spheres.candidates(posed, margin_px).tolist():
+    for i in leds.spheres.candidates(posed, margin_px, within).tolist():
         if within is not None:
             outline = outline_roi(posed, face_of_led(leds, i))
             if outline is None or not outline.overlaps(within):

@@ -1,9 +1,9 @@
 """Cameras that move while a rolling shutter reads their lines: each line has a pose of its own.
 
-Rays into the room have the pose of their pixel's line. Images of LEDs are computed at poses so close that no point of
-the image moves by more than half a pixel from one to the next, the knots, and interpolated for the lines between them.
-To first order interpolation moves no edge: it smooths an edge that moves by d from knot to knot by a standard deviation
-of d / 2 at most. Each line's exposure is a mean over poses, as that of a global shutter.
+Rays into the room have the pose of their pixel's line. Images of LEDs are computed at poses, the knots, so close that
+no point of the image moves by more than an eighth of a pixel from one to the next, and interpolated for the lines
+between them. To first order interpolation moves no edge: it smooths an edge that moves by d from knot to knot by a
+standard deviation of d / 2 at most. Each line's exposure is a mean over poses, as that of a global shutter.
 """
 
 from collections.abc import Callable, Sequence

@@ -146,23 +146,21 @@ class Renderer:
         """
         _check_size(rois, view.posed.camera)
         rates = self._rates(view.posed.camera)
-        backgrounds, reflections = self._rooms(view, rois, rates)
-        of_leds: Sequence[Image | None] = [None] * len(rois)
-        if room_apart:
-            of_leds, _ = self._rooms(view, rois, replace(rates, ambient=0.0), with_reflections=False)
+        parts = (rates, replace(rates, ambient=0.0)) if room_apart else (rates,)
+        rooms, reflections = self._rooms(view, rois, parts)
         patches = self._patches(view)
         halo = self._halo(view.posed, patches, room_apart)
         return ExpectedImage(
             tuple(
                 ExpectedRegion(
                     roi,
-                    background,
+                    room[0],
                     tuple(p for p in patches if roi.contains(p.roi)),
                     tuple(r for r in reflections if roi.contains(r.roi)),
                     halo,
-                    by_leds,
+                    room[1] if room_apart else None,
                 )
-                for roi, background, by_leds in zip(rois, backgrounds, of_leds, strict=True)
+                for roi, room in zip(rois, rooms, strict=True)
             )
         )
 
@@ -241,34 +239,42 @@ class Renderer:
         return glare_halo(posed, self._background, rates, [*patches, *reflections], room_apart)
 
     def _rooms(
-        self, view: LedView, rois: Sequence[Roi], rates: ElectronRates, with_reflections: bool = True
-    ) -> tuple[list[Image], list[SpecularReflection]]:
-        """The background of each region, and all specular reflections: means over the poses, blurred."""
+        self, view: LedView, rois: Sequence[Roi], rates: Sequence[ElectronRates]
+    ) -> tuple[list[list[Image]], list[SpecularReflection]]:
+        """Backgrounds of each region, one for each of the rates, and all specular reflections: means over the poses,
+        blurred.
+        """
         blurs, camera = view.blurs, view.posed.camera
         sensor = Roi.of_sensor(camera)
         padded = [roi.padded(blurs.radius_px) for roi in rois]
         wide = [p.intersection(sensor) if sensor.contains(roi) else p for roi, p in zip(rois, padded, strict=True)]
         steps = len(view.bands[0].poses)
-        totals: list[Image] | None = None
+        totals: list[tuple[Image, ...]] | None = None
         reflections: list[SpecularReflection] = []
         for step in range(steps):
             lines = None if view.rolling is None else view.rolling.steps[step]
-            rooms = self._background.regions(view.bands[0].poses[step], wide, rates, lines)
+            rooms = self._background.regions(view.bands[0].poses[step], wide, *rates, lines=lines)
             self._cover_with_faces(rooms, view.bands, step, rates)
             if totals is None:
-                totals = [room.image for room in rooms]
+                totals = [room.images for room in rooms]
             else:
-                for total, room in zip(totals, rooms, strict=True):
-                    total += room.image
-            for number in range(len(self.scene.glazings) if with_reflections else 0):
+                for of_room, room in zip(totals, rooms, strict=True):
+                    for total, image in zip(of_room, room.images, strict=True):
+                        total += image
+            for number in range(len(self.scene.glazings)):
                 label = self._background.room.first_glazing + number
                 if any((room.surfaces == label).any() for room in rooms):
-                    reflections += self._reflections(view, step, number, wide, rois, rates.led / steps)
+                    reflections += self._reflections(view, step, number, wide, rois, rates[0].led / steps)
         assert totals is not None  # there is at least one pose
-        means = []
-        for total, outer, roi in zip(totals, wide, rois, strict=True):
-            mean = total if steps == 1 else total / np.float32(steps)
-            means.append(np.ascontiguousarray(blur(mean, blurs.typical, "edge")[outer.slices(roi)]))
+
+        def mean(total: Image, outer: Roi, roi: Roi) -> Image:
+            sharp = total if steps == 1 else total / np.float32(steps)
+            return np.ascontiguousarray(blur(sharp, blurs.typical, "edge")[outer.slices(roi)])
+
+        means = [
+            [mean(total, outer, roi) for total in of_room]
+            for of_room, outer, roi in zip(totals, wide, rois, strict=True)
+        ]
         return means, reflections
 
     def _reflections(
@@ -293,15 +299,17 @@ class Renderer:
         return found
 
     def _cover_with_faces(
-        self, rooms: Sequence[BackgroundRegion], bands: Sequence[LedBand], step: int, rates: ElectronRates
+        self, rooms: Sequence[BackgroundRegion], bands: Sequence[LedBand], step: int, rates: Sequence[ElectronRates]
     ) -> None:
         """Put the LEDs' faces, which reflect the room's light, before the room; changes its images.
 
         step: the number of the pose of each band.
         """
         places = slice(len(self._light.mesh.vertices_m), None)  # the lightmap has the faces after the mesh
-        faces = rates.led * self._light.led_cd_m2(places) + rates.ambient * self._light.ambient_cd_m2(places)
-        sharp = [room.image.copy() for room in rooms] if len(bands) > 1 else [room.image for room in rooms]
+        by_leds, other = self._light.led_cd_m2(places), self._light.ambient_cd_m2(places)
+        faces = [one.led * by_leds + one.ambient * other for one in rates]
+        several = len(bands) > 1
+        sharp = [tuple(image.copy() if several else image for image in room.images) for room in rooms]
         for band in bands:
             for i, led in band.images[step].items():
                 if self.scene.leds.diffusers[i] is not None:
@@ -311,13 +319,14 @@ class Renderer:
                     if shared is not None and room.roi.overlaps(shared[0]):
                         both = room.roi.intersection(shared[0])
                         here, there = room.roi.slices(both), led.roi.slices(both)
-                        coverage = led.coverage[there]
-                        if band.knot is None:
-                            uncovered = room.image[here] * (1 - coverage)
-                            room.image[here] = uncovered + faces[i] * coverage * led.weight[there]
-                        else:
-                            share = coverage * band.knot.weights_in(both)
-                            room.image[here] += share * (faces[i] * led.weight[there] - before[here])
+                        coverage, weight = led.coverage[there], led.weight[there]
+                        for image, sharp_image, face in zip(room.images, before, faces, strict=True):
+                            if band.knot is None:
+                                uncovered = image[here] * (1 - coverage)
+                                image[here] = uncovered + face[i] * coverage * weight
+                            else:
+                                share = coverage * band.knot.weights_in(both)
+                                image[here] += share * (face[i] * weight - sharp_image[here])
 
     def _patches(self, view: LedView, precision: type[np.floating] = np.float32) -> tuple[LedPatch, ...]:
         """Patches of the LEDs: means over the images at several poses, blurred."""

@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlcrender.camera.posed_camera import PosedCamera
+from vlcrender.camera.projection import FieldOfView
+from vlcrender.camera.roi import Roi
 
 BLOCK = 32
 """LEDs of neighbouring identities, mostly of one panel, that are first looked at together."""
@@ -24,17 +26,22 @@ class BoundingSpheres:
     centers_m: Array
     radii_m: Array
 
-    def candidates(self, posed: PosedCamera, margin_px: float = 0.0) -> NDArray[np.int64]:
+    def candidates(self, posed: PosedCamera, margin_px: float = 0.0, within: Roi | None = None) -> NDArray[np.int64]:
         """Indices of all LEDs that light a pixel of the sensor or up to `margin_px` beside it, and perhaps of others.
 
         An LED is a candidate where its centre is above the camera and its sphere enters the camera's field of view.
+        within: a region in place of the sensor and its margin.
         """
-        near = np.flatnonzero(self._blocks._in_view(posed, margin_px))
+        if within is None:
+            view = posed.camera.field_of_view(margin_px)
+        else:
+            view = posed.camera.field_of_view_of(within.column, within.row, within.end_column, within.end_row)
+        near = np.flatnonzero(self._blocks._in_view(posed, view))
         members = (near[:, None] * BLOCK + np.arange(BLOCK)).ravel()
         members = members[members < len(self.radii_m)]
         of_members = BoundingSpheres(self.centers_m[members], self.radii_m[members])
         above = of_members.centers_m[:, 2] > posed.pose.position_m[2]
-        found: NDArray[np.int64] = members[above & of_members._in_view(posed, margin_px)]
+        found: NDArray[np.int64] = members[above & of_members._in_view(posed, view)]
         return found
 
     @cached_property
@@ -46,6 +53,6 @@ class BoundingSpheres:
         reaches_m = np.linalg.norm(self.centers_m - np.repeat(centers_m, counts, axis=0), axis=1) + self.radii_m
         return type(self)(centers_m, np.maximum.reduceat(reaches_m, starts) * (1 + ROUNDING))
 
-    def _in_view(self, posed: PosedCamera, margin_px: float) -> NDArray[np.bool_]:
-        """Whether each sphere may enter the camera's field of view, (n,)."""
-        return posed.camera.field_of_view(margin_px).may_contain(posed.camera_coordinates(self.centers_m), self.radii_m)
+    def _in_view(self, posed: PosedCamera, view: FieldOfView) -> NDArray[np.bool_]:
+        """Whether each sphere may enter a field of view of the camera, (n,)."""
+        return view.may_contain(posed.camera_coordinates(self.centers_m), self.radii_m)

@@ -104,8 +104,10 @@ def _full_chain(
         electrons = dr.minimum(electrons, number(sensor.full_well_e))  # 6
         # 7 and 8: read and ADC noise are normal and both follow the clip, so one draw has the sum of their variances.
         noise, _ = normals(kernel_seed(key, "read"), column, row)
-        of_row, _ = normals(kernel_seed(individual, "rows"), mi.UInt32(0), row)
-        of_column, _ = normals(kernel_seed(individual, "columns"), column, mi.UInt32(0))
+        of_row = _of_lines(kernel_seed(individual, "rows"), row, [(roi.row, roi.end_row) for roi in rois], 1)
+        of_column = _of_lines(
+            kernel_seed(individual, "columns"), column, [(roi.column, roi.end_column) for roi in rois], 0
+        )
         electrons = electrons + number(sensor.dark_noise_e) * noise
         electrons = electrons + number(sensor.row_offset_e) * of_row + number(sensor.column_offset_e) * of_column
         level = dr.round(electrons / number(sensor.gain_at_iso_e_per_dn)) + number(sensor.black_level_dn)  # 8 and 9
@@ -113,6 +115,20 @@ def _full_chain(
         dr.eval(dn)
     image: NDArray[np.uint32] = dn.numpy()
     return image
+
+
+def _of_lines(seed: Any, line: Any, extents: Sequence[tuple[int, int]], axis: int) -> Any:
+    """A normal number of each pixel's row (axis 1) or column (axis 0), numbered `line`: drawn once for all its pixels.
+
+    extents: of the regions, first row or column and that after the last.
+    """
+    first, end = min(one for one, _ in extents), max(end for _, end in extents)
+    offset = dr.opaque(mi.UInt32, first % 2**32)
+    place = [mi.UInt32(0), mi.UInt32(0)]
+    place[axis] = dr.arange(mi.UInt32, end - first) + offset
+    drawn, _ = normals(seed, *place)
+    dr.eval(drawn)
+    return dr.gather(mi.Float, drawn, line - offset)
 
 
 def _of_hot_pixels(sensor: Sensor, individual: str, column: Any, row: Any) -> Any:
