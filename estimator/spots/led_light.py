@@ -80,8 +80,10 @@ class Ellipse:
         Takes a row of u (1, columns) and a column of v (rows, 1); returns (rows, columns).
         """
         du, dv = u_px - self.centre_px[0], v_px - self.centre_px[1]
-        (uu, uv), (_, vv) = (self.axes / (self.semi_axes_px + padding_px) ** 2) @ self.axes.T
-        return np.asarray(uu * du**2 + vv * dv**2 + (2 * uv * dv) * du)
+        (uu, uv), (_, vv) = ((self.axes / (self.semi_axes_px + padding_px) ** 2) @ self.axes.T).tolist()
+        # uu du^2 + vv dv^2 + 2 uv du dv as one product of matrices, which takes a third of the time of its sums.
+        by_row = np.concatenate([vv * dv**2, np.ones_like(dv), 2 * uv * dv], axis=1)
+        return np.asarray(by_row @ np.concatenate([np.ones_like(du), uu * du**2, du]))
 
     def half_extent(self, padding_px: float) -> NDArray[np.float64]:
         """Half width and half height, (2,), of the upright box around the padded ellipse."""
@@ -169,9 +171,11 @@ class Light:
             return self._noise.second(du, dv) / self.flux_e**2
         # A centroid of box means is a sum over the raw pixels, weighted by the box means of the centroid's weights.
         box = (2 * denoise_radius_px + 1, 2 * denoise_radius_px + 1)
-        levers = np.stack([self.support * du, self.support * dv[:, None]]) / self.flux_e
-        weights = np.stack([cv2.blur(lever, box, borderType=cv2.BORDER_CONSTANT).ravel() for lever in levers])
-        return np.asarray((weights * self.variance_e2.ravel()) @ weights.T)
+        levers = self.support * (du / self.flux_e), self.support * (dv / self.flux_e)[:, None]
+        along_u, along_v = (cv2.blur(lever, box, borderType=cv2.BORDER_CONSTANT) for lever in levers)
+        of_u, of_v = self.variance_e2 * along_u, self.variance_e2 * along_v
+        mixed = np.vdot(of_u, along_v)
+        return np.array([[np.vdot(of_u, along_u), mixed], [mixed, np.vdot(of_v, along_v)]])
 
     def moment_sigmas_px2(self, centroid_px: NDArray[np.float64], moments: NDArray[np.float64]) -> NDArray[np.float64]:
         """Standard deviations (2,) of the second moments (2,) along u and v by the pixels' noise."""
