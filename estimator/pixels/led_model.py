@@ -230,13 +230,15 @@ class RenderedLeds:
             index = np.full(self._rois.cells(), len(cells))
             index[cells] = np.arange(len(cells))
             at = index[self._rois.cell(pieces.roi, pieces.row, pieces.column)]
-            sums = [np.bincount(at, slope, len(cells) + 1)[:-1] for slope in pieces.slopes.T]
-            return np.stack(sums, axis=1)
+            sums = np.empty((len(pieces.slopes), len(cells)))
+            for parameter, slope in enumerate(pieces.slopes):
+                sums[parameter] = np.bincount(at, slope, len(cells) + 1)[:-1]
+            return sums.T
         fine = self._rois.padded(lens.radius_px).subdivided(lens.slope_factors)
         coarsening = (lens.factors // lens.slope_factors)[pieces.roi]
         at = fine.cell(pieces.roi, pieces.row // coarsening, pieces.column // coarsening)
-        slopes = np.empty((len(cells), pieces.slopes.shape[1]))
-        for parameter, slope in enumerate(pieces.slopes.T):
+        slopes = np.empty((len(cells), len(pieces.slopes)))
+        for parameter, slope in enumerate(pieces.slopes):
             sharp: Floats = np.asarray(np.bincount(at, slope / coarsening**2, fine.cells()), dtype=np.float64)
             slopes[:, parameter] = _blurred(sharp, fine, self._rois, lens, lens.slope_kernels)[cells]
         return slopes
@@ -276,11 +278,11 @@ class LedImageModel:
 
         `parameters` are those of the IMAGE_PARAMETERS and MOTION_COLUMNS that derivatives are by.
         """
-        lens, factors = self._lens, self._lens.factors[self._led, None]
+        lens, factors = self._lens, self._lens.factors[self._led]
         offsets_m = state.of(self._led).rims_m(self._rims_m[:, None])[:, 0]
-        rims = state.project(self._centres_m[self._led] + state.shifts_m[self._led] + offsets_m)
+        rims = state.project((self._centres_m + state.shifts_m)[self._led] + offsets_m)
         slopes = _slopes(rims, offsets_m, state.camera, parameters)
-        outlines = Outlines(rims.pixels * factors, self._following, self._led, slopes * factors[:, None])
+        outlines = Outlines(rims.pixels * factors[:, None], self._following, self._led, slopes * factors)
         covered, pieces = cover(self._fine, outlines)
         light = covered * self._fine_fall_off
         pieces = pieces.times(self._fine_fall_off[self._fine.cell(pieces.roi, pieces.row, pieces.column)])
@@ -290,19 +292,21 @@ class LedImageModel:
 
 
 def _slopes(rims: ProjectedPoints, offsets_m: Floats, camera: Camera, parameters: Ints) -> Floats:
-    """Derivatives (n, 2, p) of points of rims by parameters (p,); `offsets_m` (n, 3) are from their LEDs' centres."""
+    """Derivatives (2, p, n) of points of rims by parameters (p,); `offsets_m` (n, 3) are from their LEDs' centres."""
     # A point of the face moves its image as much as the camera moves it by the opposite way.
     by_size = -np.einsum("nij,nj->ni", rims.slopes[:, :, :3], offsets_m)[:, :, None]
-    by_tilts = -rims.slopes[:, :, 2:3] * offsets_m[:, None, :2]
-    blocks = {0: rims.slopes, SIZE_PARAMETER: by_size, SIZE_PARAMETER + 1: by_tilts}
+    blocks = {0: rims.slopes, SIZE_PARAMETER: by_size}
+    if (parameters > SIZE_PARAMETER).any():
+        blocks[SIZE_PARAMETER + 1] = -rims.slopes[:, :, 2:3] * offsets_m[:, None, :2]
     if ((parameters >= POSE_PARAMETERS) & (parameters < SIZE_PARAMETER)).any():
         blocks[POSE_PARAMETERS] = intrinsic_slopes_px(rims.p_cam, camera.normalized(rims.pixels), camera)
     if rims.motion_slopes is not None:
         blocks[LOCAL_PARAMETERS] = rims.motion_slopes
-    slopes = np.zeros((len(offsets_m), 2, len(parameters)))
+    slopes = np.zeros((2, len(parameters), len(offsets_m)))
     for first, block in blocks.items():
-        wanted = (parameters >= first) & (parameters < first + block.shape[2])
-        slopes[:, :, wanted] = block[:, :, parameters[wanted] - first]
+        for column, parameter in enumerate(parameters.tolist()):
+            if first <= parameter < first + block.shape[2]:
+                slopes[:, column] = block[:, :, parameter - first].T
     return slopes
 
 
