@@ -250,7 +250,9 @@ def _centres_px(first: int, last: int) -> Pixels:
 def _within(mask: NDArray[np.bool_], radius_px: float) -> NDArray[np.bool_]:
     """Pixels of a mask, and those at most this far from one."""
     if radius_px > MAX_KERNEL_PX:
-        return np.asarray(cv2.distanceTransform((~mask).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE) <= radius_px)
+        return np.asarray(
+            cv2.distanceTransform((~mask).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE) <= radius_px
+        )
     along = np.arange(-int(radius_px), int(radius_px) + 1)
     disc = (along[:, None] ** 2 + along**2 <= radius_px**2).view(np.uint8)
     return np.asarray(cv2.dilate(mask.view(np.uint8), disc).view(bool))
