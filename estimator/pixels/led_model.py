@@ -12,7 +12,8 @@ thousand electrons is 1e-2.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -44,6 +45,7 @@ FACE_PARAMETERS = 3
 """Parameters of a face: the relative error of its size, then its two tilts, see `ImageState`."""
 IMAGE_PARAMETERS = POSE_PARAMETERS + CAMERA_PARAMETERS + FACE_PARAMETERS
 """Parameters of LED images: the pose's, the intrinsics', then those of the LED's own face."""
+PRINCIPAL_POINT = (POSE_PARAMETERS + 2, POSE_PARAMETERS + 3)
 SIZE_PARAMETER = IMAGE_PARAMETERS - FACE_PARAMETERS
 TILT_PARAMETERS = (SIZE_PARAMETER + 1, SIZE_PARAMETER + 2)
 PROFILE_PARAMETERS = 3
@@ -158,13 +160,18 @@ def rim(led: Led, points: int) -> Floats:
 
     `points` is a multiple of 4.
     """
-    if led.shape == "disc":
+    return np.asarray(led.half_width_m * _unit_rim(led.shape, points))
+
+
+@lru_cache(maxsize=256)
+def _unit_rim(shape: str, points: int) -> Floats:
+    """Polygon of the area of a face of half width 1, (points, 3)."""
+    if shape == "disc":
         step = 2 * np.pi / points
         angles = step * np.arange(points)
-        radius_m = led.half_width_m * np.sqrt(step / np.sin(step))
-        return np.asarray(radius_m * np.column_stack([np.cos(angles), np.sin(angles), 0 * angles]))
+        return np.asarray(np.sqrt(step / np.sin(step)) * np.column_stack([np.cos(angles), np.sin(angles), 0 * angles]))
     along = np.arange(points // 4) / (points // 4) * 2 - 1
-    side = led.half_width_m * np.column_stack([np.ones_like(along), along, 0 * along])
+    side = np.column_stack([np.ones_like(along), along, 0 * along])
     quarter_turn = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])  # of row vectors, from x to y
     sides = [side]
     for _ in range(3):
@@ -189,20 +196,19 @@ def fall_off(rois: RoiStack, centres_px: Floats, camera: Camera, factors: Ints |
     values = relative_illumination(np.column_stack([u.ravel(), v.ravel()]), camera).reshape(shape)
     values = np.nan_to_num(values / relative_illumination(centres_px, camera)[:, None, None])
     cells = np.zeros(rois.cells())
-    # Barycentric weights of Chebyshev's first-kind nodes.
-    barycentric = np.asarray((-1.0) ** k * np.sin(np.pi * (k + 0.5) / FALL_OFF_NODES), dtype=np.float64)
     for roi, value in enumerate(values):
-        columns, rows = (
-            _interpolation((2 * np.arange(n) + 1) / n - 1, nodes, barycentric)
-            for n in (int(rois.widths[roi]), int(rois.heights[roi]))
-        )
+        columns, rows = (_interpolation(int(size)) for size in (rois.widths[roi], rois.heights[roi]))
         rois.roi(cells, roi)[:] = rows @ value @ columns.T
     return cells
 
 
-def _interpolation(at: Floats, nodes: Floats, barycentric: Floats) -> Floats:
-    """Lagrange's polynomials of the nodes (k,) at points (n,), (n, k)."""
-    offset = at[:, None] - nodes
+@lru_cache(maxsize=512)
+def _interpolation(pixels: int) -> Floats:
+    """Lagrange's polynomials of the FALL_OFF_NODES at the centres of pixels along a line, (pixels, nodes)."""
+    k = np.arange(FALL_OFF_NODES)
+    # Barycentric weights of Chebyshev's first-kind nodes.
+    barycentric = (-1.0) ** k * np.sin(np.pi * (k + 0.5) / FALL_OFF_NODES)
+    offset = ((2 * np.arange(pixels) + 1) / pixels - 1)[:, None] - np.cos(np.pi * (k + 0.5) / FALL_OFF_NODES)
     on_node = np.abs(offset) < 1e-14
     weights = barycentric / np.where(on_node, 1.0, offset)
     weights = np.where(on_node.any(axis=1, keepdims=True), on_node, weights)
@@ -222,6 +228,17 @@ class RenderedLeds:
     _rois: RoiStack
     _pieces: EdgePieces
     _lens: LensBlur
+
+    def by_shift_and_size(self) -> "RenderedLeds":
+        """The same images, with derivatives by the principal point, which shifts them, and by the size alone."""
+        pieces = self._pieces
+        shifts = pieces.shifts * self._lens.factors[pieces.roi]
+        of_size = pieces.slopes[self.parameters == SIZE_PARAMETER]
+        return replace(
+            self,
+            parameters=np.array([*PRINCIPAL_POINT, SIZE_PARAMETER]),
+            _pieces=replace(pieces, slopes=np.concatenate([shifts, of_size])),
+        )
 
     def slopes(self, cells: Ints) -> Floats:
         """Derivatives of the light in n cells by the p parameters of the model, (n, p)."""

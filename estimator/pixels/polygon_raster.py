@@ -88,7 +88,8 @@ class Outlines:
     """Closed polygons: `points` (n, 2) in pixels, all outlines one after another, and `roi` (n,) each point's region.
 
     `following` (n,) is the index of the next point of the same outline, and `slopes` (2, p, n) are the derivatives of
-    the points' u and v by p parameters. No edge may be longer than MAX_EDGE_PX; each outline runs in the sense from u to v.
+    the points' u and v by p parameters. No edge may be longer than MAX_EDGE_PX; each outline runs in the sense from u
+    to v.
     """
 
     points: Floats
@@ -101,17 +102,19 @@ class Outlines:
 class EdgePieces:
     """Edges cut at the lines between pixels: m pieces inside their regions, with the pixel (m,) of each.
 
-    `slopes` (p, m) are the derivatives of the pixel's covered share by p parameters.
+    `slopes` (p, m) are the derivatives of the pixel's covered share by p parameters, `shifts` (2, m) those by shifts of
+    the outline along u and v.
     """
 
     roi: Ints
     row: Ints
     column: Ints
     slopes: Floats
+    shifts: Floats
 
     def times(self, factor: Floats) -> "EdgePieces":
         """The pieces with their derivatives multiplied by a factor for each, (m,)."""
-        return EdgePieces(self.roi, self.row, self.column, self.slopes * factor)
+        return EdgePieces(self.roi, self.row, self.column, self.slopes * factor, self.shifts * factor)
 
 
 def cover(rois: RoiStack, outlines: Outlines) -> tuple[Floats, EdgePieces]:
@@ -146,12 +149,13 @@ def cover(rois: RoiStack, outlines: Outlines) -> tuple[Floats, EdgePieces]:
     covered: Floats = np.cumsum(increments[:-1], dtype=np.float64)
 
     # Velocity at the middle of each edge: over so short an edge it is constant.
-    of_u, of_v = outlines.slopes
-    gained = ((of_u + of_u[:, following]) * dv - (of_v + of_v[:, following]) * du) / 2
-    slopes = gained[:, edge] * length
+    of_u, of_v = outlines.slopes + np.take(outlines.slopes, following, axis=2)
+    slopes = np.take((of_u * dv - of_v * du) / 2, edge, axis=1) * length
+    shifts = np.stack([rise, -du[edge] * length])
     if not within.all():
-        roi, row, column, slopes = roi[within], row[within], column[within], slopes[:, within]
-    return covered, EdgePieces(roi, row, column, slopes)
+        roi, row, column = roi[within], row[within], column[within]
+        slopes, shifts = slopes[:, within], shifts[:, within]
+    return covered, EdgePieces(roi, row, column, slopes, shifts)
 
 
 def _crossing(start: Floats, step: Floats, following: Ints) -> Floats:
