@@ -47,6 +47,8 @@ MIN_CENTROID_SIGMA_PX = 1e-4
 _ALONG, _SHARES = np.sqrt(1.8) * np.array([-1.0, 0.0, 1.0]), np.array([5.0, 8.0, 5.0]) / 18
 FACE_NODES = np.stack(np.meshgrid(_ALONG, _ALONG, indexing="ij"), axis=-1).reshape(-1, 2)
 FACE_WEIGHTS = np.outer(_SHARES, _SHARES).ravel()
+_OF_NODES = np.column_stack([FACE_NODES, np.ones(len(FACE_NODES))])
+_NODES_2 = (FACE_NODES**2).sum(axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,10 +206,13 @@ def light_centres_m(leds_m: Floats, lift_m2: Floats, camera_m: Floats) -> Floats
     """
     offset = leds_m - camera_m
     s = np.sqrt(lift_m2 / 4)[:, None]
-    nearer = 2 * s * (offset[:, :2] @ FACE_NODES.T) + s**2 * (FACE_NODES**2).sum(axis=1)
-    weights = FACE_WEIGHTS / ((offset**2).sum(axis=1, keepdims=True) + nearer) ** 2
+    distance2 = (2 * s * offset[:, :2]) @ FACE_NODES.T
+    distance2 += s**2 * _NODES_2 + np.einsum("ni,ni->n", offset, offset)[:, None]
+    distance2 *= distance2
+    # The means of the nodes times their weights, and the weights' sum.
+    sums = (FACE_WEIGHTS / distance2) @ _OF_NODES
     points = leds_m.copy()
-    points[:, :2] += s * (weights @ FACE_NODES) / weights.sum(axis=1, keepdims=True)
+    points[:, :2] += s * sums[:, :2] / sums[:, 2:]
     return points
 
 
