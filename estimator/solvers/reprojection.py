@@ -9,7 +9,6 @@ Where the camera has a rolling shutter, its velocity while the frame is read out
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -22,10 +21,10 @@ from estimator.camera.motion import MOTION_PARAMETERS
 from estimator.camera.pose import POSE_PARAMETERS, Pose
 from estimator.errors import EstimationFailure
 from estimator.solvers import second_order
+from estimator.solvers.least_squares import Function, least_squares_minimum
 from estimator.solvers.observations import Observations, moving_slopes, position_slopes
 
 Floats = NDArray[np.float64]
-Function = Callable[[Floats], Floats]
 Loss = Literal["linear", "soft_l1"]
 
 # With gravity, two spots have as many coordinates as a pose has parameters.
@@ -37,10 +36,6 @@ MAX_EVALUATIONS = 60
 TOLERANCE = 1e-8
 # The same for a search that only has to tell how bad another minimum is.
 COARSE_TOLERANCE = 0.2
-# Damping, as a share of the information's diagonal, after a step that does not lower the sum, and its factor from one
-# step to the next.
-MIN_DAMPING = 1e-3
-DAMPING_RATIO = 10.0
 # The slopes of a spot by the map change with the pose by a share of the error of the initial pose: the weights of the
 # second repetition are those at a pose that is good to the errors stated.
 RELINEARIZATIONS = 2
@@ -234,8 +229,7 @@ class _Search:
                 x0 = np.concatenate([vector, shift, velocity])
                 if loss == "soft_l1":
                     return _robustly(self.residuals, x0, self.jacobian)
-                # SciPy takes several times as long.
-                return _minimum(self.residuals, x0, self.jacobian, tolerance)
+                return least_squares_minimum(self.residuals, x0, self.jacobian, tolerance, MAX_EVALUATIONS)[:3]
         except (np.linalg.LinAlgError, ValueError, cv2.error):
             raise EstimationFailure("position", UNDETERMINED) from None
 
@@ -283,36 +277,6 @@ def _fit(observations: Observations, start: Pose, whitening: Floats, loss: Loss)
         velocity=x[POSE_PARAMETERS:],
         motion_chi2=float((at_minimum[2 * count + 2 :] ** 2).sum()),
     )
-
-
-def _minimum(residuals: Function, x0: Floats, jacobian: Function, tolerance: float) -> tuple[Floats, Floats, float]:
-    """Minimum of the sum of squares from x0, the residuals there, and the sum; raises ValueError, LinAlgError.
-
-    Gauss-Newton, damped where a step does not lower the sum (Levenberg-Marquardt).
-    """
-    x, at, slopes, damping = x0, residuals(x0), jacobian(x0), 0.0
-    cost = float(at @ at)
-    if not (np.isfinite(cost) and np.isfinite(slopes).all()):
-        raise ValueError("residuals are not finite")
-    for _ in range(MAX_EVALUATIONS):
-        information, gradient = slopes.T @ slopes, slopes.T @ at
-        held = damping * information.diagonal()
-        step = -np.linalg.solve(information + np.diag(held), gradient)
-        promised = float(step @ (held * step) - step @ gradient)
-        there = residuals(x + step)
-        new_cost = float(there @ there)
-        if new_cost < cost:
-            small = max(cost - new_cost, promised) <= tolerance * cost
-            x, at, cost = x + step, there, new_cost
-            damping = damping / DAMPING_RATIO if damping > MIN_DAMPING else 0.0
-            if small:
-                break
-            slopes = jacobian(x)
-        elif promised <= tolerance * cost:
-            break
-        else:
-            damping = max(DAMPING_RATIO * damping, MIN_DAMPING)
-    return x, at, cost
 
 
 def _robustly(residuals: Function, x0: Floats, jacobian: Function) -> tuple[Floats, Floats, float]:
