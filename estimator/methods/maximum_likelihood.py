@@ -49,7 +49,7 @@ from estimator.pixels.search import (
     unexplained,
 )
 from estimator.solvers import second_order
-from estimator.solvers.observations import Observations, observe_frame
+from estimator.solvers.observations import Observations, observe_once
 from estimator.solvers.reprojection import fit
 from estimator.solvers.uncertainty import assumed_uncertainty
 from estimator.spots.correspondences import find_correspondences
@@ -115,7 +115,7 @@ def ml(frame: DeviceFrame) -> Estimate:
     if not all(led.has_size for led in frame.leds.values()):
         raise EstimationFailure("fit", "the map does not say how large its LEDs are")
     correspondences = find_correspondences(frame)
-    observations = observe_frame(frame)
+    observations = observe_once(frame, correspondences)
     inliers, use_gravity, is_ambiguous = np.ones(len(observations.leds_m), dtype=bool), True, False
     exact, unchecked_m2 = True, np.zeros((3, 3))
     if len(observations.leds_m) < MIN_FOR_CONSENSUS:

@@ -21,7 +21,7 @@ from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame, normalized
 from estimator.io.records import is_covariance
 from estimator.methods.variant import Estimate, Variant
-from estimator.solvers.observations import Observations, observe, observe_frame
+from estimator.solvers.observations import Observations, observe, observe_once
 from estimator.solvers.ordinary_covariance import ordinary_covariance
 from estimator.solvers.shutter_motion import motion_prior
 from estimator.solvers.trilateration import check_pattern
@@ -60,7 +60,8 @@ def _estimate(frame: DeviceFrame, methods: Sequence[int]) -> Estimate:
     def once(method: int, compute: Callable[[], Candidates]) -> Candidates:
         return frame.once(("pnp", weakref.ref(frame), method), compute)
 
-    return _located(frame, find_correspondences(frame), methods, once, partial(observe_frame, frame))
+    correspondences = find_correspondences(frame)
+    return _located(frame, correspondences, methods, once, partial(observe_once, frame, correspondences))
 
 
 def fit_correspondences(

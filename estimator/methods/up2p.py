@@ -23,7 +23,7 @@ from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame
 from estimator.methods.centroid_sigma import with_centroid_sigma
 from estimator.methods.variant import Estimate, Variant
-from estimator.solvers.observations import Observations, observe, observe_frame
+from estimator.solvers.observations import Observations, observe, observe_once
 from estimator.solvers.robust_fit import consensus
 from estimator.solvers.trilateration import determine_orientation
 from estimator.spots.correspondences import find_correspondences
@@ -53,9 +53,9 @@ def up2p(frame: DeviceFrame, centroid_sigma_px: float = 0.0) -> Estimate:
     """
     if poselib is None:
         raise EstimationFailure("up2p", "PoseLib is not installed (pip install vlcrender[poselib])")
-    find_correspondences(frame)
+    correspondences = find_correspondences(frame)
     _check_gravity(frame)
-    return _estimate(observe_frame(frame, centroid_sigma_px))
+    return _estimate(observe_once(frame, correspondences, centroid_sigma_px))
 
 
 def fit_correspondences(

@@ -37,7 +37,7 @@ from estimator.camera.undistort import has_pinhole_image, pinhole_image
 from estimator.io.device import Camera, DeviceFrame
 from estimator.solvers.shutter_motion import ShutterMotion, image_slopes, motion_prior
 from estimator.solvers.uncertainty import Uncertainty, assumed_camera, uncertainty
-from estimator.spots.correspondences import centroids_px, find_correspondences, led_positions_m
+from estimator.spots.correspondences import centroids_px, led_positions_m
 from estimator.spots.identify import Correspondence
 
 Floats = NDArray[np.float64]
@@ -194,11 +194,13 @@ def observe(
     )
 
 
-def observe_frame(frame: DeviceFrame, centroid_sigma_px: float = 0.0) -> Observations:
-    """`observe` of a frame's own spots, once for all variants of the frame; raises EstimationFailure."""
+def observe_once(
+    frame: DeviceFrame, correspondences: Sequence[Correspondence], centroid_sigma_px: float = 0.0
+) -> Observations:
+    """`observe` of a frame's own spots, once for all variants of the frame."""
     # The reference does not keep the frame, which holds the results, and no other frame equals it.
     key = "observations", weakref.ref(frame), centroid_sigma_px
-    return frame.once(key, lambda: observe(frame, find_correspondences(frame), centroid_sigma_px))
+    return frame.once(key, lambda: observe(frame, correspondences, centroid_sigma_px))
 
 
 def centroid_images(pose: Pose, leds_m: Floats, lift_m2: Floats) -> tuple[Floats, Floats]:
