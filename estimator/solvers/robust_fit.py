@@ -398,14 +398,14 @@ def minima(observations: Observations, starts: Iterable[Pose], robust: bool = Fa
         if any(_same_minimum(start, other.pose) for other in fits):
             continue
         try:
-            if fits and not robust and (start := _promising(observations, start, fits)) is None:
+            near = start if robust or not fits else _promising(observations, start, fits)
+            if near is None:
                 continue
-            found = fit(observations, start, "soft_l1" if robust else "linear")
+            found = fit(observations, near, "soft_l1" if robust else "linear")
         except EstimationFailure:
             continue
-        depth_m = centroid_images(found.pose, observations.leds_m, observations.lift_m2)[1]
         below = found.pose.position_m[2] < observations.leds_m[:, 2].min()
-        in_front = depth_m > 0
+        in_front = centroid_images(found.pose, observations.leds_m, observations.lift_m2)[1] > 0
         possible = below and (2 * in_front.sum() > len(in_front) if robust else in_front.all())
         distinct = not any(_same_minimum(found.pose, other.pose) for other in fits)
         if possible and np.isfinite(found.cost) and distinct:

@@ -242,7 +242,8 @@ def _ellipse(core: NDArray[np.bool_], left: int, top: int, stretch: float) -> El
     """Ellipse with the centroid and second moments of the pixels set; (left, top) is the first pixel of `core`."""
     pixels = Moments(core.astype(np.float64))
     count = pixels.total
-    u_px, v_px = np.arange(core.shape[1]) + left + 0.5, np.arange(core.shape[0]) + top + 0.5
+    u_px = np.arange(core.shape[1], dtype=np.float64) + (left + 0.5)
+    v_px = np.arange(core.shape[0], dtype=np.float64) + (top + 0.5)
     centre = pixels.first(u_px, v_px) / count
     variances, axes = _principal_axes(pixels.second(u_px - centre[0], v_px - centre[1]) / count)
     # A uniform ellipse has variance a^2 / 4 along its semi-axis a.
