@@ -1,4 +1,4 @@
-"""Collinearity equations: position and rotation together from spots, by nonlinear least squares.
+"""Collinearity equations: position and rotation together from spots, by nonlinear least squares (SciPy).
 
 An LED, the projection centre and the LED's image lie on one line: `p_cam = R (a - p)` for an LED at a, and its image is
 the projection of `p_cam`. Each LED gives two equations in the six unknowns, p and R.
@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter
+from scipy.optimize import least_squares
 
 from estimator.camera.pose import Pose, rotation
 from estimator.camera.projection import Projection
 from estimator.errors import EstimationFailure
-from estimator.solvers.least_squares import least_squares_minimum
 from estimator.solvers.trilateration import check_pattern
 
 Floats = NDArray[np.float64]
@@ -26,6 +26,8 @@ START_STEP_DEG = 7.5
 MAX_START_DEG = 75.0
 MAX_STARTS = 4
 MAX_EVALUATIONS = 100
+# A relative step this small is the last: convergence is quadratic, so the next would be its square, or rounding.
+STEP_TOLERANCE = 1e-10
 # Relative change of the cost: at 1e-15 the position is within 3e-8 standard deviations of the minimum.
 COST_TOLERANCE = 1e-15
 # A leveled ray at a smaller sine of elevation meets the ceiling some ten room heights away.
@@ -112,8 +114,18 @@ def fit_pose(leds_m: Floats, image: Floats, projection: Projection, start: Pose)
 
     vector = cv2.Rodrigues(start.R_cam_world)[0].ravel()
     first = np.concatenate([start.position_m, vector])
-    try:
-        found = least_squares_minimum(residuals, first, jacobian, COST_TOLERANCE, MAX_EVALUATIONS)
-    except (np.linalg.LinAlgError, ValueError):
+    if not np.isfinite(residuals(first)).all():
         return None
-    return (pose_of(found.x), found.cost) if found.converged else None
+    # Of SciPy's methods, "trf" shortens a step on which an LED loses its image.
+    found = least_squares(
+        residuals,
+        first,
+        jacobian,
+        method="trf",
+        x_scale="jac",
+        xtol=STEP_TOLERANCE,
+        ftol=COST_TOLERANCE,
+        gtol=COST_TOLERANCE,
+        max_nfev=MAX_EVALUATIONS,
+    )
+    return (pose_of(found.x), 2 * float(found.cost)) if found.success else None

@@ -4,7 +4,6 @@ The damping is Levenberg and Marquardt's. SciPy's solvers take several times as 
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,25 +15,21 @@ Function = Callable[[Floats], Floats]
 # step to the next.
 MIN_DAMPING = 1e-3
 DAMPING_RATIO = 10.0
-
-
-class Minimum(NamedTuple):
-    """Parameters `x` (k,) of a minimum, the residuals (m,) there, and their sum of squares; whether it was reached."""
-
-    x: Floats
-    residuals: Floats
-    cost: float
-    converged: bool
+# A step this small relative to the parameters is the last: convergence is quadratic, so the next would be its square,
+# or rounding.
+STEP_TOLERANCE = 1e-10
 
 
 def least_squares_minimum(
     residuals: Function, x0: Floats, jacobian: Function, tolerance: float, max_steps: int
-) -> Minimum:
+) -> tuple[Floats, Floats, float]:
     """Local minimum of the sum of squares of residuals (m,) from parameters x0 (k,); `jacobian` gives (m, k).
 
-    The search ends where the sum changes by less than a share `tolerance`, as found and as the derivatives promise.
-    Residuals that are not finite count as a sum that is not lower. Raises ValueError if those at x0 are not finite,
-    and LinAlgError if they determine no step.
+    Returns the parameters there, the residuals and their sum of squares.
+
+    The search ends where the sum changes by less than a share `tolerance`, as found and as the derivatives promise, or
+    with a step shorter than STEP_TOLERANCE. Residuals that are not finite count as a sum that is not lower. Raises
+    ValueError if those at x0 are not finite, and LinAlgError if they determine no step.
     """
     x, at, slopes, damping = x0, residuals(x0), jacobian(x0), 0.0
     cost = float(at @ at)
@@ -44,18 +39,19 @@ def least_squares_minimum(
         information, gradient = slopes.T @ slopes, slopes.T @ at
         held = damping * information.diagonal()
         step = -np.linalg.solve(information + np.diag(held), gradient)
+        short = bool(np.linalg.norm(step) <= STEP_TOLERANCE * np.linalg.norm(x))
         promised = float(step @ (held * step) - step @ gradient)
         there = residuals(x + step)
         new_cost = float(there @ there)
         if new_cost < cost:
-            small = max(cost - new_cost, promised) <= tolerance * cost
+            small = short or max(cost - new_cost, promised) <= tolerance * cost
             x, at, cost = x + step, there, new_cost
             if small:
-                return Minimum(x, at, cost, True)
+                break
             damping = damping / DAMPING_RATIO if damping > MIN_DAMPING else 0.0
             slopes = jacobian(x)
-        elif promised <= tolerance * cost:
-            return Minimum(x, at, cost, True)
+        elif short or promised <= tolerance * cost:
+            break
         else:
             damping = max(DAMPING_RATIO * damping, MIN_DAMPING)
-    return Minimum(x, at, cost, False)
+    return x, at, cost

@@ -229,7 +229,7 @@ class _Search:
                 x0 = np.concatenate([vector, shift, velocity])
                 if loss == "soft_l1":
                     return _robustly(self.residuals, x0, self.jacobian)
-                return least_squares_minimum(self.residuals, x0, self.jacobian, tolerance, MAX_EVALUATIONS)[:3]
+                return least_squares_minimum(self.residuals, x0, self.jacobian, tolerance, MAX_EVALUATIONS)
         except (np.linalg.LinAlgError, ValueError, cv2.error):
             raise EstimationFailure("position", UNDETERMINED) from None
 
