@@ -223,8 +223,10 @@ def light_of(readout: Readout, ellipse: Ellipse, others: list[Ellipse], denoise_
         gate_e = BACKGROUND_SIGMA * float(np.sqrt(_median(variance_e2.ravel()[of_ring]) + 1.0))
         ring_fall_off = fall_off.ravel()[of_ring]
         even_e = electrons.ravel()[of_ring] / ring_fall_off
-        # The ring without pixels of another surface or light.
+        # The ring without pixels of another surface or light; all of it where its median is between two surfaces.
         even = np.abs(even_e - _median(even_e)) <= gate_e
+        if not even.any():
+            even[:] = True
         of_ring, ring_fall_off = of_ring[even], ring_fall_off[even]
         above_e = electrons - float(even_e[even].mean()) * fall_off
         if len(of_ring) >= MIN_RING_PIXELS:
