@@ -6,6 +6,7 @@ import pytest
 from estimator_synthetic import Array, View, grid, poisson, render, view_of
 
 from estimator.errors import EstimationFailure
+from estimator.spots import led_light
 from estimator.spots.denoise import NEIGHBOURHOOD_RADIUS_PX, neighbourhood_mean
 from estimator.spots.detect import Spot, detect
 from estimator.spots.led_light import Readout
@@ -253,6 +254,31 @@ def test_the_background_of_a_large_led_image_has_the_fall_off_of_its_light(shape
     (spot,) = detect([readout], image.size, 0, any_square=shape == "square")
     # float32 electrons: rounding of 3e-8 of 4000 in each of 2e4 pixels, at 70 px, is 1e-7 px when it adds at random.
     assert np.hypot(spot.u_px - exact[0], spot.v_px - exact[1]) < 1e-6
+
+
+def test_an_led_between_two_surfaces_of_equal_share_has_a_centroid() -> None:
+    """Half of the ring has 40 electrons, half 160: none of its pixels is near its median, 100.
+
+    With their mean as background the margin of 2.5 px about the disc of 9 px has 60 electrons too few on one side and
+    too many on the other: 160 px at some 6.5 px along u move the centroid of 254 px of 3900 electrons by 0.06 px.
+    """
+    v, u = np.mgrid[:100, :120] + 0.5
+    image = np.where(np.hypot(u - 60, v - 50) < 9, 4000.0, np.where(u < 60, 40.0, 160.0))
+    (spot,) = spots_of(image)
+    assert np.hypot(spot.u_px - 60, spot.v_px - 50) < 0.1
+
+
+@pytest.mark.parametrize("denoised", [False, True])
+def test_masks_padded_by_distances_are_those_padded_by_dilation(
+    denoised: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    v, u = np.mgrid[:500, :600] + 0.5
+    image = 40 + 3960.0 * (np.hypot(u - 160.3, 1.2 * (v - 150.2)) < 70)
+    (dilated,) = spots_of(image, denoised)
+    monkeypatch.setattr(led_light, "MAX_KERNEL_PX", 0.0)
+    (by_distances,) = spots_of(image, denoised)
+    assert (dilated.u_px, dilated.v_px) == (by_distances.u_px, by_distances.v_px)
+    np.testing.assert_array_equal(dilated.covariance_px2, by_distances.covariance_px2)
 
 
 @pytest.mark.parametrize("blur_px", [3, 12, 24])

@@ -12,6 +12,7 @@ from estimator.camera.pose import Pose
 from estimator.io.device import Camera, DiscLed, Led, SquareLed
 from estimator.pixels.led_model import (
     IMAGE_PARAMETERS,
+    PRINCIPAL_POINT,
     SIZE_PARAMETER,
     TILT_PARAMETERS,
     ImageState,
@@ -226,6 +227,19 @@ def test_slopes_by_camera_and_face_are_what_differences_give(
 
     difference = (moved(1) - moved(-1)) / (2 * step)
     assert np.abs(found[:, parameter] - difference).max() < 0.01 * largest
+
+
+@pytest.mark.parametrize("changes", [{}, {"focus_distance_m": 1.5, "f_number": 10.0}])
+def test_a_shift_of_the_image_is_one_of_the_principal_point(changes: dict[str, object]) -> None:
+    """Derivatives that an image has beside those asked for: those of a rendering by these parameters, to rounding."""
+    lens, one = camera(**changes), led("disc")
+    model = images(lens, one, here(lens))
+    cells, at = np.arange(model.rois.cells()), state(here(lens), lens)
+    found = model.render(at, np.array([0, 5, SIZE_PARAMETER])).by_shift_and_size()
+    expected = model.render(at, np.array([*PRINCIPAL_POINT, SIZE_PARAMETER]))
+    assert found.parameters.tolist() == expected.parameters.tolist()
+    largest = np.abs(expected.slopes(cells)).max()
+    np.testing.assert_allclose(found.slopes(cells), expected.slopes(cells), atol=1e-12 * largest)
 
 
 def test_an_led_that_moves_does_as_the_camera_that_moves_back() -> None:

@@ -23,7 +23,7 @@ def circle(u: float, v: float, radius: float) -> Floats:
 
 def outlines(points: Floats, slopes: Floats | None = None) -> Outlines:
     count = len(points)
-    free = np.zeros((count, 2, 0)) if slopes is None else slopes
+    free = np.zeros((2, 0, count)) if slopes is None else slopes.transpose(1, 2, 0)
     return Outlines(points, np.roll(np.arange(count), -1), np.zeros(count, dtype=np.int64), free)
 
 
@@ -73,7 +73,7 @@ def test_regions_do_not_affect_each_other() -> None:
     points = np.concatenate([first, second])
     following = np.concatenate([np.roll(np.arange(len(p)), -1) + s for p, s in ((first, 0), (second, len(first)))])
     belongs = np.repeat([0, 1], [len(first), len(second)])
-    both, _ = cover(rois, Outlines(points, following, belongs, np.zeros((len(points), 2, 0))))
+    both, _ = cover(rois, Outlines(points, following, belongs, np.zeros((2, 0, len(points)))))
     np.testing.assert_allclose(rois.roi(both, 0), covered(roi(0, 2, 20, 15), first), atol=1e-12)
     np.testing.assert_allclose(rois.roi(both, 1), covered(roi(2, 30, 15, 12), second), atol=1e-12)
 
@@ -102,7 +102,7 @@ def test_slopes_are_what_moving_the_outline_gives() -> None:
     _, pieces = cover(rois, outlines(points, moves))
     cells = rois.cell(pieces.roi, pieces.row, pieces.column)
     for parameter in range(3):
-        found = np.bincount(cells, pieces.slopes[:, parameter], rois.cells())
+        found = np.bincount(cells, pieces.slopes[parameter], rois.cells())
         step = 1e-5 * moves[:, :, parameter]
         ahead, behind = (cover(rois, outlines(points + sign * step))[0] for sign in (1, -1))
         # Growing, an edge's ends move by 1 % of a pixel differently: within an edge the middle stands for it.

@@ -16,6 +16,8 @@ def with_errors(camera: Camera, errors: Floats) -> Camera:
 
     Errors of the distortion do not apply to an equidistant camera and have to be zero there.
     """
+    if not errors.any():
+        return camera
     focal, aspect, cx, cy, k1, p1, p2 = errors.tolist()
     (fx, skew, u0), (_, fy, v0), last = camera.K
     K = (

@@ -65,7 +65,7 @@ class Perspective:
         with np.errstate(all="ignore"):
             valid = z > MIN_DEPTH_SHARE * np.linalg.norm(p_cam, axis=1)
             z = np.where(valid, z, np.nan)
-            plane = np.column_stack([x / z, y / z])
+            plane = np.stack([x / z, y / z], axis=1)
             jacobian = np.zeros((len(p_cam), 2, 3))
             jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1 / z
             jacobian[:, :, 2] = -plane / z[:, None]
@@ -177,13 +177,18 @@ def project(points_m: Floats, pose: Pose, camera: Camera) -> ProjectedPoints:
     p_cam = pose.in_camera(points_m)
     image, jacobian = projection_of(camera).project(p_cam)
     K = camera.matrix()
-    to_pixels = K[:2, :2] @ jacobian
+    to_pixels = np.empty_like(jacobian)
+    to_pixels[:, 0] = K[0, 0] * jacobian[:, 0] + K[0, 1] * jacobian[:, 1]
+    to_pixels[:, 1] = K[1, 0] * jacobian[:, 0] + K[1, 1] * jacobian[:, 1]
     slopes = np.empty((len(points_m), 2, POSE_PARAMETERS))
     slopes[:, :, :3] = (to_pixels.reshape(-1, 3) @ -pose.R_cam_world).reshape(-1, 2, 3)
-    offset = points_m - pose.position_m
-    for column, rotation_slope in enumerate(rotation_slopes(pose, camera), start=3):
-        rotated = offset @ rotation_slope.T
-        slopes[:, :, column] = (to_pixels * rotated[:, None]).sum(axis=2)
+    # A turn a of the camera's axes moves a point p in them by a x p, and its image by J (a x p) = (p x J) a.
+    turned = np.empty_like(to_pixels)
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        turned[:, :, i] = p_cam[:, j, None] * to_pixels[:, :, k] - p_cam[:, k, None] * to_pixels[:, :, j]
+    skews = [slope @ pose.R_cam_world.T for slope in rotation_slopes(pose, camera)]
+    axes = np.array([(skew[2, 1], skew[0, 2], skew[1, 0]) for skew in skews])
+    slopes[:, :, 3:] = (turned.reshape(-1, 3) @ axes.T).reshape(-1, 2, 3)
     return ProjectedPoints(camera.to_pixels(image), slopes, p_cam)
 
 

@@ -1,6 +1,7 @@
 """Device knowledge: camera, sensor, accelerometer, LED map, and a frame with all of them (datasets/FORMAT.md)."""
 
 import json
+import math
 from abc import abstractmethod
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -232,8 +233,8 @@ class Sensor(Row):
         It is FULL_SIGMA standard deviations below the full well, of all noise that is added after clipping. The ADC's
         last code needs no such margin: a pixel that reads less has not reached it.
         """
-        added_e = float(np.hypot(self.read_noise_e, np.hypot(self.row_offset_e, self.column_offset_e)))
-        spread_dn = float(np.hypot(added_e / self.gain, self.adc_noise_dn))
+        added_e = math.hypot(self.read_noise_e, self.row_offset_e, self.column_offset_e)
+        spread_dn = math.hypot(added_e / self.gain, self.adc_noise_dn)
         return min(2.0**self.bits - 1, self._well_dn() - FULL_SIGMA * spread_dn)
 
     def floor_e2(self) -> float:

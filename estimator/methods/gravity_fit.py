@@ -24,7 +24,7 @@ from estimator.methods.centroid_sigma import with_centroid_sigma
 from estimator.methods.pnp import candidates, in_a_plane
 from estimator.methods.up2p import upright_pairs, upright_pose
 from estimator.methods.variant import Estimate, Needs, Variant
-from estimator.solvers.observations import Observations, centroid_images, observe
+from estimator.solvers.observations import Observations, centroid_images, observe, observe_once
 from estimator.solvers.robust_fit import Consensus, consensus
 from estimator.solvers.trilateration import determine_orientation
 from estimator.spots.correspondences import find_correspondences
@@ -47,7 +47,7 @@ def gravity_fit(frame: DeviceFrame, centroid_sigma_px: float = 0.0) -> Estimate:
 
     `centroid_sigma_px` is the standard deviation of centroids by errors that the device does not state.
     """
-    observations = observe(frame, find_correspondences(frame), centroid_sigma_px)
+    observations = observe_once(frame, find_correspondences(frame), centroid_sigma_px)
     return _estimate(agreement_of(frame, observations, centroid_sigma_px))
 
 

@@ -39,7 +39,7 @@ from estimator.methods.gravity_fit import agreement_of, ambiguous
 from estimator.methods.up2p import upright_pose
 from estimator.methods.variant import Estimate, Needs, Variant
 from estimator.pixels.initial import START_SIGMA_SHARE, Start, gravity_of, start_at_spots
-from estimator.pixels.led_model import IMAGE_PARAMETERS, PROFILE_PARAMETERS, SIZE_PARAMETER, rim
+from estimator.pixels.led_model import IMAGE_PARAMETERS, PRINCIPAL_POINT, PROFILE_PARAMETERS, SIZE_PARAMETER, rim
 from estimator.pixels.led_pixels import LedPixels, LedsInView, gather_led_pixels, leds_in_view
 from estimator.pixels.likelihood import Noise, fit_photometry, score
 from estimator.pixels.nuisances import NO_COMPONENTS, NO_GRAVITY, Components, Gravity, Nuisances, Priors
@@ -54,7 +54,7 @@ from estimator.pixels.search import (
 )
 from estimator.receiver.known import with_known_gains
 from estimator.solvers import second_order
-from estimator.solvers.observations import Observations, observe
+from estimator.solvers.observations import Observations, observe_once
 from estimator.solvers.reprojection import fit
 from estimator.solvers.uncertainty import assumed_uncertainty
 from estimator.spots.correspondences import find_correspondences
@@ -77,6 +77,8 @@ START_COMPONENTS = Components(place_m=5e-3, size=0.01, profile=0.03)
 SHIFT_TOLERANCE_PX = 3e-3
 SIZE_TOLERANCE_PX = 0.02
 PROFILE_TOLERANCE = 3e-3
+# Images that the last step moved by less reveal what they would reveal after it: a small share of SHIFT_TOLERANCE_PX.
+MAX_LAST_PX = 3e-4
 # Probability that noise reveals one.
 REVEALED_PROBABILITY = 1e-9
 # Movement of an image above which its pixels are gathered once more.
@@ -122,7 +124,7 @@ def ml(frame: DeviceFrame) -> Estimate:
         raise EstimationFailure("fit", "the map does not say how large its LEDs are")
     frame = with_known_gains(frame)
     correspondences = find_correspondences(frame)
-    observations = observe(frame, correspondences)
+    observations = observe_once(frame, correspondences)
     inliers, use_gravity, is_ambiguous = np.ones(len(observations.leds_m), dtype=bool), True, False
     exact, unchecked_m2 = True, np.zeros((3, 3))
     if len(observations.leds_m) < MIN_FOR_CONSENSUS:
@@ -209,12 +211,15 @@ def _revealed(frame: DeviceFrame, gravity: Gravity, priors: Priors, found: Maxim
         return had
     if found.model_is_wrong:
         return START_COMPONENTS
-    state = result.nuisances.state(result.pose, frame.camera, priors.only(pixels.index))
     # A shift of the principal point is one of the image.
-    shift, size = [POSE_PARAMETERS + 2, POSE_PARAMETERS + 3], [SIZE_PARAMETER]
-    rendered = pixels.model.render(state, np.array(shift + size))
-    profile = result.nuisances.profile()
-    photometry = fit_photometry(pixels, rendered, result.used, Noise.of(frame), result.photometry, profile)
+    shift, size = list(PRINCIPAL_POINT), [SIZE_PARAMETER]
+    profile, photometry = result.nuisances.profile(), result.photometry
+    if result.last_px < MAX_LAST_PX:
+        rendered = result.rendered.by_shift_and_size()
+    else:
+        state = result.nuisances.state(result.pose, frame.camera, priors.only(pixels.index))
+        rendered = pixels.model.render(state, np.array(shift + size))
+        photometry = fit_photometry(pixels, rendered, result.used, Noise.of(frame), photometry, profile)
     information, gradient = (one[result.used] for one in score(pixels, rendered, photometry, profile))
     radius_px = pixels.radius_px[result.used]
 

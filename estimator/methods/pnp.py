@@ -6,7 +6,9 @@ Centroids stand for the images of the LEDs' centres, from which they differ slig
 the rest of the motion is not fitted, but its prior counts in the covariance (`estimator.solvers.shutter_motion`).
 """
 
-from collections.abc import Sequence
+import weakref
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import cv2
 import numpy as np
@@ -19,7 +21,7 @@ from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame, normalized
 from estimator.io.records import is_covariance
 from estimator.methods.variant import Estimate, Needs, Variant
-from estimator.solvers.observations import observe
+from estimator.solvers.observations import Observations, observe, observe_once
 from estimator.solvers.ordinary_covariance import ordinary_covariance
 from estimator.solvers.shutter_motion import motion_prior
 from estimator.solvers.trilateration import check_pattern
@@ -27,6 +29,8 @@ from estimator.spots.correspondences import centroids_px, find_correspondences, 
 from estimator.spots.identify import Correspondence
 
 Floats = NDArray[np.float64]
+Candidates = list[tuple[Floats, Floats]]
+Once = Callable[[int, Callable[[], Candidates]], Candidates]
 
 # Depth over length of the LEDs' pattern, from which on the planar solver is no use. Its poses are initial values, so
 # that errors of the map, and luminaires that hang a little askew, may lift LEDs out of the plane.
@@ -51,7 +55,13 @@ def sqpnp(frame: DeviceFrame) -> Estimate:
 
 
 def _estimate(frame: DeviceFrame, methods: Sequence[int]) -> Estimate:
-    return fit_correspondences(frame, find_correspondences(frame), methods)
+    """The estimate from a frame's own spots; a method's candidates are found once for all variants of the frame."""
+
+    def once(method: int, compute: Callable[[], Candidates]) -> Candidates:
+        return frame.once(("pnp", weakref.ref(frame), method), compute)
+
+    correspondences = find_correspondences(frame)
+    return _located(frame, correspondences, methods, once, partial(observe_once, frame, correspondences))
 
 
 def fit_correspondences(
@@ -60,12 +70,22 @@ def fit_correspondences(
     methods: Sequence[int] = (cv2.SOLVEPNP_SQPNP, cv2.SOLVEPNP_IPPE),
 ) -> Estimate:
     """The estimate from identified spots by OpenCV `methods`; of the frame, the camera is used."""
+    return _located(frame, correspondences, methods, None, partial(observe, frame, correspondences))
+
+
+def _located(
+    frame: DeviceFrame,
+    correspondences: Sequence[Correspondence],
+    methods: Sequence[int],
+    once: Once | None,
+    observations: Callable[[], Observations],
+) -> Estimate:
     pixels = pinhole_pixels(centroids_px(correspondences), frame.camera)
     if (prior := motion_prior(frame)) is not None:
         times_s = frame.camera.times_s(*centroids_px(correspondences).T)
         pixels = frame.camera.to_pixels(turned_back(frame.camera.normalized(pixels), prior.velocity, times_s))
-    pose = pose_from_pixels(led_positions_m(correspondences), pixels, frame.camera.matrix(), methods)
-    covariance_m2 = ordinary_covariance(observe(frame, correspondences), pose)
+    pose = pose_from_pixels(led_positions_m(correspondences), pixels, frame.camera.matrix(), methods, once)
+    covariance_m2 = ordinary_covariance(observations(), pose)
     return Estimate(
         pose.position_m, covariance_m2=covariance_m2 if is_covariance(covariance_m2.ravel().tolist()) else None
     )
@@ -76,12 +96,15 @@ def position_from_pixels(leds_m: Floats, pixels: Floats, K: Floats, methods: Seq
     return pose_from_pixels(leds_m, pixels, K, methods).position_m
 
 
-def pose_from_pixels(leds_m: Floats, pixels: Floats, K: Floats, methods: Sequence[int]) -> Pose:
+def pose_from_pixels(
+    leds_m: Floats, pixels: Floats, K: Floats, methods: Sequence[int], once: Once | None = None
+) -> Pose:
     """Pose from LEDs (n, 3) and their pixels (n, 2) in a pinhole with `K`, by OpenCV `methods`.
 
-    Each candidate is refined by Levenberg-Marquardt. Of those with every LED in front of the camera and above it, the
-    one with the smallest reprojection error is returned. IPPE is used for LEDs in a plane. Raises EstimationFailure for
-    fewer than four LEDs, LEDs on one line, LEDs in no plane if IPPE is the only method, and if no candidate is left.
+    Each candidate is refined by Levenberg-Marquardt; `once`, if given, keeps those of a method. Of those with every LED
+    in front of the camera and above it, the one with the smallest reprojection error is returned. IPPE is used for LEDs
+    in a plane. Raises EstimationFailure for fewer than four LEDs, LEDs on one line, LEDs in no plane if IPPE is the
+    only method, and if no candidate is left.
     """
     check_pattern(leds_m, needed=4, flat=False)
     if not in_a_plane(leds_m):
@@ -95,7 +118,8 @@ def pose_from_pixels(leds_m: Floats, pixels: Floats, K: Floats, methods: Sequenc
     min_error = np.inf
     best: Pose | None = None
     for method in methods:
-        for R_cam_world, shift in candidates(model, image, method, refined=True):
+        compute = partial(candidates, model, image, method, refined=True)
+        for R_cam_world, shift in compute() if once is None else once(method, compute):
             p_cam = model @ R_cam_world.T + shift
             position_m = centre_m - R_cam_world.T @ shift
             error = float(np.linalg.norm(p_cam[:, :2] / p_cam[:, 2:] - image))
@@ -113,7 +137,7 @@ def in_a_plane(leds_m: Floats) -> bool:
     return bool(depth < MAX_PLANE_DEPTH * length)
 
 
-def candidates(model: Floats, image: Floats, method: int, refined: bool) -> list[tuple[Floats, Floats]]:
+def candidates(model: Floats, image: Floats, method: int, refined: bool) -> Candidates:
     """Candidate poses by an OpenCV method, as (rotation (3, 3), translation (3,)); the method may find none.
 
     `model` (n, 3) are points in metres relative to their centre, `image` (n, 2) their normalized image coordinates.

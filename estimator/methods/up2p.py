@@ -23,7 +23,7 @@ from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame
 from estimator.methods.centroid_sigma import with_centroid_sigma
 from estimator.methods.variant import Estimate, Needs, Variant
-from estimator.solvers.observations import Observations, observe
+from estimator.solvers.observations import Observations, observe, observe_once
 from estimator.solvers.robust_fit import consensus
 from estimator.solvers.trilateration import determine_orientation
 from estimator.spots.correspondences import find_correspondences
@@ -52,7 +52,9 @@ def up2p(frame: DeviceFrame, centroid_sigma_px: float = 0.0) -> Estimate:
     `centroid_sigma_px` is the standard deviation of centroids by errors that the device does not state.
     """
     check_poselib()
-    return fit_correspondences(frame, find_correspondences(frame), centroid_sigma_px)
+    correspondences = find_correspondences(frame)
+    _check_gravity(frame)
+    return _estimate(observe_once(frame, correspondences, centroid_sigma_px))
 
 
 def check_poselib() -> None:
@@ -65,9 +67,16 @@ def fit_correspondences(
     frame: DeviceFrame, correspondences: Sequence[Correspondence], centroid_sigma_px: float = 0.0
 ) -> Estimate:
     """The estimate from identified spots; of the frame, camera, accelerometer and map are used."""
+    _check_gravity(frame)
+    return _estimate(observe(frame, correspondences, centroid_sigma_px))
+
+
+def _check_gravity(frame: DeviceFrame) -> None:
     if frame.accelerometer is None:
         raise EstimationFailure("leveling", "the device has no accelerometer")
-    observations = observe(frame, correspondences, centroid_sigma_px)
+
+
+def _estimate(observations: Observations) -> Estimate:
     starts = pair_poses(observations)
     if determine_orientation(observations.leds_m) and not observations.displaced:
         observations = observations.without_gravity()
@@ -86,20 +95,18 @@ def pair_poses(observations: Observations) -> list[Pose]:
         pairs = [pairs[k] for k in generator.choice(len(pairs), MAX_PAIRS, replace=False)]
     gate = GATE_SIGMA * float(observations.tilt_sigma_rad.max()) + GATE_PX * observations.camera.pixel_angle_rad
     level_up, leds_up = level @ Y_UP.T, observations.leds_m @ Y_UP.T
-    poses = []
-    for pair in map(list, pairs):
-        for upright in poselib.up2p(level_up[pair], leds_up[pair]):
-            yaw = Y_UP.T @ upright.R @ Y_UP
-            poses.append(Pose(Y_UP.T @ upright.center(), tilt @ yaw))
-    if not poses:
+    found = [upright for pair in map(list, pairs) for upright in poselib.up2p(level_up[pair], leds_up[pair])]
+    if not found:
         return []
+    rotations = tilt @ (Y_UP.T @ np.stack([upright.R for upright in found]) @ Y_UP)
+    positions_m = np.stack([upright.center() for upright in found]) @ Y_UP
     # The eccentricity of centroids is far below the gate.
-    p_cam = np.stack([pose.in_camera(observations.leds_m) for pose in poses])
+    p_cam = (observations.leds_m - positions_m[:, None]) @ rotations.transpose(0, 2, 1)
     depth = p_cam[:, :, 2]
     image = p_cam[:, :, :2] / np.where(depth > 0, depth, 1.0)[:, :, None]
     error2 = np.where(depth > 0, ((image - observations.still_image) ** 2).sum(axis=2), np.inf)
     order = np.minimum(error2, gate**2).sum(axis=1).argsort(kind="stable")
-    return [poses[k] for k in order[:MAX_PAIR_STARTS].tolist()]
+    return [Pose(positions_m[k], rotations[k]) for k in order[:MAX_PAIR_STARTS].tolist()]
 
 
 def upright_pose(observations: Observations) -> Pose | None:

@@ -12,7 +12,8 @@ thousand electrons is 1e-2.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -44,6 +45,7 @@ FACE_PARAMETERS = 3
 """Parameters of a face: the relative error of its size, then its two tilts, see `ImageState`."""
 IMAGE_PARAMETERS = POSE_PARAMETERS + CAMERA_PARAMETERS + FACE_PARAMETERS
 """Parameters of LED images: the pose's, the intrinsics', then those of the LED's own face."""
+PRINCIPAL_POINT = (POSE_PARAMETERS + 2, POSE_PARAMETERS + 3)
 SIZE_PARAMETER = IMAGE_PARAMETERS - FACE_PARAMETERS
 TILT_PARAMETERS = (SIZE_PARAMETER + 1, SIZE_PARAMETER + 2)
 PROFILE_PARAMETERS = 3
@@ -158,13 +160,18 @@ def rim(led: Led, points: int) -> Floats:
 
     `points` is a multiple of 4.
     """
-    if led.shape == "disc":
+    return np.asarray(led.half_width_m * _unit_rim(led.shape, points))
+
+
+@lru_cache(maxsize=256)
+def _unit_rim(shape: str, points: int) -> Floats:
+    """Polygon of the area of a face of half width 1, (points, 3)."""
+    if shape == "disc":
         step = 2 * np.pi / points
         angles = step * np.arange(points)
-        radius_m = led.half_width_m * np.sqrt(step / np.sin(step))
-        return np.asarray(radius_m * np.column_stack([np.cos(angles), np.sin(angles), 0 * angles]))
+        return np.asarray(np.sqrt(step / np.sin(step)) * np.column_stack([np.cos(angles), np.sin(angles), 0 * angles]))
     along = np.arange(points // 4) / (points // 4) * 2 - 1
-    side = led.half_width_m * np.column_stack([np.ones_like(along), along, 0 * along])
+    side = np.column_stack([np.ones_like(along), along, 0 * along])
     quarter_turn = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])  # of row vectors, from x to y
     sides = [side]
     for _ in range(3):
@@ -189,20 +196,19 @@ def fall_off(rois: RoiStack, centres_px: Floats, camera: Camera, factors: Ints |
     values = relative_illumination(np.column_stack([u.ravel(), v.ravel()]), camera).reshape(shape)
     values = np.nan_to_num(values / relative_illumination(centres_px, camera)[:, None, None])
     cells = np.zeros(rois.cells())
-    # Barycentric weights of Chebyshev's first-kind nodes.
-    barycentric = np.asarray((-1.0) ** k * np.sin(np.pi * (k + 0.5) / FALL_OFF_NODES), dtype=np.float64)
     for roi, value in enumerate(values):
-        columns, rows = (
-            _interpolation((2 * np.arange(n) + 1) / n - 1, nodes, barycentric)
-            for n in (int(rois.widths[roi]), int(rois.heights[roi]))
-        )
+        columns, rows = (_interpolation(int(size)) for size in (rois.widths[roi], rois.heights[roi]))
         rois.roi(cells, roi)[:] = rows @ value @ columns.T
     return cells
 
 
-def _interpolation(at: Floats, nodes: Floats, barycentric: Floats) -> Floats:
-    """Lagrange's polynomials of the nodes (k,) at points (n,), (n, k)."""
-    offset = at[:, None] - nodes
+@lru_cache(maxsize=512)
+def _interpolation(pixels: int) -> Floats:
+    """Lagrange's polynomials of the FALL_OFF_NODES at the centres of pixels along a line, (pixels, nodes)."""
+    k = np.arange(FALL_OFF_NODES)
+    # Barycentric weights of Chebyshev's first-kind nodes.
+    barycentric = (-1.0) ** k * np.sin(np.pi * (k + 0.5) / FALL_OFF_NODES)
+    offset = ((2 * np.arange(pixels) + 1) / pixels - 1)[:, None] - np.cos(np.pi * (k + 0.5) / FALL_OFF_NODES)
     on_node = np.abs(offset) < 1e-14
     weights = barycentric / np.where(on_node, 1.0, offset)
     weights = np.where(on_node.any(axis=1, keepdims=True), on_node, weights)
@@ -223,6 +229,17 @@ class RenderedLeds:
     _pieces: EdgePieces
     _lens: LensBlur
 
+    def by_shift_and_size(self) -> "RenderedLeds":
+        """The same images, with derivatives by the principal point, which shifts them, and by the size alone."""
+        pieces = self._pieces
+        shifts = pieces.shifts * self._lens.factors[pieces.roi]
+        of_size = pieces.slopes[self.parameters == SIZE_PARAMETER]
+        return replace(
+            self,
+            parameters=np.array([*PRINCIPAL_POINT, SIZE_PARAMETER]),
+            _pieces=replace(pieces, slopes=np.concatenate([shifts, of_size])),
+        )
+
     def slopes(self, cells: Ints) -> Floats:
         """Derivatives of the light in n cells by the p parameters of the model, (n, p)."""
         pieces, lens = self._pieces, self._lens
@@ -230,13 +247,15 @@ class RenderedLeds:
             index = np.full(self._rois.cells(), len(cells))
             index[cells] = np.arange(len(cells))
             at = index[self._rois.cell(pieces.roi, pieces.row, pieces.column)]
-            sums = [np.bincount(at, slope, len(cells) + 1)[:-1] for slope in pieces.slopes.T]
-            return np.stack(sums, axis=1)
+            sums = np.empty((len(pieces.slopes), len(cells)))
+            for parameter, slope in enumerate(pieces.slopes):
+                sums[parameter] = np.bincount(at, slope, len(cells) + 1)[:-1]
+            return sums.T
         fine = self._rois.padded(lens.radius_px).subdivided(lens.slope_factors)
         coarsening = (lens.factors // lens.slope_factors)[pieces.roi]
         at = fine.cell(pieces.roi, pieces.row // coarsening, pieces.column // coarsening)
-        slopes = np.empty((len(cells), pieces.slopes.shape[1]))
-        for parameter, slope in enumerate(pieces.slopes.T):
+        slopes = np.empty((len(cells), len(pieces.slopes)))
+        for parameter, slope in enumerate(pieces.slopes):
             sharp: Floats = np.asarray(np.bincount(at, slope / coarsening**2, fine.cells()), dtype=np.float64)
             slopes[:, parameter] = _blurred(sharp, fine, self._rois, lens, lens.slope_kernels)[cells]
         return slopes
@@ -276,11 +295,11 @@ class LedImageModel:
 
         `parameters` are those of the IMAGE_PARAMETERS and MOTION_COLUMNS that derivatives are by.
         """
-        lens, factors = self._lens, self._lens.factors[self._led, None]
+        lens, factors = self._lens, self._lens.factors[self._led]
         offsets_m = state.of(self._led).rims_m(self._rims_m[:, None])[:, 0]
-        rims = state.project(self._centres_m[self._led] + state.shifts_m[self._led] + offsets_m)
+        rims = state.project((self._centres_m + state.shifts_m)[self._led] + offsets_m)
         slopes = _slopes(rims, offsets_m, state.camera, parameters)
-        outlines = Outlines(rims.pixels * factors, self._following, self._led, slopes * factors[:, None])
+        outlines = Outlines(rims.pixels * factors[:, None], self._following, self._led, slopes * factors)
         covered, pieces = cover(self._fine, outlines)
         light = covered * self._fine_fall_off
         pieces = pieces.times(self._fine_fall_off[self._fine.cell(pieces.roi, pieces.row, pieces.column)])
@@ -290,19 +309,21 @@ class LedImageModel:
 
 
 def _slopes(rims: ProjectedPoints, offsets_m: Floats, camera: Camera, parameters: Ints) -> Floats:
-    """Derivatives (n, 2, p) of points of rims by parameters (p,); `offsets_m` (n, 3) are from their LEDs' centres."""
+    """Derivatives (2, p, n) of points of rims by parameters (p,); `offsets_m` (n, 3) are from their LEDs' centres."""
     # A point of the face moves its image as much as the camera moves it by the opposite way.
     by_size = -np.einsum("nij,nj->ni", rims.slopes[:, :, :3], offsets_m)[:, :, None]
-    by_tilts = -rims.slopes[:, :, 2:3] * offsets_m[:, None, :2]
-    blocks = {0: rims.slopes, SIZE_PARAMETER: by_size, SIZE_PARAMETER + 1: by_tilts}
+    blocks = {0: rims.slopes, SIZE_PARAMETER: by_size}
+    if (parameters > SIZE_PARAMETER).any():
+        blocks[SIZE_PARAMETER + 1] = -rims.slopes[:, :, 2:3] * offsets_m[:, None, :2]
     if ((parameters >= POSE_PARAMETERS) & (parameters < SIZE_PARAMETER)).any():
         blocks[POSE_PARAMETERS] = intrinsic_slopes_px(rims.p_cam, camera.normalized(rims.pixels), camera)
     if rims.motion_slopes is not None:
         blocks[LOCAL_PARAMETERS] = rims.motion_slopes
-    slopes = np.zeros((len(offsets_m), 2, len(parameters)))
+    slopes = np.zeros((2, len(parameters), len(offsets_m)))
     for first, block in blocks.items():
-        wanted = (parameters >= first) & (parameters < first + block.shape[2])
-        slopes[:, :, wanted] = block[:, :, parameters[wanted] - first]
+        for column, parameter in enumerate(parameters.tolist()):
+            if first <= parameter < first + block.shape[2]:
+                slopes[:, column] = block[:, :, parameter - first].T
     return slopes
 
 

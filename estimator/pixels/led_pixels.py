@@ -174,9 +174,9 @@ def gather_led_pixels(frame: DeviceFrame, view: LedsInView, parameters: Ints = P
     rois = _rois(frame, footprints, EDGE_PX + lens.radius_px)
     model = LedImageModel(leds, footprints, frame.camera, lens, rois)
     rendered = model.render(state, parameters)
-    fall_offs = [rois.roi(model.fall_off, k) for k in range(len(leds))]
     with np.errstate(all="ignore"):
-        shares = [np.nan_to_num(rois.roi(rendered.light, k) / fall_offs[k]) for k in range(len(leds))]
+        share_of_cells = np.nan_to_num(rendered.light / model.fall_off)
+    shares = [rois.roi(share_of_cells, k) for k in range(len(leds))]
     masks = [_edge_and_lit(share) for share in shares]
     readings = _readings(frame, rois)
     saturated = np.array([_mostly_saturated(share, known) for share, (_, known) in zip(shares, readings, strict=True)])
@@ -197,14 +197,15 @@ def gather_led_pixels(frame: DeviceFrame, view: LedsInView, parameters: Ints = P
         u, v = footprints.centre[k].tolist()
         du, dv = columns + 0.5 - u, rows + 0.5 - v
         lines = _lines(frame, leds[k], rows, columns)
-        position = _FacePixels(au * du + av * dv, bu * du + bv * dv, fall_offs[k])
+        position = _FacePixels(au * du + av * dv, bu * du + bv * dv, rois.roi(model.fall_off, k))
+        edge, inside = known & masks[k].edge & masks[k].near, known & ~masks[k].edge & (shares[k] > 0.5)
         for of_colour in _colours(frame, rows, columns):
-            row, column = np.nonzero(known & of_colour & masks[k].edge & masks[k].near)
+            of_edge = edge & of_colour
+            row, column = np.nonzero(of_edge)
             if len(row) == 0:
                 continue
             cells = rois.cell(np.full(len(row), k), row + rois.rows[k], column + rois.columns[k])
-            row_in, column_in = np.nonzero(known & of_colour & ~masks[k].edge & (shares[k] > 0.5))
-            groups.append(_group(position, electrons, cells, (row, column), (row_in, column_in), lines))
+            groups.append(_group(position, electrons, cells, of_edge, inside & of_colour, lines))
             led_of_group.append(k)
     if not groups:
         raise EstimationFailure("fit", "no pixel of the LEDs in view is usable: all are saturated or overlap others")
@@ -266,11 +267,11 @@ def _group(
     pixels: _FacePixels,
     electrons: Floats,
     cells: Ints,
-    edge: tuple[Ints, Ints],
-    inside: tuple[Ints, Ints],
+    edge: Mask,
+    inside: Mask,
     lines: Ints | None,
 ) -> _Readings:
-    """Readings of the edge pixels and of blocks of the pixels inside the face, both given by (row, column).
+    """Readings of the edge pixels and of blocks of the pixels inside the face, both given by masks (rows, columns).
 
     `lines` (rows, columns) are those of the pixels where the LED sends.
     """
@@ -282,26 +283,29 @@ def _group(
     light = np.zeros(len(a))
     a, b, fall_off = (values[inside] for values in vars(pixels).values())
     r2 = a * a + b * b
-    tile = np.clip(np.floor((a + 1) * BLOCKS / 2), 0, BLOCKS - 1) * BLOCKS
-    tile += np.clip(np.floor((b + 1) * BLOCKS / 2), 0, BLOCKS - 1)
-    if lines is not None:
-        tile += BLOCKS**2 * lines[inside]
-    first, block = np.unique(tile, return_inverse=True)
-    blocks = int(block.max()) + 1 if len(block) else 0
+    tile = np.clip((a + 1) * (BLOCKS / 2), 0, BLOCKS - 1).astype(np.int64) * BLOCKS
+    tile += np.clip((b + 1) * (BLOCKS / 2), 0, BLOCKS - 1).astype(np.int64)
+    first_line = 0
+    if lines is not None and len(tile):
+        lines_inside = lines[inside]
+        first_line = int(lines_inside.min())
+        tile += BLOCKS**2 * (lines_inside - first_line)
+    pixels_in = np.bincount(tile)
+    blocks = np.flatnonzero(pixels_in)
 
     def summed(values: Floats) -> Floats:
-        return np.asarray(np.bincount(block, values, blocks), dtype=np.float64)
+        return np.asarray(np.bincount(tile, values)[blocks], dtype=np.float64)
 
     sums = np.stack([summed(fall_off * basis) for basis in (np.ones(len(a)), a, b, r2)], axis=1)
     mean = sums[:, 1:] / sums[:, :1]
     return _Readings(
         cells=cells,
-        pixel_counts=np.concatenate([count, summed(np.ones(len(a)))]),
+        pixel_counts=np.concatenate([count, pixels_in[blocks]]),
         electrons=np.concatenate([electrons[edge], summed(electrons[inside])]),
         background=np.concatenate([background, sums]),
         face=np.concatenate([face, mean - [0.0, 0.0, 0.5]]),
         uniform_light=np.concatenate([light, sums[:, 0]]),
-        lines=None if lines is None else np.concatenate([lines[edge], (first // BLOCKS**2).astype(np.int64)]),
+        lines=None if lines is None else np.concatenate([lines[edge], first_line + blocks // BLOCKS**2]),
     )
 
 
@@ -382,7 +386,7 @@ def _edge_and_lit(share: Floats) -> _Masks:
     lit = share > UNIFORM_TOLERANCE
     partly_lit = lit & (share < 1 - UNIFORM_TOLERANCE)
     edge, near_lit, near = (
-        cv2.dilate(mask.astype(np.uint8), np.ones((2 * px + 1, 2 * px + 1), dtype=np.uint8)).astype(bool)
+        cv2.dilate(mask.view(np.uint8), np.ones((2 * px + 1, 2 * px + 1), dtype=np.uint8)).view(bool)
         for mask, px in ((partly_lit, EDGE_PX), (lit, EDGE_PX), (lit, NEAR_PX))
     )
     return _Masks(edge, near_lit, near)

@@ -125,13 +125,15 @@ def fit_photometry(
     weight = of_used_led / n if before is None else before.weight
     level = np.maximum.reduceat(y / n, pixels.starts[:-1]) if before is None else before.level
     count = COEFFICIENTS if phase is None else COEFFICIENTS + 1
-    basis = np.column_stack([pixels.background, light])
+    # One coefficient after another in memory: (c + 1, m), the readings last.
+    columns = np.empty((count + 1, len(y)))
+    columns[:AMPLITUDE], columns[AMPLITUDE], columns[-1] = pixels.background.T, light, y
     # Without variances of a previous fit, iterate: the first weights are a guess.
     for _ in range(3 if before is None else 1):
         if pixels.gains is not None and phase is not None:
             gain, by_phase = pixels.gains.at(phase)
-            basis = np.column_stack([pixels.background, light * gain, light * by_phase])
-        normal, right = _normal_equations(pixels.starts, basis, y, weight)
+            columns[AMPLITUDE], columns[AMPLITUDE + 1] = light * gain, light * by_phase
+        normal, right = _normal_equations(pixels.starts, columns, weight)
         of_background, of_light = normal[:, 0, 0], normal[:, AMPLITUDE, AMPLITUDE]
         determinant = of_background * of_light - normal[:, 0, AMPLITUDE] ** 2
         determined = determinant > MIN_DETERMINANT * of_background * of_light
@@ -150,7 +152,7 @@ def fit_photometry(
         normal[~determined] = np.eye(count)
         covariance = _inverse(normal) * determined[:, None, None]
         coefficients = np.einsum("gij,gj->gi", covariance, right)
-        expected = np.einsum("mi,mi->m", basis, coefficients[group])
+        expected = (columns[:-1] * np.repeat(coefficients.T, np.diff(pixels.starts), axis=1)).sum(axis=0)
         per_pixel = np.maximum(expected / n, 0.0)
         variance = np.maximum(per_pixel + noise.dark_e2 + noise.prnu2 * per_pixel**2, MIN_VARIANCE_E2)
         unsaturated = per_pixel + SATURATION_MARGIN_SIGMA * np.sqrt(variance) < noise.saturation_e
@@ -166,7 +168,7 @@ def fit_photometry(
     weighed = weight > 0
     deviance = _mean_deviance(y[weighed], expected[weighed], n[weighed] * noise.dark_e2)
     return PhotometricFit(
-        basis,
+        columns[:-1].T,
         amplitude,
         coefficients[:, 0],
         signal_to_noise,
@@ -180,12 +182,14 @@ def fit_photometry(
     )
 
 
-def _normal_equations(starts: Ints, basis: Floats, y: Floats, weight: Floats) -> tuple[Floats, Floats]:
-    """Normal equations (g, c, c) and right-hand sides (g, c) of readings (m,) by a basis (m, c), weighted (m,)."""
-    columns = np.column_stack([basis, y])
-    weighted = columns * weight[:, None]
+def _normal_equations(starts: Ints, columns: Floats, weight: Floats) -> tuple[Floats, Floats]:
+    """Normal equations (g, c, c) and right-hand sides (g, c) of readings (m,), weighted (m,).
+
+    `columns` (c + 1, m) are the derivatives by the c coefficients, then the readings.
+    """
+    weighted = columns * weight
     bounds = pairwise(starts.tolist())
-    products = np.stack([weighted[first:end].T @ columns[first:end] for first, end in bounds])
+    products = np.stack([weighted[:, first:end] @ columns[:, first:end].T for first, end in bounds])
     return products[:, :-1, :-1], products[:, :-1, -1]
 
 
@@ -219,36 +223,38 @@ def score(
     Amplitudes and backgrounds are eliminated. Parameters that `rendered` has no derivatives by have no information; so
     has the profile if `profile` (n, 3) is None.
     """
-    slopes = rendered.slopes(pixels.cells) * photometry.amplitude[pixels.group[pixels.edges]][:, None]
+    slopes = rendered.slopes(pixels.cells).T
+    edges, light = pixels.edges, None
     if photometry.gain is not None:
-        slopes *= photometry.gain[pixels.edges][:, None]
+        slopes *= photometry.gain[edges]
     if profile is not None:
-        factor = 1 + np.einsum("mi,mi->m", pixels.face, profile[pixels.led][pixels.group])
-        slopes *= factor[pixels.edges][:, None]
+        slopes *= (1 + np.einsum("mi,mi->m", pixels.face, profile[pixels.led][pixels.group]))[edges]
         light = pixels.light(rendered) if photometry.gain is None else pixels.light(rendered) * photometry.gain
-        of_profile = pixels.face * (light * photometry.amplitude[pixels.group])[:, None]
     residual = photometry.weight * (pixels.electrons - photometry.expected)
     columns = rendered.parameters
     in_motion = bool((columns >= LOCAL_PARAMETERS).any())
     if profile is not None:
         columns = np.concatenate([columns, IMAGE_PARAMETERS + np.arange(PROFILE_PARAMETERS)])
-    count = len(columns)
     all_of_them = LOCAL_PARAMETERS + (MOTION_PARAMETERS if in_motion else 0)
     information = np.zeros((len(pixels.leds), all_of_them, all_of_them))
     gradient = np.zeros((len(pixels.leds), all_of_them))
-    first_edge = np.searchsorted(pixels.edges, pixels.starts)
-    for g, led in enumerate(pixels.led.tolist()):
+    first_edge = np.searchsorted(edges, pixels.starts).tolist()
+    bounds = zip(pairwise(pixels.starts.tolist()), pairwise(first_edge), strict=True)
+    for g, ((start, end), (first, last)) in enumerate(bounds):
         # The edge pixels are the first readings of a group, and the image's shape does not change the others.
-        edge = slice(first_edge[g], first_edge[g + 1])
-        readings = slice(pixels.starts[g], pixels.starts[g + 1])
-        design = np.zeros((readings.stop - readings.start, count))
-        design[: edge.stop - edge.start, : slopes.shape[1]] = slopes[edge]
-        if profile is not None:
-            design[:, slopes.shape[1] :] = of_profile[readings]
-        weighted = design * photometry.weight[readings][:, None]
-        mixed = weighted.T @ photometry.basis[readings]
-        information[led][np.ix_(columns, columns)] += weighted.T @ design - mixed @ photometry.covariance[g] @ mixed.T
-        gradient[led][columns] += design.T @ residual[readings]
+        design = slopes[:, first:last]
+        if light is None:
+            end = start + last - first
+        else:
+            of_shape, design = design, np.zeros((len(columns), end - start))
+            design[: len(slopes), : last - first] = of_shape
+            design[len(slopes) :] = (pixels.face[start:end] * light[start:end, None]).T
+        weighted = design * photometry.weight[start:end]
+        mixed = weighted @ photometry.basis[start:end]
+        amplitude, led = photometry.amplitude[g], pixels.led[g]
+        own = weighted @ design.T - mixed @ photometry.covariance[g] @ mixed.T
+        information[led][np.ix_(columns, columns)] += amplitude**2 * own
+        gradient[led][columns] += amplitude * (design @ residual[start:end])
     return information, gradient
 
 

@@ -7,6 +7,7 @@ with velocity (a, b), the covered area of the pixel grows by b du - a dv, exactl
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,13 +42,14 @@ class RoiStack:
 
     def cells(self) -> int:
         """Number of cells."""
-        return int((self.heights * (self.widths + 1)).sum())
+        return int(self.starts[-1])
 
     def roi(self, cells: Floats, k: int) -> Floats:
         """View of region k in a flat array of cells, (rows, columns)."""
-        start, height, width = int(self.starts()[k]), int(self.heights[k]), int(self.widths[k])
+        start, height, width = int(self.starts[k]), int(self.heights[k]), int(self.widths[k])
         return cells[start : start + height * (width + 1)].reshape(height, width + 1)[:, :width]
 
+    @cached_property
     def starts(self) -> Ints:
         """First cell of each region, (n + 1,); the last entry is the number of cells."""
         return np.concatenate([[0], np.cumsum(self.heights * (self.widths + 1))])
@@ -55,7 +57,7 @@ class RoiStack:
     def cell(self, roi: Ints, row: Ints, column: Ints) -> Ints:
         """Cells of sensor pixels (row, column) in the given regions, elementwise."""
         return np.asarray(
-            self.starts()[roi] + (row - self.rows[roi]) * (self.widths[roi] + 1) + column - self.columns[roi]
+            self.starts[roi] + (row - self.rows[roi]) * (self.widths[roi] + 1) + column - self.columns[roi]
         )
 
     def meeting(self, others: "RoiStack", k: int) -> list[int]:
@@ -85,8 +87,9 @@ class RoiStack:
 class Outlines:
     """Closed polygons: `points` (n, 2) in pixels, all outlines one after another, and `roi` (n,) each point's region.
 
-    `following` (n,) is the index of the next point of the same outline, and `slopes` (n, 2, p) are the derivatives of
-    the points by p parameters. No edge may be longer than MAX_EDGE_PX; each outline runs in the sense from u to v.
+    `following` (n,) is the index of the next point of the same outline, and `slopes` (2, p, n) are the derivatives of
+    the points' u and v by p parameters. No edge may be longer than MAX_EDGE_PX; each outline runs in the sense from u
+    to v.
     """
 
     points: Floats
@@ -99,51 +102,65 @@ class Outlines:
 class EdgePieces:
     """Edges cut at the lines between pixels: m pieces inside their regions, with the pixel (m,) of each.
 
-    `slopes` (m, p) are the derivatives of the pixel's covered share by p parameters.
+    `slopes` (p, m) are the derivatives of the pixel's covered share by p parameters, `shifts` (2, m) those by shifts of
+    the outline along u and v.
     """
 
     roi: Ints
     row: Ints
     column: Ints
     slopes: Floats
+    shifts: Floats
 
     def times(self, factor: Floats) -> "EdgePieces":
         """The pieces with their derivatives multiplied by a factor for each, (m,)."""
-        return EdgePieces(self.roi, self.row, self.column, self.slopes * factor[:, None])
+        return EdgePieces(self.roi, self.row, self.column, self.slopes * factor, self.shifts * factor)
 
 
 def cover(rois: RoiStack, outlines: Outlines) -> tuple[Floats, EdgePieces]:
     """Covered share of each cell, (cells,), and its derivatives by pieces."""
-    start, end = outlines.points, outlines.points[outlines.following]
-    step = end - start
+    following = outlines.following
+    u0, v0 = outlines.points.T
+    du, dv = u0[following] - u0, v0[following] - v0
     # Position along each edge where it crosses a line between columns and one between rows; 1 if it crosses none.
-    line = np.maximum(np.floor(start), np.floor(end))
-    crosses = np.floor(start) != np.floor(end)
-    at = np.divide(line - start, step, out=np.ones_like(start), where=crosses)
-    at.sort(axis=1)
-    cuts = np.column_stack([np.zeros(len(at)), at, np.ones(len(at))])
-    edge, part = np.nonzero(cuts[:, 1:] > cuts[:, :-1])
-    first, last = cuts[edge, part][:, None], cuts[edge, part + 1][:, None]
-    middle, length = (first + last) / 2, last - first
-    dv = step[edge, 1] * length[:, 0]
-    u, v = (start[edge] + step[edge] * middle).T
+    crossings = [_crossing(first, step, following) for first, step in ((u0, du), (v0, dv))]
+    one, other = np.minimum(*crossings), np.maximum(*crossings)
+    middle, rest = np.flatnonzero(other > one), np.flatnonzero(other < 1)
+    edge = np.concatenate([np.arange(len(u0)), middle, rest])
+    first = np.concatenate([np.zeros(len(u0)), one[middle], other[rest]])
+    last = np.concatenate([one, other[middle], np.ones(len(rest))])
+    halfway, length = (first + last) / 2, last - first
+    u, v = u0[edge] + du[edge] * halfway, v0[edge] + dv[edge] * halfway
+    rise = dv[edge] * length
 
     roi = outlines.roi[edge]
     row, column = np.floor(v).astype(np.int64), np.floor(u).astype(np.int64)
-    inside = (row >= rois.rows[roi]) & (row < rois.rows[roi] + rois.heights[roi])
-    edge, roi, row, column, u, dv = (values[inside] for values in (edge, roi, row, column, u, dv))
-    left, right = rois.columns[roi], rois.columns[roi] + rois.widths[roi]
+    inside = (row >= rois.rows[roi]) & (row < (rois.rows + rois.heights)[roi])
+    if not inside.all():
+        edge, roi, row, column = edge[inside], roi[inside], row[inside], column[inside]
+        u, rise, length = u[inside], rise[inside], length[inside]
+    left, right = rois.columns[roi], (rois.columns + rois.widths)[roi]
     within = (column >= left) & (column < right)
     # A piece left of a region covers its first pixel, one right of it the additional cell, over the full width.
     to_the_right = np.where(within, column + 1 - u, 1.0)
     cell = rois.cell(roi, row, np.clip(column, left, right))
-    cells = rois.cells()
-    increments = np.bincount(cell, -dv * to_the_right, cells + 1)
-    increments += np.bincount(cell + 1, -dv * (1 - to_the_right), cells + 1)
+    increments = np.bincount(cell, -rise * to_the_right, rois.cells() + 1)
+    increments += np.bincount(cell + 1, -rise * (1 - to_the_right), rois.cells() + 1)
     covered: Floats = np.cumsum(increments[:-1], dtype=np.float64)
 
     # Velocity at the middle of each edge: over so short an edge it is constant.
-    velocity = (outlines.slopes + outlines.slopes[outlines.following]) / 2
-    gained = velocity[:, 0] * step[:, 1:] - velocity[:, 1] * step[:, :1]
-    slopes = gained[edge[within]] * length[inside][within]
-    return covered, EdgePieces(roi[within], row[within], column[within], slopes)
+    of_u, of_v = outlines.slopes + np.take(outlines.slopes, following, axis=2)
+    slopes = np.take((of_u * dv - of_v * du) / 2, edge, axis=1) * length
+    shifts = np.stack([rise, -du[edge] * length])
+    if not within.all():
+        roi, row, column = roi[within], row[within], column[within]
+        slopes, shifts = slopes[:, within], shifts[:, within]
+    return covered, EdgePieces(roi, row, column, slopes, shifts)
+
+
+def _crossing(start: Floats, step: Floats, following: Ints) -> Floats:
+    """Where along their edges (n,) coordinates cross a whole number, 0 to 1; 1 for those that cross none."""
+    whole = np.floor(start)
+    following_whole = whole[following]
+    at = np.divide(np.maximum(whole, following_whole) - start, step, out=np.ones_like(start), where=step != 0)
+    return np.asarray(np.where(whole != following_whole, at, 1.0))

@@ -79,6 +79,7 @@ class ScoringResult:
     `converged` says whether the maximum was reached, and not the limit of validity of the gathered pixels. `used`,
     `faint` (used, but with a low signal-to-noise ratio) and `excess` (of chi-square over its limit) are by LED, (n,).
     `moved_px` is the largest movement of an image since its pixels were gathered, `damping` that of the next step.
+    `rendered` are the images before the last step, which moved them by `last_px` at most.
     """
 
     pose: Pose
@@ -92,6 +93,8 @@ class ScoringResult:
     excess: Floats
     moved_px: float
     damping: float
+    rendered: RenderedLeds
+    last_px: float
 
 
 class Search:
@@ -156,17 +159,22 @@ class Search:
             of_priors = self._gravity.deviance(angles) + nuisances.deviance(priors)
             min_deviance = candidate.deviance + of_priors / len(pixels.electrons)
             factor = 1.0 if before is None else step_factor(step, before, factor)
-            moved_px = self._movement_px(accepted, step, factor, priors)
-            factor *= min(1.0, pixels.max_move_px / max(moved_px, 1e-12))
+            before_px = self._rims_px(state)
+            pose, nuisances = self._moved(accepted, step, factor)
+            rims_px = self._rims_px(nuisances.state(pose, camera, priors))
+            moved_px = _largest(rims_px - before_px)
             short = moved_px < pixels.max_move_px
+            if not short:
+                factor *= pixels.max_move_px / moved_px
+                pose, nuisances = self._moved(accepted, step, factor)
+                rims_px = self._rims_px(nuisances.state(pose, camera, priors))
             converged = step.step2 * factor**2 < CONVERGED_STEP2 and short and damping == 0
             converged &= priors.exact or moved_px < CONVERGED_PX
             if damping > 0:
                 damping *= DAMPING_RATIO ** (-1 if short else moved_px > 4 * pixels.max_move_px)
                 damping = damping if damping > MIN_DAMPING else 0.0
-            pose, nuisances = self._moved(accepted, step, factor)
-            off_px = self._rims_px(nuisances.state(pose, camera, priors)) - self._origin_px
-            if converged or not bool((np.linalg.norm(off_px, axis=-1) < pixels.max_move_px).all()):
+            off_px = _largest(rims_px - self._origin_px)
+            if converged or not off_px < pixels.max_move_px:
                 break
         else:
             # Wrong LEDs may make the search go round in small circles.
@@ -183,9 +191,20 @@ class Search:
             np.bincount(pixels.led, excess_chi2(pixels, rendered, photometry), count), dtype=np.float64
         )
         faint = used & (max_signal_to_noise < MIN_SIGNAL_TO_NOISE)
-        moved = float(np.linalg.norm(off_px, axis=-1).max())
         return ScoringResult(
-            pose, nuisances, converged, step, components, photometry, used, faint, excess, moved, damping
+            pose=pose,
+            nuisances=nuisances,
+            converged=converged,
+            solution=step,
+            components=components,
+            photometry=photometry,
+            used=used,
+            faint=faint,
+            excess=excess,
+            moved_px=off_px,
+            damping=damping,
+            rendered=rendered,
+            last_px=moved_px,
         )
 
     def _with_edge_errors(self, photometry: PhotometricFit) -> Priors:
@@ -209,14 +228,6 @@ class Search:
     def _moved(self, start: tuple[Pose, Nuisances], step: Solution, factor: float) -> tuple[Pose, Nuisances]:
         return start[0].moved(factor * step.pose_step, self._camera), start[1].moved(step.step, factor)
 
-    def _movement_px(self, start: tuple[Pose, Nuisances], step: Solution, factor: float, priors: Priors) -> float:
-        """Largest movement of a point of a rim by a step."""
-        before, after = (
-            self._rims_px(nuisances.state(pose, self._camera, priors))
-            for pose, nuisances in (start, self._moved(start, step, factor))
-        )
-        return float(np.nan_to_num(np.linalg.norm(after - before, axis=-1), nan=np.inf).max())
-
     def _rims_px(self, state: ImageState) -> Floats:
         """Points of the rims, (n, RIM_POINTS, 2)."""
         centres_m = self._centres_m + state.shifts_m
@@ -229,6 +240,11 @@ def step_factor(step: Solution, before: Solution, factor: float) -> float:
     inner = step.view_step @ step.information @ before.view_step * factor
     length2 = before.view_step @ step.information @ before.view_step * factor**2
     return 0.5 if inner < -MAX_RETURN * length2 else 1.0
+
+
+def _largest(offsets_px: Floats) -> float:
+    """Largest length of offsets (..., 2); infinite where a point has no image."""
+    return float(np.nan_to_num(np.linalg.norm(offsets_px, axis=-1), nan=np.inf).max())
 
 
 def unexplained(result: ScoringResult) -> Mask:

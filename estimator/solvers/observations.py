@@ -20,6 +20,7 @@ the undistorted centroid is then not the centroid of the undistorted image. `cor
 difference once a pose determines the size of the images.
 """
 
+import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -47,6 +48,8 @@ MIN_CENTROID_SIGMA_PX = 1e-4
 _ALONG, _SHARES = np.sqrt(1.8) * np.array([-1.0, 0.0, 1.0]), np.array([5.0, 8.0, 5.0]) / 18
 FACE_NODES = np.stack(np.meshgrid(_ALONG, _ALONG, indexing="ij"), axis=-1).reshape(-1, 2)
 FACE_WEIGHTS = np.outer(_SHARES, _SHARES).ravel()
+_OF_NODES = np.column_stack([FACE_NODES, np.ones(len(FACE_NODES))])
+_NODES_2 = (FACE_NODES**2).sum(axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,6 +194,15 @@ def observe(
     )
 
 
+def observe_once(
+    frame: DeviceFrame, correspondences: Sequence[Correspondence], centroid_sigma_px: float = 0.0
+) -> Observations:
+    """`observe` of a frame's own spots, once for all variants of the frame."""
+    # The reference does not keep the frame, which holds the results, and no other frame equals it.
+    key = "observations", weakref.ref(frame), centroid_sigma_px
+    return frame.once(key, lambda: observe(frame, correspondences, centroid_sigma_px))
+
+
 def centroid_images(pose: Pose, leds_m: Floats, lift_m2: Floats) -> tuple[Floats, Floats]:
     """Centroids (n, 2) of the images of LEDs (n, 3) in the pinhole's image plane, and the LEDs' depths (n,), metres."""
     p_cam = pose.in_camera(light_centres_m(leds_m, lift_m2, pose.position_m))
@@ -204,10 +216,13 @@ def light_centres_m(leds_m: Floats, lift_m2: Floats, camera_m: Floats) -> Floats
     """
     offset = leds_m - camera_m
     s = np.sqrt(lift_m2 / 4)[:, None]
-    nearer = 2 * s * (offset[:, :2] @ FACE_NODES.T) + s**2 * (FACE_NODES**2).sum(axis=1)
-    weights = FACE_WEIGHTS / ((offset**2).sum(axis=1, keepdims=True) + nearer) ** 2
+    distance2 = (2 * s * offset[:, :2]) @ FACE_NODES.T
+    distance2 += s**2 * _NODES_2 + np.einsum("ni,ni->n", offset, offset)[:, None]
+    distance2 *= distance2
+    # The means of the nodes times their weights, and the weights' sum.
+    sums = (FACE_WEIGHTS / distance2) @ _OF_NODES
     points = leds_m.copy()
-    points[:, :2] += s * (weights @ FACE_NODES) / weights.sum(axis=1, keepdims=True)
+    points[:, :2] += s * sums[:, :2] / sums[:, 2:]
     return points
 
 

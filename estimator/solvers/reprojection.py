@@ -9,31 +9,33 @@ Where the camera has a rolling shutter, its velocity while the frame is read out
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares, leastsq
+from scipy.optimize import least_squares
 
 from estimator.camera.motion import MOTION_PARAMETERS
 from estimator.camera.pose import POSE_PARAMETERS, Pose
 from estimator.errors import EstimationFailure
 from estimator.solvers import second_order
+from estimator.solvers.least_squares import Function, least_squares_minimum
 from estimator.solvers.observations import Observations, moving_slopes, position_slopes
 
 Floats = NDArray[np.float64]
-Function = Callable[[Floats], Floats]
+Loss = Literal["linear", "soft_l1"]
 
 # With gravity, two spots have as many coordinates as a pose has parameters.
 MIN_SPOTS = 2
 # Residuals beyond this many standard deviations are weighted down by the robust loss.
 ROBUST_SIGMA = 3.0
 MAX_EVALUATIONS = 60
-# Relative change of the sum, of the parameters, and cosine to the gradient, at which a search ends.
+# Relative change of the sum, found and promised by the derivatives, at which a search ends.
 TOLERANCE = 1e-8
+# The same for a search that only has to tell how bad another minimum is.
+COARSE_TOLERANCE = 0.2
 # The slopes of a spot by the map change with the pose by a share of the error of the initial pose: the weights of the
 # second repetition are those at a pose that is good to the errors stated.
 RELINEARIZATIONS = 2
@@ -42,6 +44,7 @@ NEAR_M = 3e-3
 NEAR_RAD = 1e-3
 # Share of the largest redundancy below which a spot's displacement is not controlled by other observations.
 MIN_REDUNDANCY = 1e-9
+UNDETERMINED = "the observations do not determine a pose"
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,8 +116,8 @@ class Fit:
         return float(np.abs(self.spots_redundancy).max(initial=0.0))
 
 
-def fit(observations: Observations, start: Pose, loss: Literal["linear", "soft_l1"] = "linear") -> Fit:
-    """Local minimum from an initial pose, by Levenberg-Marquardt (SciPy) with exact derivatives.
+def fit(observations: Observations, start: Pose, loss: Loss = "linear") -> Fit:
+    """Local minimum from an initial pose, by Levenberg-Marquardt with exact derivatives.
 
     A robust loss disregards the correlation of spots. Raises EstimationFailure if the observations do not determine a
     pose there.
@@ -128,6 +131,16 @@ def fit(observations: Observations, start: Pose, loss: Literal["linear", "soft_l
             at = found.pose
             found = _fit(observations, at, _whitening(observations, at, loss), loss)
     return found
+
+
+def coarse_fit(observations: Observations, start: Pose) -> tuple[Pose, float]:
+    """A pose on the way to the local minimum from an initial one, and its sum of squares, about that of the minimum.
+
+    A further step would lower the sum by less than COARSE_TOLERANCE. Raises EstimationFailure as `fit` does.
+    """
+    search = _Search(observations, _whitening(observations, start, "linear"))
+    x, _, cost = search.minimum(start, "linear", COARSE_TOLERANCE)
+    return search.pose_of(x), cost
 
 
 def _near(one: Pose, other: Pose) -> bool:
@@ -165,51 +178,73 @@ def _whitened(whitening: Floats, of_spots: Floats) -> Floats:
     return np.asarray(whitening @ of_spots.reshape(len(of_spots), 2, -1)).reshape(flat)
 
 
-def _fit(observations: Observations, start: Pose, whitening: Floats, loss: Literal["linear", "soft_l1"]) -> Fit:
-    centre, motion = observations.leds_m.mean(axis=0), observations.motion
-    model = np.ascontiguousarray(observations.leds_m - centre)
-    count = len(observations.leds_m)
+class _Search:
+    """Residuals of a pose and velocity, whitened, and their derivatives, by a vector of parameters (6,) or (12,)."""
 
-    def pose_of(x: Floats) -> Pose:
+    def __init__(self, observations: Observations, whitening: Floats) -> None:
+        self.observations, self.whitening = observations, whitening
+        self.centre = observations.leds_m.mean(axis=0)
+        self.model = np.ascontiguousarray(observations.leds_m - self.centre)
+
+    def pose_of(self, x: Floats) -> Pose:
+        """The pose of parameters."""
         R_cam_world = cv2.Rodrigues(x[:3])[0]
-        return Pose(centre - R_cam_world.T @ x[3:POSE_PARAMETERS], R_cam_world)
+        return Pose(self.centre - R_cam_world.T @ x[3:POSE_PARAMETERS], R_cam_world)
 
-    def residuals(x: Floats) -> Floats:
-        pose, velocity = pose_of(x), x[POSE_PARAMETERS:]
+    def residuals(self, x: Floats) -> Floats:
+        """Residuals (2n + 2,), or (2n + 8,) with those of the velocity."""
+        observations = self.observations
+        pose, velocity = self.pose_of(x), x[POSE_PARAMETERS:]
         offset = observations.images(pose, velocity)[0] - observations.image
-        parts = [_whitened(whitening, offset), _tilt_residual(pose, observations)]
-        if motion is not None:
-            parts.append(motion.residuals(velocity))
+        parts = [_whitened(self.whitening, offset), _tilt_residual(pose, observations)]
+        if observations.motion is not None:
+            parts.append(observations.motion.residuals(velocity))
         return np.concatenate(parts)
 
-    def jacobian(x: Floats) -> Floats:
+    def jacobian(self, x: Floats) -> Floats:
+        """Derivatives of the residuals."""
+        observations, motion = self.observations, self.observations.motion
         # The eccentricity changes these by s^2 / d^2: some millionths for an LED of 1 cm, a hundredth for one of 60 cm.
         if motion is None:
-            of_image = cv2.projectPoints(model, x[:3], x[3:], np.eye(3), None)[1][:, :6].reshape(-1, 2, 6)
-            slopes = np.empty((2 * count + 2, POSE_PARAMETERS))
-            slopes[:-2], slopes[-2:] = _whitened(whitening, of_image), _tilt_jacobian(x, observations)
+            of_image = cv2.projectPoints(self.model, x[:3], x[3:], np.eye(3), None)[1][:, :6].reshape(-1, 2, 6)
+            slopes = np.empty((2 * len(self.model) + 2, POSE_PARAMETERS))
+            slopes[:-2], slopes[-2:] = _whitened(self.whitening, of_image), _tilt_jacobian(x, observations)
             return slopes
-        of_image = moving_slopes(observations, pose_of(x), x[POSE_PARAMETERS:], x)
+        of_image = moving_slopes(observations, self.pose_of(x), x[POSE_PARAMETERS:], x)
         of_priors = np.zeros((2 + MOTION_PARAMETERS, POSE_PARAMETERS + MOTION_PARAMETERS))
         of_priors[:2, :POSE_PARAMETERS] = _tilt_jacobian(x, observations)
         of_priors[2:, POSE_PARAMETERS:] = np.diag(1 / motion.prior.sigmas)
-        return np.vstack([_whitened(whitening, of_image), of_priors])
+        return np.vstack([_whitened(self.whitening, of_image), of_priors])
 
+    def minimum(self, start: Pose, loss: Loss, tolerance: float) -> tuple[Floats, Floats, float]:
+        """Parameters at the minimum, the residuals there, and their sum; raises EstimationFailure."""
+        motion = self.observations.motion
+        try:
+            if len(self.model) < MIN_SPOTS:
+                raise ValueError("fewer observations than parameters")
+            with np.errstate(all="ignore"):
+                vector = cv2.Rodrigues(start.R_cam_world)[0].ravel()
+                velocity = np.zeros(0) if motion is None else motion.prior.velocity
+                shift = start.R_cam_world @ (self.centre - start.position_m)
+                x0 = np.concatenate([vector, shift, velocity])
+                if loss == "soft_l1":
+                    return _robustly(self.residuals, x0, self.jacobian)
+                return least_squares_minimum(self.residuals, x0, self.jacobian, tolerance, MAX_EVALUATIONS)
+        except (np.linalg.LinAlgError, ValueError, cv2.error):
+            raise EstimationFailure("position", UNDETERMINED) from None
+
+
+def _fit(observations: Observations, start: Pose, whitening: Floats, loss: Loss) -> Fit:
+    search, count, motion = _Search(observations, whitening), len(observations.leds_m), observations.motion
+    x, at_minimum, cost = search.minimum(start, loss, TOLERANCE)
     try:
-        if count < MIN_SPOTS:
-            raise ValueError("fewer observations than parameters")
         with np.errstate(all="ignore"):
-            vector = cv2.Rodrigues(start.R_cam_world)[0].ravel()
-            velocity = np.zeros(0) if motion is None else motion.prior.velocity
-            x0 = np.concatenate([vector, start.R_cam_world @ (centre - start.position_m), velocity])
-            # MINPACK is several times faster, and has no robust loss.
-            x, at_minimum, cost = (_by_minpack if loss == "linear" else _robustly)(residuals, x0, jacobian)
-            slope = jacobian(x)
+            slope = search.jacobian(x)
             information = slope.T @ slope
             covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
-    except (np.linalg.LinAlgError, ValueError, cv2.error):
-        raise EstimationFailure("position", "the observations do not determine a pose") from None
-    pose = pose_of(x)
+    except (np.linalg.LinAlgError, cv2.error):
+        raise EstimationFailure("position", UNDETERMINED) from None
+    pose = search.pose_of(x)
     of_spots = at_minimum[: 2 * count]
     of_position = np.zeros((3, len(x)))
     of_position[:, :POSE_PARAMETERS] = position_slopes(x[:POSE_PARAMETERS])
@@ -242,25 +277,6 @@ def _fit(observations: Observations, start: Pose, whitening: Floats, loss: Liter
         velocity=x[POSE_PARAMETERS:],
         motion_chi2=float((at_minimum[2 * count + 2 :] ** 2).sum()),
     )
-
-
-def _by_minpack(residuals: Function, x0: Floats, jacobian: Function) -> tuple[Floats, Floats, float]:
-    """Minimum of the sum of squares from x0, the residuals there, and the sum; raises ValueError."""
-    x, _, found, _, _ = leastsq(
-        residuals,
-        x0,
-        (),
-        jacobian,
-        full_output=True,
-        ftol=TOLERANCE,
-        xtol=TOLERANCE,
-        gtol=TOLERANCE,
-        maxfev=MAX_EVALUATIONS,
-    )
-    cost = float((found["fvec"] ** 2).sum())
-    if not np.isfinite(cost):  # the search has not left its start
-        raise ValueError("residuals are not finite")
-    return x, found["fvec"], cost
 
 
 def _robustly(residuals: Function, x0: Floats, jacobian: Function) -> tuple[Floats, Floats, float]:

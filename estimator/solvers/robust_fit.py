@@ -28,7 +28,7 @@ from estimator.errors import EstimationFailure
 from estimator.solvers.camera_check import contradicts_camera, unchecked_focal_m2
 from estimator.solvers.chi_square import chi2_limit, pair_limit
 from estimator.solvers.observations import Observations, centroid_images, corrected_for_eccentricity
-from estimator.solvers.reprojection import Fit, fit
+from estimator.solvers.reprojection import Fit, coarse_fit, fit
 
 Floats = NDArray[np.float64]
 
@@ -50,8 +50,7 @@ CHI2_MEDIAN = 2 * np.log(2)
 MIN_EXCLUDED_SHARE = 0.5
 # Repetitions that estimate the size of errors, by the median of spots with outliers and by all spots without, and the
 # largest change of its square in one.
-ROBUST_ROUNDS = 3
-MOMENT_ROUNDS = 3
+ROBUST_ROUNDS = MOMENT_ROUNDS = 3
 MAX_RATIO = 100.0
 # Share of the image's width within which an outlier may lie anywhere: as far as a decoded pixel may be from a spot.
 OUTLIER_RADIUS = 0.01
@@ -67,6 +66,8 @@ MAX_SCALE = 20.0
 # Poses closer than both lead to one minimum.
 SAME_MINIMUM_RAD = 0.01
 SAME_MINIMUM_M = 0.1
+# A minimum whose sum of squares is so many times that of another is no candidate, whatever its last digits are.
+HOPELESS_RATIO = 100.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -389,24 +390,34 @@ def _score(agreed: Consensus, observations: Observations) -> float:
 def minima(observations: Observations, starts: Iterable[Pose], robust: bool = False) -> tuple[Fit, ...]:
     """Distinct local minima from the initial poses, best first, with all LEDs in front of the camera and above it.
 
-    A robust fit needs most LEDs in front of the camera only: an outlier must not exclude its pose.
+    A minimum is left out where its sum of squares is HOPELESS_RATIO times that of one before. A robust fit needs most
+    LEDs in front of the camera only: an outlier must not exclude its pose.
     """
     fits: list[Fit] = []
     for start in starts:
         if any(_same_minimum(start, other.pose) for other in fits):
             continue
         try:
-            found = fit(observations, start, "soft_l1" if robust else "linear")
+            near = start if robust or not fits else _promising(observations, start, fits)
+            if near is None:
+                continue
+            found = fit(observations, near, "soft_l1" if robust else "linear")
         except EstimationFailure:
             continue
-        depth_m = centroid_images(found.pose, observations.leds_m, observations.lift_m2)[1]
         below = found.pose.position_m[2] < observations.leds_m[:, 2].min()
-        in_front = depth_m > 0
+        in_front = centroid_images(found.pose, observations.leds_m, observations.lift_m2)[1] > 0
         possible = below and (2 * in_front.sum() > len(in_front) if robust else in_front.all())
         distinct = not any(_same_minimum(found.pose, other.pose) for other in fits)
         if possible and np.isfinite(found.cost) and distinct:
             fits.append(found)
     return tuple(sorted(fits, key=lambda one: one.cost))
+
+
+def _promising(observations: Observations, start: Pose, known: Sequence[Fit]) -> Pose | None:
+    """A pose nearer to the minimum from an initial one; None if it is one of those known, or hopeless beside them."""
+    pose, cost = coarse_fit(observations, start)
+    drop = cost > HOPELESS_RATIO * (1 + min(one.cost for one in known))
+    return None if drop or any(_same_minimum(pose, one.pose) for one in known) else pose
 
 
 def _same_minimum(one: Pose, other: Pose) -> bool:

@@ -183,8 +183,8 @@ class _MapParameters:
         self.leds_m = leds_m
         self.parameters: list[Parameter] = []
         self.sigmas: list[float] = []
-        self._levers: list[Floats] = []
-        self._sizes: list[Floats] = []
+        self._levers: list[Floats] = [np.zeros((len(leds_m), 3, 0))]
+        self._sizes: list[Floats] = [np.zeros((len(leds_m), 0))]
 
     def add(self, names: Sequence[str], of: Sequence[int | None], sigmas: Floats, levers: Floats) -> None:
         """Add parameters (k,) with levers (n, 3, k); those with a sigma of 0 are left out."""
@@ -209,12 +209,16 @@ class _MapParameters:
 
 
 def _add_datum(of_map: _MapParameters, datum: MapDatum | None) -> None:
+    if datum is None:
+        return
     levers = np.concatenate([np.tile(np.eye(3), (len(of_map.leds_m), 1, 1)), of_map.leds_m[:, :, None]], axis=2)
     names = [*(f"datum_{axis}" for axis in AXES), "datum_scale"]
-    of_map.add(names, [None] * 4, np.zeros(4) if datum is None else datum.sigmas(), levers)
+    of_map.add(names, [None] * 4, datum.sigmas(), levers)
 
 
 def _add_luminaires(of_map: _MapParameters, leds: Sequence[Led], luminaires: Mapping[int, Luminaire]) -> None:
+    if not luminaires:
+        return
     of_led = np.array([-1 if led.luminaire is None else led.luminaire for led in leds], dtype=np.int64)
     names = [f"{kind}_{axis}" for kind in ("luminaire", "turn") for axis in AXES]
     for key in np.unique(of_led[of_led >= 0]).tolist():
@@ -237,9 +241,9 @@ def _add_luminaires(of_map: _MapParameters, leds: Sequence[Led], luminaires: Map
 
 
 def _add_leds(of_map: _MapParameters, leds: Sequence[Led]) -> None:
-    sigmas = np.array([led.sigmas() for led in leds]).reshape(-1, 6)
-    if not sigmas.any():
+    if not any(led.states_errors for led in leds):
         return
+    sigmas = np.array([led.sigmas() for led in leds]).reshape(-1, 6)
     count = len(leds)
     ids = [led.id for led in leds]
     each = np.zeros((count, 3, count, 3))

@@ -24,10 +24,10 @@ from estimator.spots.led_light import (
     RING_PX,
     SMOOTHING_PX,
     Ellipse,
+    Moments,
     Pixels,
     Readout,
     light_of,
-    second_moments,
 )
 from estimator.spots.sampling import PIXEL_VARIANCE, SHARP, LensBlur, sampling_error, sampling_variance_px2
 
@@ -171,12 +171,12 @@ def brightest_of(
     if decoded_px is not None:
         first = np.array([(readout.column, readout.row) for readout in readouts])
         size = np.array([image.shape[::-1] for image in smooth])
-        for centre_px in decoded_px:
-            low = np.clip(centre_px - near_px - first, 0, size).astype(int)
-            high = np.clip(centre_px + near_px - first, 0, size).astype(int)
-            for part in np.flatnonzero((low < high).all(axis=1)).tolist():
-                (left, top), (right, bottom) = low[part], high[part]
-                peaks.append(float(smooth[part][top:bottom, left:right].max()))
+        low = np.clip(decoded_px[:, None] - near_px - first, 0, size).astype(int)
+        high = np.clip(decoded_px[:, None] + near_px - first, 0, size).astype(int)
+        spots, parts = np.nonzero((low < high).all(axis=2))
+        boxes = np.concatenate([low[spots, parts], high[spots, parts]], axis=1).tolist()
+        for part, (left, top, right, bottom) in zip(parts.tolist(), boxes, strict=True):
+            peaks.append(float(smooth[part][top:bottom, left:right].max()))
     return float(np.median(peaks)) if peaks else max(float(image.max()) for image in smooth)
 
 
@@ -219,8 +219,8 @@ def _ellipses(
         left, top, width, height = cv2.boundingRect(outline)
         roi = np.s_[top : top + height, left : left + width]
         column, row = outline[0, 0]
-        labels = cv2.connectedComponents(mask[roi], connectivity=8)[1]
-        own = labels == labels[row - top, column - left]
+        count, labels = cv2.connectedComponents(mask[roi], connectivity=8)
+        own = labels == labels[row - top, column - left] if count > 2 else mask[roi].view(bool)
         values = smooth[roi][own]
         if not MIN_BLOB_PX <= len(values) <= largest_px:
             small, large = small + (len(values) < MIN_BLOB_PX), large + (len(values) > largest_px)
@@ -229,10 +229,10 @@ def _ellipses(
         quartile = 3 * len(values) // 4
         half_e = background_e + (float(np.partition(values, quartile)[quartile]) - background_e) / 2
         core = (own & (smooth[roi] >= half_e)).view(np.uint8)
-        pieces = cv2.connectedComponents(core, connectivity=8)[1]
-        areas = np.bincount(pieces.ravel())[1:]
+        count, pieces = cv2.connectedComponents(core, connectivity=8)
+        areas = np.bincount(pieces.ravel())[1:] if count > 2 else np.ones(1)
         for piece in np.flatnonzero(areas >= MIN_PIECE * areas.max()).tolist():
-            ellipse = _ellipse(pieces == piece + 1, left, top, stretch)
+            ellipse = _ellipse(pieces == piece + 1 if count > 2 else core.view(bool), left, top, stretch)
             if len(areas) == 1:
                 box = np.array([left, top]), np.array([left + width, top + height])
                 ellipse = replace(ellipse, fringe_px=_fringe_px(ellipse, *box))
@@ -242,16 +242,15 @@ def _ellipses(
 
 def _ellipse(core: NDArray[np.bool_], left: int, top: int, stretch: float) -> Ellipse:
     """Ellipse with the centroid and second moments of the pixels set; (left, top) is the first pixel of `core`."""
-    weights = core.astype(np.float64)
-    of_columns, of_rows = weights.sum(axis=0), weights.sum(axis=1)
-    count = of_rows.sum()
-    u_px, v_px = np.arange(core.shape[1]) + left + 0.5, np.arange(core.shape[0]) + top + 0.5
-    centre = np.array([of_columns @ u_px, of_rows @ v_px]) / count
-    du, dv = u_px - centre[0], v_px - centre[1]
-    variances, axes = _principal_axes(second_moments(weights, du, dv) / count)
+    pixels = Moments(core.astype(np.float64))
+    count = pixels.total
+    u_px = np.arange(core.shape[1], dtype=np.float64) + (left + 0.5)
+    v_px = np.arange(core.shape[0], dtype=np.float64) + (top + 0.5)
+    centre = pixels.first(u_px, v_px) / count
+    variances, axes = _principal_axes(pixels.second(u_px - centre[0], v_px - centre[1]) / count)
     # A uniform ellipse has variance a^2 / 4 along its semi-axis a.
     semi_axes_px = 2 * stretch * np.sqrt(np.maximum(variances, 0)) + 0.5
-    (columns,), (rows,) = of_columns.nonzero(), of_rows.nonzero()
+    (columns,), (rows,) = pixels.by_column.nonzero(), pixels.by_row.nonzero()
     low_px = np.array([columns[0] + left, rows[0] + top], dtype=np.float64)
     high_px = np.array([columns[-1] + left + 1, rows[-1] + top + 1], dtype=np.float64)
     uses_core = semi_axes_px.max() > (LARGE_PX if stretch == 1.0 else SMALL_PX)
@@ -340,6 +339,7 @@ def _measure(readout: Readout, ellipse: Ellipse, others: list[Ellipse], denoise_
 
     inside = ellipse.distance2(u_px, v_px, 0.0) <= 1
     brightest = np.unravel_index(np.argmax(np.where(inside, light.electrons, -np.inf)), inside.shape)
+    clipped = readout.clipped[light.roi]
     margin_px = MARGIN_PX + max(denoise_radius_px, ellipse.fringe_px)
     low, high = ellipse.low_px - margin_px, ellipse.high_px + margin_px
     spot = Spot(
@@ -351,7 +351,7 @@ def _measure(readout: Readout, ellipse: Ellipse, others: list[Ellipse], denoise_
         area_px=ellipse.area_px,
         peak_e=float(light.electrons[brightest]),
         touches_border=bool((low < 0).any() or high[0] > width_px or high[1] > height_px),
-        saturated=bool(readout.clipped[light.roi][inside].any()),
+        saturated=bool(clipped.any() and clipped[inside].any()),
         flux_e=light.flux_e,
     )
     return _Measured(spot, moments, light.moment_sigmas_px2(centroid, moments))

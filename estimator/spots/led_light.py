@@ -23,6 +23,8 @@ RING_PX = 3.0
 BACKGROUND_SIGMA = 3.0
 # Of fewer pixels the variance is not measured.
 MIN_RING_PIXELS = 20
+# Up to this radius a mask is dilated; a larger one by distances takes less time.
+MAX_KERNEL_PX = 12.0
 # Of fewer pixels within an LED image the gradient of its light is not measured.
 MIN_INSIDE_PIXELS = 20
 # Illumination beside an LED image, relative to its middle: luminaires of 60 cm have 0.8 to 1.2; noise may give any.
@@ -78,12 +80,45 @@ class Ellipse:
         Takes a row of u (1, columns) and a column of v (rows, 1); returns (rows, columns).
         """
         du, dv = u_px - self.centre_px[0], v_px - self.centre_px[1]
-        (uu, uv), (_, vv) = (self.axes / (self.semi_axes_px + padding_px) ** 2) @ self.axes.T
-        return np.asarray(uu * du**2 + vv * dv**2 + (2 * uv * dv) * du)
+        (uu, uv), (_, vv) = ((self.axes / (self.semi_axes_px + padding_px) ** 2) @ self.axes.T).tolist()
+        # uu du^2 + vv dv^2 + 2 uv du dv as one product of matrices, which takes a third of the time of its sums.
+        by_row = np.concatenate([vv * dv**2, np.ones_like(dv), 2 * uv * dv], axis=1)
+        return np.asarray(by_row @ np.concatenate([np.ones_like(du), uu * du**2, du]))
 
     def half_extent(self, padding_px: float) -> NDArray[np.float64]:
         """Half width and half height, (2,), of the upright box around the padded ellipse."""
         return np.asarray(np.sqrt((self.axes**2) @ (self.semi_axes_px + padding_px) ** 2))
+
+
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """Sums of weights (rows, columns): all of them, by column and by row."""
+
+    weights: NDArray[np.float64]
+
+    @cached_property
+    def total(self) -> float:
+        """Sum of the weights."""
+        return float(self.by_row.sum())
+
+    @cached_property
+    def by_column(self) -> NDArray[np.float64]:
+        """Sums (columns,) over the rows."""
+        return np.asarray(np.ones(self.weights.shape[0]) @ self.weights)
+
+    @cached_property
+    def by_row(self) -> NDArray[np.float64]:
+        """Sums (rows,) over the columns."""
+        return np.asarray(self.weights @ np.ones(self.weights.shape[1]))
+
+    def first(self, u_px: Pixels, v_px: Pixels) -> NDArray[np.float64]:
+        """Sums (2,) of the weights times u (columns,) and v (rows,)."""
+        return np.array([self.by_column @ u_px, self.by_row @ v_px])
+
+    def second(self, du: Pixels, dv: Pixels) -> NDArray[np.float64]:
+        """Sums (2, 2) of the weights times du^2, du dv and dv^2; du is along columns, dv along rows."""
+        mixed = dv @ (self.weights @ du)
+        return np.array([[self.by_column @ du**2, mixed], [mixed, self.by_row @ dv**2]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,52 +138,54 @@ class Light:
     variance_e2: NDArray[np.float64]
 
     @cached_property
+    def _signal(self) -> Moments:
+        return Moments(self.signal_e)
+
+    @cached_property
+    def _noise(self) -> Moments:
+        """Variances of the pixels of the support."""
+        return Moments(np.where(self.support, self.variance_e2, 0.0))
+
+    @property
     def flux_e(self) -> float:
         """Sum of the signal, electrons."""
-        return float(self.signal_e.sum())
+        return self._signal.total
 
     @property
     def signal_to_noise(self) -> float:
         """Flux over its standard deviation."""
-        return self.flux_e / max(float(np.sqrt(self.variance_e2[self.support].sum())), 1e-300)
+        return self.flux_e / max(float(np.sqrt(self._noise.total)), 1e-300)
 
     def centroid_px(self) -> NDArray[np.float64]:
         """Centroid (u, v), (2,)."""
-        by_column, by_row = self.signal_e.sum(axis=0), self.signal_e.sum(axis=1)
-        return np.array([by_column @ self.u_px[0], by_row @ self.v_px[:, 0]]) / self.flux_e
+        return self._signal.first(self.u_px[0], self.v_px[:, 0]) / self.flux_e
 
     def moments_px2(self, centroid_px: NDArray[np.float64]) -> NDArray[np.float64]:
         """Second moments about the centroid, (2, 2)."""
-        return second_moments(self.signal_e, *self._offsets(centroid_px)) / self.flux_e
+        return self._signal.second(*self._offsets(centroid_px)) / self.flux_e
 
     def covariance_px2(self, centroid_px: NDArray[np.float64], denoise_radius_px: int) -> NDArray[np.float64]:
         """Covariance of the centroid by the pixels' noise, (2, 2)."""
         du, dv = self._offsets(centroid_px)
         if denoise_radius_px == 0:
-            return second_moments(self.support * self.variance_e2, du, dv) / self.flux_e**2
+            return self._noise.second(du, dv) / self.flux_e**2
         # A centroid of box means is a sum over the raw pixels, weighted by the box means of the centroid's weights.
         box = (2 * denoise_radius_px + 1, 2 * denoise_radius_px + 1)
-        levers = np.stack([self.support * du, self.support * dv[:, None]]) / self.flux_e
-        weights = np.stack([cv2.blur(lever, box, borderType=cv2.BORDER_CONSTANT).ravel() for lever in levers])
-        return np.asarray((weights * self.variance_e2.ravel()) @ weights.T)
+        levers = self.support * (du / self.flux_e), self.support * (dv / self.flux_e)[:, None]
+        along_u, along_v = (cv2.blur(lever, box, borderType=cv2.BORDER_CONSTANT) for lever in levers)
+        of_u, of_v = self.variance_e2 * along_u, self.variance_e2 * along_v
+        mixed = np.vdot(of_u, along_v)
+        return np.array([[np.vdot(of_u, along_u), mixed], [mixed, np.vdot(of_v, along_v)]])
 
     def moment_sigmas_px2(self, centroid_px: NDArray[np.float64], moments: NDArray[np.float64]) -> NDArray[np.float64]:
         """Standard deviations (2,) of the second moments (2,) along u and v by the pixels' noise."""
-        (du, dv), noise_e2 = self._offsets(centroid_px), self.support * self.variance_e2
+        du, dv = self._offsets(centroid_px)
         along_u, along_v = (du**2 - moments[0]) ** 2, (dv**2 - moments[1]) ** 2
-        return np.sqrt([noise_e2.sum(axis=0) @ along_u, noise_e2.sum(axis=1) @ along_v]) / self.flux_e
+        return np.asarray(np.sqrt(self._noise.first(along_u, along_v)) / self.flux_e)
 
     def _offsets(self, centroid_px: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Offsets of columns along u, and of rows along v, from the centroid."""
         return self.u_px[0] - centroid_px[0], self.v_px[:, 0] - centroid_px[1]
-
-
-def second_moments(
-    weights: NDArray[np.float64], du: NDArray[np.float64], dv: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Sums (2, 2) of weights (rows, columns) times du^2, du dv and dv^2; du is along columns, dv along rows."""
-    mixed = dv @ weights @ du
-    return np.array([[weights.sum(axis=0) @ du**2, mixed], [mixed, weights.sum(axis=1) @ dv**2]])
 
 
 def light_of(readout: Readout, ellipse: Ellipse, others: list[Ellipse], denoise_radius_px: int) -> Light:
@@ -158,43 +195,47 @@ def light_of(readout: Readout, ellipse: Ellipse, others: list[Ellipse], denoise_
     roi = np.s_[top:bottom, left:right]
     u_px, v_px = _centres_px(left, right)[None, :], _centres_px(top, bottom)[:, None]
     electrons = readout.image_e[roi].astype(np.float64)
-    distance2 = ellipse.distance2(u_px, v_px, margin_px)
     fall_off = np.ones(electrons.shape)
     if ellipse.core is None:
-        support = distance2 <= 1
-        ring = ~support & (ellipse.distance2(u_px, v_px, margin_px + RING_PX) <= 1)
+        support = ellipse.distance2(u_px, v_px, margin_px) <= 1
+        ring = ellipse.distance2(u_px, v_px, margin_px + RING_PX) <= 1
     else:
         face = np.zeros(electrons.shape, dtype=bool)
         column, row = ellipse.low_px.astype(int) - (left, top)
         face[row : row + ellipse.core.shape[0], column : column + ellipse.core.shape[1]] = ellipse.core
-        edge_px = SMOOTHING_PX // 2 + ellipse.fringe_px
-        fall_off = _relative_fall_off(electrons, _distance_px(face) > edge_px)
-        beyond_px = _distance_px(~face)
-        support = beyond_px <= margin_px
-        ring = ~support & (beyond_px <= margin_px + RING_PX)
+        inside = ~_within(~face, SMOOTHING_PX // 2 + ellipse.fringe_px)
+        fall_off = _relative_fall_off(electrons, inside)
+        support, ring = _within(face, margin_px), _within(face, margin_px + RING_PX)
+    ring &= ~support
+    distance2 = ellipse.distance2(u_px, v_px, margin_px) if others else fall_off
     for other in others:
         # A pixel in two supports belongs to the nearer spot.
         other_distance2 = other.distance2(u_px, v_px, MARGIN_PX + max(denoise_radius_px, other.fringe_px))
         support &= distance2 <= other_distance2
         ring &= other_distance2 > 1
     # Shot noise: a raw pixel's variance is its electrons.
-    raw_e = np.maximum(readout.raw_e[roi].astype(np.float64), 0.0)
+    raw_e = np.maximum(readout.raw_e[roi], 0.0, dtype=np.float64)
     variance_e2 = raw_e + readout.floor_e2 + (readout.prnu * raw_e) ** 2
-    background_e = np.zeros(electrons.shape)
+    above_e = electrons
     if ring.any():
+        of_ring = np.flatnonzero(ring)
         # One electron more: the noise of a pixel with fewer is not normal.
-        gate_e = BACKGROUND_SIGMA * float(np.sqrt(_median(variance_e2[ring]) + 1.0))
-        even_e = electrons / fall_off
-        # The ring without pixels of another surface or light.
-        ring &= np.abs(even_e - _median(even_e[ring])) <= gate_e
-        background_e = float(even_e[ring].mean()) * fall_off
-        if np.count_nonzero(ring) >= MIN_RING_PIXELS:
-            unlit = support & (electrons - background_e <= gate_e)
-            ring_e = readout.raw_e[roi][ring] / fall_off[ring]
-            excess_e2 = _excess_variance(readout, ring_e, float(variance_e2[ring].mean()))
-            variance_e2[unlit] = np.maximum(variance_e2[unlit] + excess_e2, 0.0)
-    signal_e = np.where(support, electrons - background_e, 0.0)
-    return Light(roi, u_px, v_px, electrons, support, signal_e, variance_e2)
+        gate_e = BACKGROUND_SIGMA * float(np.sqrt(_median(variance_e2.ravel()[of_ring]) + 1.0))
+        ring_fall_off = fall_off.ravel()[of_ring]
+        even_e = electrons.ravel()[of_ring] / ring_fall_off
+        # The ring without pixels of another surface or light; all of it where its median is between two surfaces.
+        even = np.abs(even_e - _median(even_e)) <= gate_e
+        if not even.any():
+            even[:] = True
+        of_ring, ring_fall_off = of_ring[even], ring_fall_off[even]
+        above_e = electrons - float(even_e[even].mean()) * fall_off
+        if len(of_ring) >= MIN_RING_PIXELS:
+            ring_e = readout.raw_e[roi].ravel()[of_ring] / ring_fall_off
+            excess_e2 = _excess_variance(readout, ring_e, float(variance_e2.ravel()[of_ring].mean()))
+            if excess_e2 != 0:
+                unlit = support & (above_e <= gate_e)
+                variance_e2[unlit] = np.maximum(variance_e2[unlit] + excess_e2, 0.0)
+    return Light(roi, u_px, v_px, electrons, support, np.where(support, above_e, 0.0), variance_e2)
 
 
 def _median(values: NDArray[np.float64]) -> float:
@@ -208,9 +249,15 @@ def _centres_px(first: int, last: int) -> Pixels:
     return np.arange(first, last, dtype=np.float64) + 0.5
 
 
-def _distance_px(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Distance of each pixel of a mask from the nearest one that is not in it; 0 for the others."""
-    return np.asarray(cv2.distanceTransform(mask.view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE))
+def _within(mask: NDArray[np.bool_], radius_px: float) -> NDArray[np.bool_]:
+    """Pixels of a mask, and those at most this far from one."""
+    if radius_px > MAX_KERNEL_PX:
+        return np.asarray(
+            cv2.distanceTransform((~mask).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE) <= radius_px
+        )
+    along = np.arange(-int(radius_px), int(radius_px) + 1)
+    disc = (along[:, None] ** 2 + along**2 <= radius_px**2).view(np.uint8)
+    return np.asarray(cv2.dilate(mask.view(np.uint8), disc).view(bool))
 
 
 def _surroundings(ellipse: Ellipse, padding_px: float, shape: tuple[int, ...]) -> tuple[int, int, int, int]:
@@ -229,13 +276,15 @@ def _relative_fall_off(electrons: Pixels, inside: NDArray[np.bool_]) -> Pixels:
 
     With the second moments S of the pixels inside, a relative gradient g of the light moves their centroid by S g.
     """
-    if np.count_nonzero(inside) < MIN_INSIDE_PIXELS:
+    face = Moments(inside.astype(np.float64))
+    if face.total < MIN_INSIDE_PIXELS:
         return np.ones(electrons.shape)
-    offset = np.indices(electrons.shape, dtype=np.float64)
-    offset -= offset[:, inside].mean(axis=1)[:, None, None]
-    moments = np.cov(offset[:, inside], bias=True)
-    gradient = np.linalg.solve(moments, offset[:, inside] @ electrons[inside] / electrons[inside].sum())
-    return np.asarray(np.clip(1 + np.tensordot(gradient, offset, axes=1), *FALL_OFF_RANGE))
+    light = Moments(np.where(inside, electrons, 0.0))
+    v, u = (np.arange(size, dtype=np.float64) for size in electrons.shape)
+    middle = face.first(u, v) / face.total
+    du, dv = u - middle[0], v - middle[1]
+    gradient = np.linalg.solve(face.second(du, dv) / face.total, light.first(du, dv) / light.total)
+    return np.asarray(np.clip(gradient[0] * du + (1 + gradient[1] * dv)[:, None], *FALL_OFF_RANGE))
 
 
 def _excess_variance(readout: Readout, ring_e: Pixels, model_e2: float) -> float:

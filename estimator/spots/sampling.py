@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import j1, jv
+from scipy.special import j0, j1
 
 from estimator.io.device import Camera
 
@@ -153,6 +153,8 @@ def _error(true_px: Floats, half_px: Floats, weights: Floats | float = 1.0) -> t
 def _moments(true_px: Floats, half_px: Floats) -> Floats:
     """Second moments (n,), px^2, by pixels about the sampled centroid, of ellipses at true centroids (n,)."""
     x, phase = 2 * np.pi * HARMONICS * half_px[:, None], 2 * np.pi * HARMONICS * true_px[:, None]
-    spectrum, slopes = 2 * j1(x) / x, -4 * np.pi * half_px[:, None] * jv(2, x) / x
+    of_first = j1(x)
+    # J2(x) = 2 J1(x) / x - J0(x), many times faster than the general function; x is 4 at least.
+    spectrum, slopes = 2 * of_first / x, -4 * np.pi * half_px[:, None] * (2 * of_first / x - j0(x)) / x
     excess = (np.cos(phase) * (spectrum / HARMONICS**2 - slopes / HARMONICS)).sum(axis=1) / np.pi**2
     return np.asarray(half_px**2 / 4 + PIXEL_VARIANCE + excess - _error(true_px, half_px)[0] ** 2)
