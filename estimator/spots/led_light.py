@@ -185,8 +185,9 @@ def light_of(readout: Readout, ellipse: Ellipse, others: list[Ellipse], denoise_
         # One electron more: the noise of a pixel with fewer is not normal.
         gate_e = BACKGROUND_SIGMA * float(np.sqrt(_median(variance_e2[ring]) + 1.0))
         even_e = electrons / fall_off
-        # The ring without pixels of another surface or light.
-        ring &= np.abs(even_e - _median(even_e[ring])) <= gate_e
+        # The ring without pixels of another surface or light; few pixels may lie on both sides of their median.
+        even_ring = ring & (np.abs(even_e - _median(even_e[ring])) <= gate_e)
+        ring = even_ring if even_ring.any() else ring
         background_e = float(even_e[ring].mean()) * fall_off
         if np.count_nonzero(ring) >= MIN_RING_PIXELS:
             unlit = support & (electrons - background_e <= gate_e)
