@@ -25,7 +25,7 @@ from estimator.camera.motion import MOTION_PARAMETERS
 from estimator.camera.pose import Pose
 from estimator.camera.projection import projection_of
 from estimator.errors import EstimationFailure
-from estimator.solvers.camera_check import contradicts_camera, unchecked_focal_m2
+from estimator.solvers.camera_check import camera_errors, unchecked_focal_m2
 from estimator.solvers.chi_square import chi2_limit, pair_limit
 from estimator.solvers.observations import Observations, centroid_images, corrected_for_eccentricity
 from estimator.solvers.reprojection import Fit, fit
@@ -194,7 +194,7 @@ def _plausible(agreed: Consensus, observations: Observations) -> bool:
     freedom = max(_freedom(chosen), 1)
     if best.tilt_chi2 > chi2_limit(OUTLIER_PROBABILITY, 2) or best.chi2 > chi2_limit(OUTLIER_PROBABILITY, freedom):
         return False
-    return chosen.correlated or chosen.camera.uncertainty is not None or not contradicts_camera(chosen, best)
+    return chosen.correlated or chosen.camera.uncertainty is not None or not camera_errors(chosen, best).revealed
 
 
 def _enough(inliers: NDArray[np.bool_]) -> bool:
