@@ -229,8 +229,9 @@ def effects(chosen: Chosen) -> None:
 
 
 def levels(chosen: Chosen) -> None:
-    """Error against level: the plot of the page, from the benchmark set and the three levels."""
-    folders = [chosen.measurement.dataset("office200", "office200"), *map(chosen.dataset, LEVELS)]
+    """Error against level: the plot of the page, from the benchmark recipe and the three levels."""
+    ideal = chosen.measurement.dataset(f"office200-{chosen.frames}", "office200", {"poses.count": chosen.frames})
+    folders = [ideal, *map(chosen.dataset, LEVELS)]
     found = []
     for folder in folders:
         missing = [name for name in PLOTTED if not (folder / "estimates" / f"{name}.parquet").is_file()]
