@@ -78,12 +78,17 @@ def test_errors_that_cannot_be_seen_reveal_nothing() -> None:
     assert not CameraErrors(found / 2, sigmas, np.array([2.0, 2.0]), moved).revealed
 
 
-def test_an_unchecked_focal_length_costs_its_mean_square_error() -> None:
-    """Sigma 0.1 % with a prior of 1 % and 0.2 % found: by hand; below an eighth of 0.1 % it is checked."""
-    moved = np.array([[0.0], [1.0], [3.0]])
-    errors = CameraErrors(np.array([2e-3]), np.array([1e-3]), np.array([1e-2]), moved)
-    weight = 1e-4 / (1e-4 + 1e-6)
+def test_an_unchecked_camera_costs_its_mean_square_error() -> None:
+    """Sigma 0.1 % with a prior of 1 % and 0.2 % found: by hand; below an eighth of 0.1 % the camera is checked.
+
+    Beside the focal length the second intrinsic would be revealed, 0.8 of its prior at four sigmas, and the third
+    not, 1.2.
+    """
+    moved = np.array([[0.0, 1.0, 1.0], [1.0, 1.0, 0.0], [3.0, 1.0, 2.0]])
+    found, assumed = np.array([2e-3, 0.3, 0.1]), np.array([1e-2, 1.0, 1.0])
+    errors = CameraErrors(found, np.array([1e-3, 0.2, 0.3]), assumed, moved)
+    weight, third = 1e-4 / (1e-4 + 1e-6), 1 / 1.09
     expected = (weight * 1e-6 + (weight * 2e-3) ** 2) * np.outer(moved[:, 0], moved[:, 0])
-    np.testing.assert_allclose(errors.unchecked_focal_m2(), expected, rtol=1e-12)
-    checked = CameraErrors(np.array([2e-3]), np.array([1.2e-4]), np.array([1e-2]), moved)
-    assert not checked.unchecked_focal_m2().any()
+    expected += (third * 0.09 + (third * 0.1) ** 2) * np.outer(moved[:, 2], moved[:, 2])
+    np.testing.assert_allclose(errors.unchecked_m2(), expected, rtol=1e-12)
+    assert not CameraErrors(found, np.array([1.2e-4, 0.2, 0.3]), assumed, moved).unchecked_m2().any()

@@ -70,7 +70,7 @@ def test_errors_by_the_residuals_give_the_covariance_of_student_s_distribution(s
 
 
 @pytest.mark.parametrize("adapted", [False, True])
-def test_an_unchecked_focal_length_adds_its_covariance_unscaled(adapted: bool) -> None:
+def test_an_unchecked_camera_adds_its_covariance_unscaled(adapted: bool) -> None:
     """Neither the scale of chi-square, 500, nor Student's, 2, applies to it."""
     best, unchecked_m2 = fitted(2e3, np.full(4, 500.0)), np.outer([0.0, 1.0, 20.0], [0.0, 1.0, 20.0])
     found = Consensus(best, (), np.ones(4, dtype=bool), True, adapted=adapted, unchecked_m2=unchecked_m2)

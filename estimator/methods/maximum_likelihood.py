@@ -12,8 +12,8 @@ hybrid bound. What it does not state is taken as exact, unless the images contra
 against each other by more than their noise explains, or have another size or profile, these become nuisances as well.
 The standard deviation of such a nuisance is that of all LEDs of the frame: a variance component (Foerstner 1979). A
 camera that states nothing is then assumed to be one as sold, and so it is where an error of its intrinsics explains the
-images better than an exact camera does (`estimator.pixels.camera_check`). A focal length that the images do not check
-adds to the covariance.
+images better than an exact camera does (`estimator.pixels.camera_check`). A camera that the images do not check adds
+to the covariance.
 
 With a rolling shutter the velocity of the camera while the frame is read out is estimated with the pose, with the
 gyroscope's reading or a hand's motion as a prior (`estimator.solvers.shutter_motion`); the pose is that at mid-readout.
@@ -138,7 +138,7 @@ def ml(frame: DeviceFrame) -> Estimate:
     found = _maximize_honestly(frame, gravity, spots, pose, exact)
     covariance_m2 = found.covariance[:3, :3]
     if isinstance(found, Maximum):
-        unchecked_m2 = np.zeros((3, 3)) if found.camera is None else found.camera.unchecked_focal_m2()
+        unchecked_m2 = np.zeros((3, 3)) if found.camera is None else found.camera.unchecked_m2()
     if not _camera_is_assumed(frame, found.components):
         covariance_m2 = covariance_m2 + unchecked_m2
     if observations.motion is not None:

@@ -1,4 +1,4 @@
-"""Check of a camera that states no errors by the residuals of a fit, and what an unchecked focal length may cost."""
+"""Check of a camera that states no errors by the residuals of a fit, and what an unchecked one may cost."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -41,18 +41,20 @@ class CameraErrors:
         visible = self.sigmas < self.assumed
         return bool((np.abs(self.found) > MAX_CAMERA_SIGMA * self.sigmas)[visible].any())
 
-    def unchecked_focal_m2(self) -> Floats:
-        """Covariance (3, 3) of the position by a focal length that the residuals do not check.
+    def unchecked_m2(self) -> Floats:
+        """Covariance (3, 3) of the position by intrinsics that the residuals do not check.
 
-        Residuals that would reveal an error of CHECKED_FOCAL check it, and it is taken as exact: zero. Otherwise it has
-        the mean square error that residuals leave and the camera as sold has.
+        Residuals that would reveal an error of CHECKED_FOCAL check the camera, which is taken as exact: zero. Otherwise
+        the focal length counts, and so does each other intrinsic of which they would not reveal an error as large as
+        that of a camera as sold: with the mean square error that the residuals leave and the camera as sold has.
         """
-        found, sigma, assumed = (float(one[0]) for one in (self.found, self.sigmas, self.assumed))
-        if MAX_CAMERA_SIGMA * sigma <= CHECKED_FOCAL:
+        if MAX_CAMERA_SIGMA * self.sigmas[0] <= CHECKED_FOCAL:
             return np.zeros((3, 3))
-        weight = assumed**2 / (assumed**2 + sigma**2)
-        mean_square = weight * sigma**2 + (weight * found) ** 2
-        return np.asarray(mean_square * np.outer(self.moved[:, 0], self.moved[:, 0]))
+        counts = MAX_CAMERA_SIGMA * self.sigmas > self.assumed
+        counts[0] = True
+        weight = self.assumed**2 / (self.assumed**2 + self.sigmas**2)
+        mean_square = weight * self.sigmas**2 + (weight * self.found) ** 2
+        return np.asarray((self.moved * (mean_square * counts)) @ self.moved.T)
 
 
 @lru_cache(maxsize=1)  # both checks of a fit
@@ -68,11 +70,11 @@ def camera_errors(observations: Observations, best: Fit) -> CameraErrors:
     return CameraErrors(found, 1 / np.sqrt(size2), assumed.sigmas[:count], moved)
 
 
-def unchecked_focal_m2(observations: Observations, best: Fit) -> Floats:
-    """Covariance (3, 3) of the position by the focal length of a camera that states nothing, where it is not checked.
+def unchecked_camera_m2(observations: Observations, best: Fit) -> Floats:
+    """Covariance (3, 3) of the position by a camera that states nothing and is not checked by the spots.
 
-    Zero where the spots have errors of camera or map beside their noise.
+    See `CameraErrors.unchecked_m2`. Zero where the spots have errors of camera or map beside their noise.
     """
     if observations.correlated or observations.camera.uncertainty is not None:
         return np.zeros((3, 3))
-    return camera_errors(observations, best).unchecked_focal_m2()
+    return camera_errors(observations, best).unchecked_m2()
