@@ -319,7 +319,10 @@ def _snooped(
             inliers[np.flatnonzero(inliers)[displaced >= MIN_EXCLUDED_SHARE * displaced.max()]] = False
             continue
         if adapted:
-            model, found = _settled(model, found, inliers)
+            try:
+                model, found = _settled(model, found, inliers)
+            except EstimationFailure:
+                return None
         return model, found, inliers
     return None
 
