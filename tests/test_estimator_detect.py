@@ -390,3 +390,28 @@ def test_a_frame_without_a_spot_says_what_was_seen() -> None:
     cornered[0, 0] = 200.0
     with pytest.raises(EstimationFailure, match=r"bright areas: 1 smaller than 16 px$"):
         spots_of(cornered)
+
+
+def test_led_images_of_a_pixel_are_found_below_a_ceiling_at_a_hundredth_of_their_luminance() -> None:
+    """The 5 x 5 mean of one pixel is a 25th of it: 5 % of that, 1/500, is less than the ceiling's 1/100."""
+    led_e, wall_e, ceiling_e = 300_000.0, 10_000.0, 13_000.0
+    image = np.full((120, 120), ceiling_e)
+    image[:, :40] = wall_e  # a third of the outermost pixels: their darkest quarter
+    image[50:115:8, 50:115:8] = led_e
+    part = Readout(0, 0, image.astype(np.float32), image.astype(np.float32), np.zeros(image.shape, bool))
+    v_px, u_px = np.mgrid[50:115:8, 50:115:8] + 0.5
+    leds_px = np.column_stack([u_px.ravel(), v_px.ravel()])
+    spots = list(detect([part], 120 * 160, 0, leds_px, near_px=4.0))
+    assert len(spots) == len(leds_px)
+    # Symmetric about each LED but for its neighbours, which are left out.
+    np.testing.assert_allclose(by_nearest(spots, leds_px), 0.0, atol=1e-3)
+
+
+def test_a_ring_of_two_surfaces_has_a_background() -> None:
+    """Half the ring is dark and half bright: no pixel is near the median between, and all of them count."""
+    image = np.full((60, 60), 100.0)
+    image[:, 30:] = 10_000.0
+    image[27:34, 27:33] = 1e6
+    (spot,) = spots_of(image)
+    # The support has at most 14 x 14 pixels, each half off its background by 4950 e at a mean lever of 3.5 px.
+    assert abs(spot.u_px - 30.0) < 14 * 14 * 4950 * 3.5 / 42e6

@@ -217,9 +217,11 @@ def test_gravity_and_two_leds_fix_a_position_and_one_does_not() -> None:
 
 @pytest.mark.slow
 def test_exact_gravity_is_exact() -> None:
-    """Said to be without error, a reading that is off by 0.1 deg moves the answer by 3 m times that, 5 mm."""
+    """Said to be without error, as is the camera, a reading that is off by 0.1 deg moves the answer by 3 m times that,
+    5 mm.
+    """
     view = view_of(TARGET, 3.0, 10.0, 5.0, 30.0)
-    frame = exact(view, SIX)
+    frame = with_exact_camera(exact(view, SIX))
     off = rotation(np.radians(10.1), np.radians(5.0)) @ [0.0, 0.0, 9.80665]
     wrong = replace(
         frame, accelerometer_m_s2=tuple(off.tolist()), accelerometer=Accelerometer(kind="tilt-error", error_deg=0.0)
@@ -270,7 +272,7 @@ def test_the_covariance_is_that_of_small_changes_of_the_answer(monkeypatch: pyte
         view, PAIR, np.rint(render(view, PAIR, PAIR_RADIUS_M, 20000.0, samples=100)).astype(np.uint32), 0.05
     )
     leds = {key: led.model_copy(update={"radius_m": PAIR_RADIUS_M}) for key, led in frame.leds.items()}
-    frame = replace(frame, leds=leds)
+    frame = with_exact_camera(replace(frame, leds=leds))
     start, gravity = Pose(np.array(view.position_m), view.R_cam_world), gravity_of(frame)
     state = ImageState.as_told(start, frame.camera, 2)
     view_of_leds = leds_in_view(frame, state, SURE, np.zeros(2), np.zeros(2, dtype=bool))

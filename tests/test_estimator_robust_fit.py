@@ -12,6 +12,7 @@ from estimator.camera.pose import Pose, rotation
 from estimator.errors import EstimationFailure
 from estimator.methods.gravity_fit import _from_triples as from_triples
 from estimator.methods.gravity_fit import agreement, ambiguous
+from estimator.solvers import robust_fit
 from estimator.solvers.observations import Observations, observe
 from estimator.solvers.reprojection import Fit
 from estimator.solvers.robust_fit import Consensus, consensus, minima
@@ -71,7 +72,7 @@ def test_errors_by_the_residuals_give_the_covariance_of_student_s_distribution(s
 
 
 @pytest.mark.parametrize("adapted", [False, True])
-def test_an_unchecked_focal_length_adds_its_covariance_unscaled(adapted: bool) -> None:
+def test_an_unchecked_camera_adds_its_covariance_unscaled(adapted: bool) -> None:
     """Neither the scale of chi-square, 500, nor Student's, 2, applies to it."""
     best, unchecked_m2 = fitted(2e3, np.full(4, 500.0)), np.outer([0.0, 1.0, 20.0], [0.0, 1.0, 20.0])
     found = Consensus(best, (), np.ones(4, dtype=bool), True, adapted=adapted, unchecked_m2=unchecked_m2)
@@ -251,3 +252,16 @@ def test_poses_of_three_spots_are_ranked_by_the_others() -> None:
     seven = observed(offsets, np.full(9, 0.02)).only(np.arange(9) < 7)
     for pose in from_triples(seven):
         np.testing.assert_allclose(pose.position_m, VIEW.position_m, atol=1e-6)
+
+
+def test_a_size_of_errors_that_no_fit_settles_leaves_the_other_explanations(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One wrong spot of nine: errors as stated with an outlier explain it, without errors by the residuals."""
+
+    def unsettled(*_: object) -> None:
+        raise EstimationFailure("position", "the covariance of the spots is not positive definite")
+
+    monkeypatch.setattr(robust_fit, "_settled", unsettled)
+    monkeypatch.setattr(robust_fit, "MIN_SURE_INLIERS", 99)  # so that every explanation is tried
+    monkeypatch.setattr(robust_fit, "MIN_SURE_SHARE", 99.0)
+    found = agreed(observed(np.vstack([np.zeros((8, 2)), [[30.0, 0.0]]]), np.full(9, 0.02)))
+    assert found.inliers.tolist() == [True] * 8 + [False]

@@ -11,8 +11,9 @@ datum) is estimated with the pose, as nuisances with priors (`estimator.pixels.n
 hybrid bound. What it does not state is taken as exact, unless the images contradict: if LED images are displaced
 against each other by more than their noise explains, or have another size or profile, these become nuisances as well.
 The standard deviation of such a nuisance is that of all LEDs of the frame: a variance component (Foerstner 1979). A
-camera that states nothing is then assumed to be one as sold. A displacement common to all images is not revealed. Nor
-is a focal length where the view does not check it: `estimator.solvers.robust_fit` says what it adds to the covariance.
+camera that states nothing is then assumed to be one as sold, and so it is where an error of its intrinsics explains the
+images better than an exact camera does (`estimator.pixels.camera_check`). A camera that the images do not check adds
+to the covariance.
 
 With a rolling shutter the velocity of the camera while the frame is read out is estimated with the pose, with the
 gyroscope's reading or a hand's motion as a prior (`estimator.solvers.shutter_motion`); the pose is that at mid-readout.
@@ -38,8 +39,16 @@ from estimator.io.device import DeviceFrame
 from estimator.methods.gravity_fit import agreement_of, ambiguous
 from estimator.methods.up2p import upright_pose
 from estimator.methods.variant import Estimate, Needs, Variant
+from estimator.pixels.camera_check import SHIFT_TOLERANCE_PX, camera_errors_by_pixels
 from estimator.pixels.initial import START_SIGMA_SHARE, Start, gravity_of, start_at_spots
-from estimator.pixels.led_model import IMAGE_PARAMETERS, PRINCIPAL_POINT, PROFILE_PARAMETERS, SIZE_PARAMETER, rim
+from estimator.pixels.led_model import (
+    IMAGE_PARAMETERS,
+    MOTION_COLUMNS,
+    PRINCIPAL_POINT,
+    PROFILE_PARAMETERS,
+    SIZE_PARAMETER,
+    rim,
+)
 from estimator.pixels.led_pixels import LedPixels, LedsInView, gather_led_pixels, leds_in_view
 from estimator.pixels.likelihood import Noise, fit_photometry, score
 from estimator.pixels.nuisances import NO_COMPONENTS, NO_GRAVITY, Components, Gravity, Nuisances, Priors
@@ -54,6 +63,7 @@ from estimator.pixels.search import (
 )
 from estimator.receiver.known import with_known_gains
 from estimator.solvers import second_order
+from estimator.solvers.camera_check import CameraErrors
 from estimator.solvers.observations import Observations, observe_once
 from estimator.solvers.reprojection import fit
 from estimator.solvers.uncertainty import assumed_uncertainty
@@ -72,9 +82,8 @@ MIN_FOR_CONSENSUS = 3
 # Error of the spots, beside their noise and START_SIGMA_SHARE, up to which the map may be exact.
 MAX_MODEL_ERROR_PX = 0.3
 # Nuisances that no one states: initial standard deviations, and how much an LED's image may differ from the model
-# before it reveals them, beside its noise: shift, size, profile.
+# before it reveals them, beside its noise: shift (SHIFT_TOLERANCE_PX), size, profile.
 START_COMPONENTS = Components(place_m=5e-3, size=0.01, profile=0.03)
-SHIFT_TOLERANCE_PX = 3e-3
 SIZE_TOLERANCE_PX = 0.02
 PROFILE_TOLERANCE = 3e-3
 # Images that the last step moved by less reveal what they would reveal after it: a small share of SHIFT_TOLERANCE_PX.
@@ -98,7 +107,8 @@ class Maximum:
 
     `covariance` (6, 6) is that of the pose, or (12, 12) with the velocity's for a rolling shutter. `components` are
     those of the priors. `model_is_wrong` says whether many LEDs are not explained. `last` is the result of the last
-    search, with `pixels`.
+    search, with `pixels`. `camera` are the errors that the images say of a camera that states none and is taken as
+    exact; None for another camera, and beside an uncertain map.
     """
 
     pose: Pose
@@ -109,6 +119,7 @@ class Maximum:
     model_is_wrong: bool
     last: ScoringResult
     pixels: LedPixels
+    camera: CameraErrors | None = None
 
 
 def ml(frame: DeviceFrame) -> Estimate:
@@ -144,6 +155,8 @@ def ml(frame: DeviceFrame) -> Estimate:
     spots = [one for one in correspondences if one.led.position_m in positions]
     found = _maximize_honestly(frame, gravity, spots, pose, exact)
     covariance_m2 = found.covariance[:3, :3]
+    if isinstance(found, Maximum):
+        unchecked_m2 = np.zeros((3, 3)) if found.camera is None else found.camera.unchecked_m2()
     if not _camera_is_assumed(frame, found.components):
         covariance_m2 = covariance_m2 + unchecked_m2
     if observations.motion is not None:
@@ -173,23 +186,23 @@ def _maximize_honestly(
     are uncertain, the spots' own fit is the result: it is nearly as good then, since the noise of centroids is small
     beside that uncertainty.
     """
-    priors = Priors.of(frame, tuple(frame.leds.values()))
-    found, revealed = None, START_COMPONENTS
+    priors = wider = Priors.of(frame, tuple(frame.leds.values()))
+    found, revealed, camera = None, START_COMPONENTS, None
     if exact or not priors.exact:
         start = start_at_spots(frame, gravity, priors, spots, pose, NO_COMPONENTS)
         try:
             found = maximize(frame, gravity, priors, start)
-            revealed = _revealed(frame, gravity, priors, found)
+            revealed, camera = _revealed(frame, gravity, priors, found)
         except EstimationFailure:
             if len(spots) < MIN_FOR_CONSENSUS:
                 raise
             if exact and not priors.exact:
                 return start
     for _ in range(MAX_ROUNDS):
-        if found is not None and revealed == found.components:
-            return found
-        wider = priors
-        if _camera_is_assumed(frame, revealed):
+        contradicted = camera is not None and camera.revealed
+        if found is not None and revealed == found.components and not contradicted:
+            return replace(found, camera=camera)
+        if contradicted or _camera_is_assumed(frame, revealed):
             wider = replace(priors, camera=assumed_uncertainty(frame.camera).device_sigmas())
         start = start_at_spots(frame, gravity, wider, spots, pose, revealed)
         try:
@@ -198,29 +211,42 @@ def _maximize_honestly(
             if not np.trace(start.covariance[:3, :3]) < MAX_SIGMA_M**2:
                 raise
             return start
-        revealed = _revealed(frame, gravity, wider, found)
+        revealed, camera = _revealed(frame, gravity, wider, found)
     if found is None:
         raise EstimationFailure("fit", DIVERGED)
-    return found
+    return replace(found, camera=camera)
 
 
-def _revealed(frame: DeviceFrame, gravity: Gravity, priors: Priors, found: Maximum) -> Components:
-    """Components of a maximum, and those that its images reveal beside them, with an initial value each."""
+def _revealed(
+    frame: DeviceFrame, gravity: Gravity, priors: Priors, found: Maximum
+) -> tuple[Components, CameraErrors | None]:
+    """Components of a maximum, and those that its images reveal beside them, with an initial value each.
+
+    Also the errors of the camera, as `Maximum` holds them.
+    """
     pixels, result, had = found.pixels, found.last, found.components
     if had == START_COMPONENTS or all(vars(had).values()):
-        return had
+        return had, None
     if found.model_is_wrong:
-        return START_COMPONENTS
+        return START_COMPONENTS, None
+    of_leds = priors.only(pixels.index)
+    of_place = priors.camera, priors.datum, priors.luminaires, had.added(priors).leds[:, :3]
+    checks_camera = frame.camera.uncertainty is None and not any(part.any() for part in of_place)
     # A shift of the principal point is one of the image.
     shift, size = list(PRINCIPAL_POINT), [SIZE_PARAMETER]
     profile, photometry = result.nuisances.profile(), result.photometry
-    if result.last_px < MAX_LAST_PX:
+    if result.last_px < MAX_LAST_PX and not checks_camera:
         rendered = result.rendered.by_shift_and_size()
     else:
-        state = result.nuisances.state(result.pose, frame.camera, priors.only(pixels.index))
-        rendered = pixels.model.render(state, np.array(shift + size))
+        columns = np.array(shift + size)
+        if checks_camera:
+            columns = np.concatenate([np.arange(SIZE_PARAMETER + 1), MOTION_COLUMNS[: len(priors.motion)]])
+        rendered = pixels.model.render(result.nuisances.state(result.pose, frame.camera, of_leds), columns)
         photometry = fit_photometry(pixels, rendered, result.used, Noise.of(frame), photometry, profile)
     information, gradient = (one[result.used] for one in score(pixels, rendered, photometry, profile))
+    camera = None
+    if checks_camera:
+        camera = camera_errors_by_pixels(frame, gravity, of_leds, result, information.sum(axis=0), gradient.sum(axis=0))
     radius_px = pixels.radius_px[result.used]
 
     def reveals(columns: list[int], tolerance: Floats, more: float = 0.0, freedom: int = 0) -> bool:
@@ -237,7 +263,7 @@ def _revealed(frame: DeviceFrame, gravity: Gravity, priors: Priors, found: Maxim
         new["size"] = START_COMPONENTS.size
     if had.profile == 0 and reveals(of_profile, PROFILE_TOLERANCE * ones):
         new["profile"] = START_COMPONENTS.profile
-    return replace(had, **new)
+    return replace(had, **new), camera
 
 
 def _differ(information: Floats, gradient: Floats, tolerance: Floats, more: float, freedom: int) -> bool:
@@ -245,13 +271,12 @@ def _differ(information: Floats, gradient: Floats, tolerance: Floats, more: floa
 
     By their information (n, k, k) and gradient (n, k), and a chi-square `more` of `freedom` degrees of freedom.
     """
-    spread = (
-        information
-        + information @ information * tolerance[:, None, None] ** 2
-        + 1e-12 * np.trace(information, axis1=1, axis2=2)[:, None, None] * np.eye(information.shape[1])
-    )
-    total = np.einsum("ni,ni->", gradient, np.linalg.solve(spread, gradient[:, :, None])[:, :, 0]) + more
-    return bool(total > chi2.isf(REVEALED_PROBABILITY, gradient.size + freedom))
+    trace = np.trace(information, axis1=1, axis2=2)
+    informed = trace > 0  # the light of an LED whose readings determine no amplitude says nothing
+    D, g, trace, tolerance = information[informed], gradient[informed], trace[informed], tolerance[informed]
+    spread = D + D @ D * tolerance[:, None, None] ** 2 + 1e-12 * trace[:, None, None] * np.eye(D.shape[1])
+    total = np.einsum("ni,ni->", g, np.linalg.solve(spread, g[:, :, None])[:, :, 0]) + more
+    return bool(total > chi2.isf(REVEALED_PROBABILITY, g.size + freedom))
 
 
 def _of_places(z: Nuisances, used: Mask) -> float:

@@ -1,5 +1,6 @@
-"""Check of a camera that states no errors by the residuals of a fit, and what an unchecked focal length may cost."""
+"""Check of a camera that states no errors by the residuals of a fit, and what an unchecked one may cost."""
 
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -18,43 +19,62 @@ MAX_CAMERA_SIGMA = 4.0
 CHECKED_FOCAL = 5e-4
 
 
-def contradicts_camera(observations: Observations, best: Fit) -> bool:
-    """Whether one of the errors that are assumed of a camera as sold explains the residuals of a fit better.
+@dataclass(frozen=True, eq=False)
+class CameraErrors:
+    """Errors of the intrinsics (k,), the focal length's first, that each by itself explain the residuals of a fit best.
 
-    Better by MAX_CAMERA_SIGMA standard deviations, and not of a size that the residuals cannot show.
+    `sigmas` (k,) are their standard deviations by the residuals, `assumed` (k,) those of a camera as sold; `moved`
+    (3, k) are the derivatives of the fitted position by the errors.
     """
-    found, errors, priors, _ = _camera_errors(observations, best)
-    visible = errors < priors
-    return bool((np.abs(found) > MAX_CAMERA_SIGMA * errors)[visible].any())
+
+    found: Floats
+    sigmas: Floats
+    assumed: Floats
+    moved: Floats
+
+    @property
+    def revealed(self) -> bool:
+        """Whether one of them explains the residuals better than an exact camera does, by MAX_CAMERA_SIGMA.
+
+        Errors that the residuals cannot show, larger than those of a camera as sold, do not count.
+        """
+        visible = self.sigmas < self.assumed
+        return bool((np.abs(self.found) > MAX_CAMERA_SIGMA * self.sigmas)[visible].any())
+
+    def unchecked_m2(self) -> Floats:
+        """Covariance (3, 3) of the position by intrinsics that the residuals do not check.
+
+        Residuals that would reveal an error of CHECKED_FOCAL check the camera, which is taken as exact: zero. Otherwise
+        the focal length counts, and so does each other intrinsic of which they would not reveal an error as large as
+        that of a camera as sold: with the mean square error that the residuals leave and the camera as sold has.
+        """
+        if MAX_CAMERA_SIGMA * self.sigmas[0] <= CHECKED_FOCAL:
+            return np.zeros((3, 3))
+        counts = MAX_CAMERA_SIGMA * self.sigmas > self.assumed
+        counts[0] = True
+        weight = self.assumed**2 / (self.assumed**2 + self.sigmas**2)
+        mean_square = weight * self.sigmas**2 + (weight * self.found) ** 2
+        return np.asarray((self.moved * (mean_square * counts)) @ self.moved.T)
 
 
 @lru_cache(maxsize=1)  # both checks of a fit
-def _camera_errors(observations: Observations, best: Fit) -> tuple[Floats, Floats, Floats, Floats]:
-    """Errors of the intrinsics (k,) that each by itself explain the residuals of a fit best.
-
-    Also their standard deviations by the residuals, (k,), and as assumed of a camera as sold, (k,), and the derivatives
-    (3, k) of the fitted position by them. The first is the focal length's.
-    """
+def camera_errors(observations: Observations, best: Fit) -> CameraErrors:
+    """Errors of the intrinsics by the residuals of spots, as of a camera that states none."""
     assumed = observations.with_assumed_camera().uncertainty
     count = len(assumed.intrinsics)
     slopes = observations.from_pixels @ assumed.slopes_px(best.pose)[:, :, :count]
     # Residuals are those of the model minus the image: an error of the camera adds its slopes to them.
     left_open, moved = best.response(slopes)
     size2 = np.maximum((left_open**2).sum(axis=0), np.finfo(float).tiny)
-    return -(left_open.T @ best.residuals) / size2, 1 / np.sqrt(size2), assumed.sigmas[:count], moved
+    found = -(left_open.T @ best.residuals) / size2
+    return CameraErrors(found, 1 / np.sqrt(size2), assumed.sigmas[:count], moved)
 
 
-def unchecked_focal_m2(observations: Observations, best: Fit) -> Floats:
-    """Covariance (3, 3) of the position by the focal length of a camera that states nothing, where it is not checked.
+def unchecked_camera_m2(observations: Observations, best: Fit) -> Floats:
+    """Covariance (3, 3) of the position by a camera that states nothing and is not checked by the spots.
 
-    Residuals that would reveal an error of CHECKED_FOCAL check it, and it is taken as exact: zero. Otherwise it has the
-    mean square error that residuals leave and the camera as sold has.
+    See `CameraErrors.unchecked_m2`. Zero where the spots have errors of camera or map beside their noise.
     """
     if observations.correlated or observations.camera.uncertainty is not None:
         return np.zeros((3, 3))
-    found, errors, priors, moved = _camera_errors(observations, best)
-    if MAX_CAMERA_SIGMA * errors[0] <= CHECKED_FOCAL:
-        return np.zeros((3, 3))
-    weight = priors[0] ** 2 / (priors[0] ** 2 + errors[0] ** 2)
-    mean_square = weight * errors[0] ** 2 + (weight * found[0]) ** 2
-    return np.asarray(mean_square * np.outer(moved[:, 0], moved[:, 0]))
+    return camera_errors(observations, best).unchecked_m2()

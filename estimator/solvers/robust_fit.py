@@ -25,7 +25,7 @@ from estimator.camera.motion import MOTION_PARAMETERS
 from estimator.camera.pose import Pose
 from estimator.camera.projection import projection_of
 from estimator.errors import EstimationFailure
-from estimator.solvers.camera_check import contradicts_camera, unchecked_focal_m2
+from estimator.solvers.camera_check import camera_errors, unchecked_camera_m2
 from estimator.solvers.chi_square import chi2_limit, pair_limit
 from estimator.solvers.observations import Observations, centroid_images, corrected_for_eccentricity
 from estimator.solvers.reprojection import Fit, coarse_fit, fit
@@ -77,8 +77,8 @@ class Consensus:
     `best` is the best fit, `others` are fits of other local minima to the same spots, best first; `inliers` (n,) are
     the spots used; `gravity` says whether the accelerometer was used. `model` are the observations with the size of
     errors that explains them, None where all spots are explained as stated; `adapted` says that the residuals gave it.
-    `unchecked_m2` (3, 3) is what a focal length that neither the device nor the residuals vouch for adds to the
-    position's covariance.
+    `unchecked_m2` (3, 3) is what a camera that neither the device nor the residuals vouch for adds to the position's
+    covariance.
     """
 
     best: Fit
@@ -144,7 +144,7 @@ def _consensus(
     if fits and _explains_all(fits[0], observations):
         agreed = Consensus(fits[0], fits[1:], everything, _uses_gravity(observations))
         if _plausible(agreed, observations):
-            return replace(agreed, unchecked_m2=unchecked_focal_m2(observations, fits[0]))
+            return replace(agreed, unchecked_m2=unchecked_camera_m2(observations, fits[0]))
         rough = [one.pose for one in fits]
     else:
         rough = [*(one.pose for one in fits), *starts, *more_starts()]
@@ -158,7 +158,7 @@ def _consensus(
     fits = minima(best.of_inliers(), [best.best.pose, *starts])
     if fits:
         best = replace(best, best=fits[0], others=fits[1:])
-    return replace(best, unchecked_m2=unchecked_focal_m2(best.of_inliers(), best.best))
+    return replace(best, unchecked_m2=unchecked_camera_m2(best.of_inliers(), best.best))
 
 
 def _explanations(
@@ -195,7 +195,7 @@ def _plausible(agreed: Consensus, observations: Observations) -> bool:
     freedom = max(_freedom(chosen), 1)
     if best.tilt_chi2 > chi2_limit(OUTLIER_PROBABILITY, 2) or best.chi2 > chi2_limit(OUTLIER_PROBABILITY, freedom):
         return False
-    return chosen.correlated or chosen.camera.uncertainty is not None or not contradicts_camera(chosen, best)
+    return chosen.correlated or chosen.camera.uncertainty is not None or not camera_errors(chosen, best).revealed
 
 
 def _enough(inliers: NDArray[np.bool_]) -> bool:
@@ -320,7 +320,10 @@ def _snooped(
             inliers[np.flatnonzero(inliers)[displaced >= MIN_EXCLUDED_SHARE * displaced.max()]] = False
             continue
         if adapted:
-            model, found = _settled(model, found, inliers)
+            try:
+                model, found = _settled(model, found, inliers)
+            except EstimationFailure:
+                return None
         return model, found, inliers
     return None
 

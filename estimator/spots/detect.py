@@ -33,6 +33,9 @@ from estimator.spots.sampling import PIXEL_VARIANCE, SHARP, LensBlur, sampling_e
 
 # Share of the brightest level: above ceiling and walls at 1/100 of an LED, below an LED at a quarter of it.
 THRESHOLD_OF_BRIGHTEST = 0.05
+# The mean dilutes LED images of a pixel or two to a tenth and less: the threshold is twice the share of ceiling and
+# walls, in any case, of the brightest pixels before the mean.
+MIN_THRESHOLD_OF_PEAK = 0.02
 THRESHOLD_SIGMA = 6.0
 # One bright pixel covers 25 when smoothed; smaller blobs are noise near the threshold.
 MIN_BLOB_PX = 16
@@ -115,6 +118,8 @@ def detect(
     smooth = [cv2.blur(readout.image_e, size, borderType=cv2.BORDER_REPLICATE) for readout in readouts]
     whole = sum(image.size for image in smooth) == sensor_px and len(smooth) == 1
     background_e, threshold_e = levels_of(smooth, whole, brightest_of(readouts, smooth, decoded_px, near_px))
+    peak_e = brightest_of(readouts, [readout.image_e for readout in readouts], decoded_px, near_px)
+    threshold_e = max(threshold_e, background_e + MIN_THRESHOLD_OF_PEAK * (peak_e - background_e))
     measured: list[_Measured] = []
     found, small, large = 0, 0, 0
     for readout, image in zip(readouts, smooth, strict=True):
@@ -164,20 +169,23 @@ def _with_neighbours(ellipses: Sequence[Ellipse], denoise_radius_px: int) -> Ite
 
 
 def brightest_of(
-    readouts: Sequence[Readout], smooth: Sequence[NDArray[np.float32]], decoded_px: Pixels | None, near_px: float
+    readouts: Sequence[Readout], images: Sequence[NDArray[np.float32]], decoded_px: Pixels | None, near_px: float
 ) -> float:
-    """Brightness of the LEDs, electrons: median of the maxima near the decoded pixels, or the image's maximum."""
+    """Brightness of the LEDs, electrons: median of the maxima near the decoded pixels, or the image's maximum.
+
+    `images` are those of the readouts, smoothed or not.
+    """
     peaks = []
     if decoded_px is not None:
         first = np.array([(readout.column, readout.row) for readout in readouts])
-        size = np.array([image.shape[::-1] for image in smooth])
+        size = np.array([image.shape[::-1] for image in images])
         low = np.clip(decoded_px[:, None] - near_px - first, 0, size).astype(int)
         high = np.clip(decoded_px[:, None] + near_px - first, 0, size).astype(int)
         spots, parts = np.nonzero((low < high).all(axis=2))
         boxes = np.concatenate([low[spots, parts], high[spots, parts]], axis=1).tolist()
         for part, (left, top, right, bottom) in zip(parts.tolist(), boxes, strict=True):
-            peaks.append(float(smooth[part][top:bottom, left:right].max()))
-    return float(np.median(peaks)) if peaks else max(float(image.max()) for image in smooth)
+            peaks.append(float(images[part][top:bottom, left:right].max()))
+    return float(np.median(peaks)) if peaks else max(float(image.max()) for image in images)
 
 
 def levels_of(smooth: Sequence[NDArray[np.float32]], whole: bool, brightest_e: float) -> tuple[float, float]:
