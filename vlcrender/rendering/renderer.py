@@ -306,18 +306,19 @@ class Renderer:
             for i, led in band.images[step].items():
                 if self.scene.leds.diffusers[i] is not None:
                     continue  # a diffuser is one of the room's surfaces
+                covered, weight = led.coverage, led.weight
                 for room, before in zip(rooms, sharp, strict=True):
                     shared = band.share(led.roi)
                     if shared is not None and room.roi.overlaps(shared[0]):
                         both = room.roi.intersection(shared[0])
                         here, there = room.roi.slices(both), led.roi.slices(both)
-                        coverage = led.coverage[there]
+                        coverage = covered[there]
                         if band.knot is None:
                             uncovered = room.image[here] * (1 - coverage)
-                            room.image[here] = uncovered + faces[i] * coverage * led.weight[there]
+                            room.image[here] = uncovered + faces[i] * coverage * weight[there]
                         else:
                             share = coverage * band.knot.weights_in(both)
-                            room.image[here] += share * (faces[i] * led.weight[there] - before[here])
+                            room.image[here] += share * (faces[i] * weight[there] - before[here])
 
     def _patches(self, view: LedView, precision: type[np.floating] = np.float32) -> tuple[LedPatch, ...]:
         """Patches of the LEDs: means over the images at several poses, blurred."""
@@ -334,7 +335,7 @@ class Renderer:
                 if not of_led or shared is None:
                     continue
                 here = roi if light is None else shared[0]
-                of_band = self._light_of(view, i, of_led, len(band.poses), here, led_rate)
+                of_band = self._light_of(view, i, of_led, len(band.poses), here, led_rate, precision)
                 visible, imaged = (
                     sum(getattr(image, name) for image in of_led) / len(band.poses)
                     for name in ("visible_fraction", "imaged_fraction")
@@ -364,14 +365,23 @@ class Renderer:
         return tuple(patches)
 
     def _light_of(
-        self, view: LedView, i: int, of_led: Sequence[LedImage], poses: int, roi: Roi, led_rate: float
-    ) -> Array:
+        self,
+        view: LedView,
+        i: int,
+        of_led: Sequence[LedImage],
+        poses: int,
+        roi: Roi,
+        led_rate: float,
+        precision: type[np.floating],
+    ) -> NDArray[np.floating]:
         """Light of LED number i in a region: the mean over its images at this number of poses, blurred."""
         luminance, kernel = self.scene.leds.luminances_cd_m2[i], view.blurs.kernel(i)
         union = union_of(of_led)
+        if poses == 1 and kernel.whole is None and union == roi:
+            return of_led[0].light(led_rate * luminance, precision)
         light = np.zeros((union.rows, union.columns))
         for image in of_led:
-            light[union.slices(image.roi)] += led_rate * luminance * image.coverage * image.weight * image.pattern
+            light[union.slices(image.roi)] += image.light(led_rate * luminance)
         edges = [image.edges for image in of_led if image.edges is not None]
         light_per_excess = led_rate * float(luminance) / poses
         result = kernel.blurred(light / poses, union, edges, light_per_excess)

@@ -68,7 +68,10 @@ class Diffuser:
         """Luminance of the diffuser at (x, y) over that of the LED: T A cos^(m+3)(theta) / (pi d^2)."""
         tan2 = ((x_m - self.foot_m[0]) ** 2 + (y_m - self.foot_m[1]) ** 2) / self.distance_m**2
         at_foot = self.transmittance * self.area_m2 / (np.pi * self.distance_m**2)
-        luminance: Array = at_foot * (1 + tan2) ** (-(self.order + 3) / 2)
+        if abs(self.order - 1) < 1e-12:  # a square takes a tenth of the time of a power
+            luminance: Array = at_foot / np.square(1 + tan2)
+        else:
+            luminance = at_foot * (1 + tan2) ** (-(self.order + 3) / 2)
         return luminance
 
     def slopes(self, x_m: Array, y_m: Array) -> tuple[Array, Array]:
