@@ -23,9 +23,9 @@ RIM_POINTS = 720
 """Points of a face's outline: their bounding box misses a disc's edge by at most 1e-5 of its radius."""
 CELLS_AT_ONCE = 500_000
 """Pixels that are computed together: bounds the memory for an LED as large as the image."""
-BLOCK_PX = 32
+BLOCK_PX = 16
 """Rows and columns of a block of a large image: those that the face covers whole or not at all have no pixels."""
-MIN_BLOCKS = 8
+MIN_BLOCKS = 16
 """Blocks across and down from which on an image is computed in blocks."""
 
 
@@ -40,23 +40,34 @@ class LedFace:
 
 @dataclass(frozen=True)
 class CoverageBlocks:
-    """Coverage of a region in blocks of BLOCK_PX x BLOCK_PX pixels from its first; the last may extend beyond it."""
+    """Coverage of a region in blocks of BLOCK_PX x BLOCK_PX pixels; those at its border extend beyond it.
 
+    Blocks start at multiples of BLOCK_PX, so that images of several LEDs have their blocks in the same rows.
+    """
+
+    row: int
+    column: int
+    """First pixel of the first block."""
     whole: NDArray[np.bool_]
     """(m, n), blocks that the face covers whole."""
-    mixed: NDArray[np.bool_]
-    """(m, n), other blocks of which the face may cover a part."""
+    numbers: NDArray[np.int64]
+    """(m, n), numbers in `parts` of other blocks of which the face may cover a part; -1 for the rest."""
     parts: Array
-    """Coverage of the pixels of those, (k, BLOCK_PX, BLOCK_PX)."""
+    """Coverage of the pixels of those blocks, (k, BLOCK_PX, BLOCK_PX)."""
 
-    def image(self, rows: int, columns: int) -> Array:
-        """Coverage of the pixels, (rows, columns)."""
-        down, across = self.whole.shape
-        pixels = np.zeros((down, BLOCK_PX, across, BLOCK_PX))
+    def image(self, roi: Roi) -> Array:
+        """Coverage of some of the pixels, (rows, columns)."""
+        top, left = (roi.row - self.row) // BLOCK_PX, (roi.column - self.column) // BLOCK_PX
+        bottom, right = (roi.end_row - self.row - 1) // BLOCK_PX + 1, (roi.end_column - self.column - 1) // BLOCK_PX + 1
+        whole, numbers = self.whole[top:bottom, left:right], self.numbers[top:bottom, left:right]
+        mixed = numbers >= 0
+        pixels = np.zeros((bottom - top, BLOCK_PX, right - left, BLOCK_PX))
         blocks = pixels.swapaxes(1, 2)
-        blocks[self.whole] = 1.0
-        blocks[self.mixed] = self.parts
-        image: Array = pixels.reshape(down * BLOCK_PX, across * BLOCK_PX)[:rows, :columns]
+        blocks[whole] = 1.0
+        blocks[mixed] = self.parts[numbers[mixed]]
+        inside = roi.row - self.row - top * BLOCK_PX, roi.column - self.column - left * BLOCK_PX
+        outer = Roi(roi.row - inside[0], roi.column - inside[1], pixels.shape[0] * BLOCK_PX, (right - left) * BLOCK_PX)
+        image: Array = pixels.reshape(outer.rows, outer.columns)[outer.slices(roi)]
         return image
 
 
@@ -75,9 +86,13 @@ class LedCoverage:
     @property
     def coverage(self) -> Array:
         """Coverage of each pixel, (rows, columns); made anew for an image in blocks."""
+        return self.coverage_in(self.roi)
+
+    def coverage_in(self, roi: Roi) -> Array:
+        """Coverage of some of the pixels, (rows, columns)."""
         if isinstance(self.pixels, CoverageBlocks):
-            return self.pixels.image(self.roi.rows, self.roi.columns)
-        return self.pixels
+            return self.pixels.image(roi)
+        return self.pixels[self.roi.slices(roi)]
 
 
 def coverage_of_led(posed: PosedCamera, face: LedFace, margin_px: int = 0) -> LedCoverage | None:
@@ -184,7 +199,8 @@ def _coverage_in_blocks(posed: PosedCamera, face: LedFace, first: Array, last: A
     if not posed.camera.lens_projection.keeps_lines_straight:
         return None
     u, v = (
-        np.arange(start, end + BLOCK_PX, BLOCK_PX, dtype=float) for start, end in zip(first, last, strict=True)
+        np.arange(start // BLOCK_PX * BLOCK_PX, end + BLOCK_PX, BLOCK_PX, dtype=float)
+        for start, end in zip(first, last, strict=True)
     )
     x, y = intersections_with_plane(posed, face.center_m, u[None, :], v[:, None])
     if max(np.abs(x).max(), np.abs(y).max()) >= BEYOND_HORIZON_M:
@@ -197,7 +213,8 @@ def _coverage_in_blocks(posed: PosedCamera, face: LedFace, first: Array, last: A
     )
     whole_pixels, mixed_pixels = face.shape.whole_and_mixed(x, y)
     parts = _coverage_of_cells(face, whole_pixels, mixed_pixels, _quads(x, y, mixed_pixels))
-    return CoverageBlocks(whole, mixed, parts)
+    numbers = np.where(mixed, np.cumsum(mixed).reshape(mixed.shape) - 1, -1)
+    return CoverageBlocks(int(v[0]), int(u[0]), whole, numbers, parts)
 
 
 def _coverage_of_cells(face: LedFace, whole: NDArray[np.bool_], mixed: NDArray[np.bool_], quads: Array) -> Array:

@@ -29,8 +29,8 @@ from vlcrender.rendering.crosstalk import REACH_PX, shared_patch, with_crosstalk
 from vlcrender.rendering.electron_rates import ElectronRates
 from vlcrender.rendering.expected_image import ExpectedImage, ExpectedRegion, Image, LedPatch, SpecularReflection
 from vlcrender.rendering.halo import GlareHalo, glare_halo, halo_of_sources
-from vlcrender.rendering.led_blur import LedBlur, led_blur
-from vlcrender.rendering.led_radiance import LedImage, led_images
+from vlcrender.rendering.led_blur import SHARP, LedBlur, led_blur
+from vlcrender.rendering.led_radiance import LedImage, led_images, light_of_diffusers
 from vlcrender.rendering.led_slopes import Cameras, led_slopes
 from vlcrender.rendering.led_view import During, LedBand, LedView, cut, patch_rois, read_out, union_of
 from vlcrender.rendering.occlusion import Occlusion
@@ -325,9 +325,10 @@ class Renderer:
         leds, posed = self.scene.leds, view.posed
         led_rate = self._rates(posed.camera).led
         centers_px = posed.project(leds.centers_m[list(view.patch_rois)]).tolist()
+        of_diffusers = self._light_of_diffusers(view, led_rate, precision)
         patches = []
         for (i, roi), (u, v) in zip(view.patch_rois.items(), centers_px, strict=True):
-            light = np.zeros((roi.rows, roi.columns)) if view.rolling else None
+            light: NDArray[np.floating] | None = np.zeros((roi.rows, roi.columns)) if view.rolling else None
             shares: list[tuple[float, float, float]] = []
             for band in view.bands:
                 of_led = [of_pose[i] for of_pose in band.images if i in of_pose]
@@ -335,7 +336,9 @@ class Renderer:
                 if not of_led or shared is None:
                     continue
                 here = roi if light is None else shared[0]
-                of_band = self._light_of(view, i, of_led, len(band.poses), here, led_rate, precision)
+                of_band = of_diffusers.pop(i, None)
+                if of_band is None:
+                    of_band = self._light_of(view, i, of_led, len(band.poses), here, led_rate, precision)
                 visible, imaged = (
                     sum(getattr(image, name) for image in of_led) / len(band.poses)
                     for name in ("visible_fraction", "imaged_fraction")
@@ -363,6 +366,20 @@ class Renderer:
                 )
             )
         return tuple(patches)
+
+    def _light_of_diffusers(
+        self, view: LedView, led_rate: float, precision: type[np.floating]
+    ) -> dict[int, NDArray[np.floating]]:
+        """`_light_of` of the LEDs behind diffusers at rest and without blur, in the regions that they light."""
+        images, leds = view.bands[0].images[0], self.scene.leds
+        still = view.rolling is None and len(view.bands[0].poses) == 1
+        behind = [
+            i
+            for i, roi in view.patch_rois.items()
+            if still and leds.diffusers[i] is not None and view.blurs.kernel(i) is SHARP and images[i].roi == roi
+        ]
+        units = [led_rate * float(leds.luminances_cd_m2[i]) for i in behind]
+        return dict(zip(behind, light_of_diffusers([images[i] for i in behind], units, precision), strict=True))
 
     def _light_of(
         self,

@@ -10,6 +10,7 @@ The lit part ends at MIN_RELATIVE_LUMINANCE of the luminance at the foot, and at
 """
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,13 @@ MIN_DISTANCE_RADII = 3.0
 """Smallest distance of an LED from its diffuser, in LED radii: E at the foot is then too large by at most 11 %."""
 QUADRATURE_NODES = 32
 """Nodes of the quadrature along each side of a quadrant."""
+
+
+@cache
+def _quadrature() -> tuple[Array, Array]:
+    """Nodes and weights of Gauss and Legendre's rule: they take longer than all that a quadrant does with them."""
+    nodes, weights = np.polynomial.legendre.leggauss(QUADRATURE_NODES)
+    return nodes, weights
 
 
 @dataclass(frozen=True)
@@ -66,12 +74,13 @@ class Diffuser:
 
     def at(self, x_m: Array, y_m: Array) -> Array:
         """Luminance of the diffuser at (x, y) over that of the LED: T A cos^(m+3)(theta) / (pi d^2)."""
-        tan2 = ((x_m - self.foot_m[0]) ** 2 + (y_m - self.foot_m[1]) ** 2) / self.distance_m**2
-        at_foot = self.transmittance * self.area_m2 / (np.pi * self.distance_m**2)
+        square_m2 = (x_m - self.foot_m[0]) ** 2 + (y_m - self.foot_m[1]) ** 2 + self.distance_m**2
+        # T A d^(m+1) / pi over the distance from the LED to the power m + 3
+        scale = self.transmittance * self.area_m2 * self.distance_m ** (self.order + 1) / np.pi
         if abs(self.order - 1) < 1e-12:  # a square takes a tenth of the time of a power
-            luminance: Array = at_foot / np.square(1 + tan2)
+            luminance: Array = scale / np.square(square_m2)
         else:
-            luminance = at_foot * (1 + tan2) ** (-(self.order + 3) / 2)
+            luminance = scale * square_m2 ** (-(self.order + 3) / 2)
         return luminance
 
     def slopes(self, x_m: Array, y_m: Array) -> tuple[Array, Array]:
@@ -86,7 +95,7 @@ class Diffuser:
         Luminance is relative to the LED's. Gauss-Legendre quadrature in s with x = d sinh(s), which flattens the
         integrand.
         """
-        nodes, weights = np.polynomial.legendre.leggauss(QUADRATURE_NODES)
+        nodes, weights = _quadrature()
         x0, y0, x1, y1 = self.lit_m
         centers, totals = np.tile(self.foot_m, (4, 1)), np.zeros(4)
         for number, (side_x, side_y) in enumerate(((x0, y0), (x1, y0), (x1, y1), (x0, y1))):
