@@ -252,7 +252,7 @@ def corners_of_cells(values: Array, cells: NDArray[np.bool_]) -> Array:
 
 
 def _corner_extreme(values: NDArray[Any], reduce: np.ufunc) -> NDArray[Any]:
-    """Reduce values at cell corners (..., rows + 1, columns + 1) over the corners of each cell, (..., rows, columns)."""
+    """Reduce values at cell corners (..., rows + 1, columns + 1) over each cell's, (..., rows, columns)."""
     extreme: NDArray[Any] = reduce(
         reduce(values[..., :-1, :-1], values[..., :-1, 1:]), reduce(values[..., 1:, :-1], values[..., 1:, 1:])
     )

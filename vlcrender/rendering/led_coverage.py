@@ -7,6 +7,7 @@ less than 1e-3 for one of 400 px; more only where a ray of a fish-eye lens is al
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,35 +41,35 @@ class LedFace:
 
 @dataclass(frozen=True)
 class CoverageBlocks:
-    """Coverage of a region in blocks of BLOCK_PX x BLOCK_PX pixels; those at its border extend beyond it.
+    """Coverage of a region in blocks of BLOCK_PX x BLOCK_PX pixels from its first; the last may extend beyond it."""
 
-    Blocks start at multiples of BLOCK_PX, so that images of several LEDs have their blocks in the same rows.
-    """
-
-    row: int
-    column: int
-    """First pixel of the first block."""
     whole: NDArray[np.bool_]
     """(m, n), blocks that the face covers whole."""
-    numbers: NDArray[np.int64]
-    """(m, n), numbers in `parts` of other blocks of which the face may cover a part; -1 for the rest."""
+    mixed: NDArray[np.bool_]
+    """(m, n), other blocks of which the face may cover a part."""
     parts: Array
-    """Coverage of the pixels of those blocks, (k, BLOCK_PX, BLOCK_PX)."""
+    """Coverage of the pixels of those, (k, BLOCK_PX, BLOCK_PX)."""
 
-    def image(self, roi: Roi) -> Array:
-        """Coverage of some of the pixels, (rows, columns)."""
-        top, left = (roi.row - self.row) // BLOCK_PX, (roi.column - self.column) // BLOCK_PX
-        bottom, right = (roi.end_row - self.row - 1) // BLOCK_PX + 1, (roi.end_column - self.column - 1) // BLOCK_PX + 1
-        whole, numbers = self.whole[top:bottom, left:right], self.numbers[top:bottom, left:right]
-        mixed = numbers >= 0
-        pixels = np.zeros((bottom - top, BLOCK_PX, right - left, BLOCK_PX))
-        blocks = pixels.swapaxes(1, 2)
-        blocks[whole] = 1.0
-        blocks[mixed] = self.parts[numbers[mixed]]
-        inside = roi.row - self.row - top * BLOCK_PX, roi.column - self.column - left * BLOCK_PX
-        outer = Roi(roi.row - inside[0], roi.column - inside[1], pixels.shape[0] * BLOCK_PX, (right - left) * BLOCK_PX)
-        image: Array = pixels.reshape(outer.rows, outer.columns)[outer.slices(roi)]
-        return image
+    def area_px(self, roi: Roi) -> float:
+        """Sum of the coverage of the region's pixels; `parts` have none beyond it."""
+        rows, columns = (
+            np.minimum(BLOCK_PX, size - BLOCK_PX * np.arange(count))
+            for size, count in zip(roi.shape, self.whole.shape, strict=True)
+        )
+        return float((rows[:, None] * columns * self.whole).sum() + self.parts.sum())
+
+    def reduce(self, light: NDArray[Any]) -> None:
+        """Multiply the light of pixels covered whole, (rows, columns), by their coverage."""
+        for number, lit in enumerate(self.whole | self.mixed):
+            if not lit.all():
+                light[number * BLOCK_PX : (number + 1) * BLOCK_PX] *= lit.repeat(BLOCK_PX)[: light.shape[1]]
+        first_row, first_column = np.nonzero(self.mixed)
+        rows, columns = np.broadcast_arrays(
+            (first_row * BLOCK_PX)[:, None, None] + np.arange(BLOCK_PX)[:, None],
+            (first_column * BLOCK_PX)[:, None, None] + np.arange(BLOCK_PX),
+        )
+        inside = (rows < light.shape[0]) & (columns < light.shape[1])
+        light[rows[inside], columns[inside]] *= self.parts[inside]
 
 
 @dataclass(frozen=True)
@@ -86,13 +87,25 @@ class LedCoverage:
     @property
     def coverage(self) -> Array:
         """Coverage of each pixel, (rows, columns); made anew for an image in blocks."""
-        return self.coverage_in(self.roi)
+        if isinstance(self.pixels, np.ndarray):
+            return self.pixels
+        coverage = np.ones(self.roi.shape)
+        self.reduce(coverage)
+        return coverage
 
-    def coverage_in(self, roi: Roi) -> Array:
-        """Coverage of some of the pixels, (rows, columns)."""
+    @property
+    def area_px(self) -> float:
+        """Sum of the coverage of all pixels."""
         if isinstance(self.pixels, CoverageBlocks):
-            return self.pixels.image(roi)
-        return self.pixels[self.roi.slices(roi)]
+            return self.pixels.area_px(self.roi)
+        return float(self.pixels.sum())
+
+    def reduce(self, light: NDArray[Any]) -> None:
+        """Multiply the light of pixels covered whole, (rows, columns), by their coverage."""
+        if isinstance(self.pixels, CoverageBlocks):
+            self.pixels.reduce(light)
+        else:
+            light *= self.pixels
 
 
 def coverage_of_led(posed: PosedCamera, face: LedFace, margin_px: int = 0) -> LedCoverage | None:
@@ -120,14 +133,15 @@ def coverage_of_led(posed: PosedCamera, face: LedFace, margin_px: int = 0) -> Le
     column, row, end_column, end_row = (int(edge) for edge in (*first, *last))
     pixels, profile = _coverage(posed, face, first, last)
     image = LedCoverage(Roi(row, column, end_row - row, end_column - column), pixels, 1.0, profile)
-    coverage = image.coverage
-    if not coverage.any():
+    if image.area_px == 0:
         return None
     if (low < 0).any() or (high > size).any():
-        on_sensor = coverage[
-            max(0, -row) : max(0, camera.height_px - row), max(0, -column) : max(0, camera.width_px - column)
-        ]
-        fraction = float(min(on_sensor.sum() / face.shape.image_area_px(outline), 1.0))
+        sensor = Roi.of_sensor(camera)
+        on_sensor_px = image.area_px
+        if not sensor.contains(image.roi):
+            both = image.roi.intersection(sensor) if sensor.overlaps(image.roi) else Roi(row, column, 0, 0)
+            on_sensor_px = float(image.coverage[image.roi.slices(both)].sum())
+        fraction = min(on_sensor_px / face.shape.image_area_px(outline), 1.0)
         return replace(image, visible_fraction=fraction)
     return image
 
@@ -198,10 +212,7 @@ def _coverage_in_blocks(posed: PosedCamera, face: LedFace, first: Array, last: A
     """
     if not posed.camera.lens_projection.keeps_lines_straight:
         return None
-    u, v = (
-        np.arange(start // BLOCK_PX * BLOCK_PX, end + BLOCK_PX, BLOCK_PX, dtype=float)
-        for start, end in zip(first, last, strict=True)
-    )
+    u, v = (np.arange(start, end + BLOCK_PX, BLOCK_PX, dtype=float) for start, end in zip(first, last, strict=True))
     x, y = intersections_with_plane(posed, face.center_m, u[None, :], v[:, None])
     if max(np.abs(x).max(), np.abs(y).max()) >= BEYOND_HORIZON_M:
         return None
@@ -212,9 +223,11 @@ def _coverage_in_blocks(posed: PosedCamera, face: LedFace, first: Array, last: A
         posed, face.center_m, u[column, None, None] + corners[None, :], v[row, None, None] + corners[:, None]
     )
     whole_pixels, mixed_pixels = face.shape.whole_and_mixed(x, y)
+    beyond = v[row, None] + corners[:-1] >= last[1], u[column, None] + corners[:-1] >= last[0]
+    for pixels in (whole_pixels, mixed_pixels):
+        pixels[beyond[0][:, :, None] | beyond[1][:, None, :]] = False
     parts = _coverage_of_cells(face, whole_pixels, mixed_pixels, _quads(x, y, mixed_pixels))
-    numbers = np.where(mixed, np.cumsum(mixed).reshape(mixed.shape) - 1, -1)
-    return CoverageBlocks(int(v[0]), int(u[0]), whole, numbers, parts)
+    return CoverageBlocks(whole, mixed, parts)
 
 
 def _coverage_of_cells(face: LedFace, whole: NDArray[np.bool_], mixed: NDArray[np.bool_], quads: Array) -> Array:

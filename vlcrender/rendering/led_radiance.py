@@ -8,7 +8,7 @@ it lights.
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial, reduce
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +17,11 @@ from vlcrender.camera.intrinsics import Camera
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.roi import LedRegions, Roi
 from vlcrender.camera.vignetting import relative_illumination
+from vlcrender.core.backend import dr, exact_math
 from vlcrender.core.planar_shapes import Disc, Rectangle
+from vlcrender.rendering.diffuser_light import light_of_diffuser
 from vlcrender.rendering.led_blur import LedBlur
 from vlcrender.rendering.led_coverage import (
-    BLOCK_PX,
     LedCoverage,
     LedFace,
     coverage_of_led,
@@ -42,8 +43,6 @@ an error of 2 (m + 3) * 0.02^2 / 24: 3e-4 for a Lambertian order m of 5."""
 GRID_POINTS = 17
 """Points across and down a region at which the width of a pixel on a diffuser is computed."""
 PIXELS_AT_ONCE = 50_000
-TILE_COLUMNS = 60 * BLOCK_PX
-"""Columns of a tile of BLOCK_PX rows: 123 kB an array, below what the C library takes from the system each time."""
 
 Array = NDArray[np.float64]
 
@@ -74,12 +73,7 @@ class LedImage:
     @property
     def coverage(self) -> Array:
         """Share of each pixel that the LED covers and nothing occludes."""
-        return self.coverage_in(self.roi)
-
-    def coverage_in(self, roi: Roi) -> Array:
-        """`coverage` of some of the pixels."""
-        covered = self.face.coverage_in(roi)
-        return covered if isinstance(self.clear, float) else covered * self.clear[self.roi.slices(roi)]
+        return self.face.coverage if isinstance(self.clear, float) else self.face.coverage * self.clear
 
     @property
     def weight(self) -> Array:
@@ -101,12 +95,11 @@ class LedImage:
     def light(self, unit: float, precision: type[np.floating] = np.float64) -> NDArray[np.floating]:
         """Light of each pixel, (rows, columns): `unit` in one that the LED fills at its mean luminance on the axis."""
         if self.leds.diffusers[self.index] is not None:
-            (light,) = light_of_diffusers([self], [unit], precision)
-            return light
+            return next(light_of_diffusers([self], [unit], precision))
         camera, coverage, profile = self.posed.camera, self.coverage, self.face.profile
         pattern = _pattern(self.leds, self.index, self.posed, self.roi)
         u, v = self.roi.centers_px()
-        light = np.empty(coverage.shape, dtype=precision)
+        light = np.empty(self.roi.shape, dtype=precision)
         for band in _bands(self.roi):
             luminance = 1.0 if pattern is None else pattern(u, v[band])
             luminance = luminance * (profile if isinstance(profile, float) else profile[band])
@@ -115,47 +108,23 @@ class LedImage:
 
 
 def light_of_diffusers(
-    images: Sequence[LedImage], units: Sequence[float], precision: type[np.floating] = np.float64
-) -> list[NDArray[np.floating]]:
-    """`LedImage.light` of LEDs behind diffusers at one pose: of pixels that several LEDs light, rays are cast once."""
-    lights = [np.empty((image.roi.rows, image.roi.columns), dtype=precision) for image in images]
-    for height_m in {float(image.leds.centers_m[image.index, 2]) for image in images}:
-        level = [
-            (image, unit, light)
-            for image, unit, light in zip(images, units, lights, strict=True)
-            if image.leds.centers_m[image.index, 2] == height_m
-        ]
-        posed, union = level[0][0].posed, reduce(Roi.union, (image.roi for image, _, _ in level))
-        on_diffuser = partial(intersections_with_plane, posed, np.array([0.0, 0.0, height_m]))
-        nearest_m = min(_diffuser(image).distance_m for image, _, _ in level)
-        nodes = _pixel_nodes(union, on_diffuser, nearest_m)
-        for tile in _tiles(union):
-            u, v = tile.centers_px()
-            places = [on_diffuser(u + du, v + dv) for du, dv in nodes]
-            weight = relative_illumination(posed.camera, u, v)
-            for image, unit, light in level:
-                if tile.overlaps(image.roi):
-                    both = tile.intersection(image.roi)
-                    here, diffuser = tile.slices(both), _diffuser(image)
-                    of_tile = reduce(np.add, (diffuser.at(x[here], y[here]) for x, y in places))
-                    of_tile *= weight[here]
-                    of_tile *= unit / len(nodes)
-                    of_tile *= image.coverage_in(both)
-                    light[image.roi.slices(both)] = of_tile
-    return lights
-
-
-def _tiles(roi: Roi) -> Iterator[Roi]:
-    """Parts of a region with whole blocks of coverage, so small that arrays of their pixels stay in the cache."""
-    for row in range(roi.row // BLOCK_PX * BLOCK_PX, roi.end_row, BLOCK_PX):
-        for column in range(roi.column // BLOCK_PX * BLOCK_PX, roi.end_column, TILE_COLUMNS):
-            yield Roi(row, column, BLOCK_PX, TILE_COLUMNS).intersection(roi)
-
-
-def _diffuser(image: LedImage) -> Diffuser:
-    diffuser = image.leds.diffusers[image.index]
-    assert diffuser is not None
-    return diffuser
+    images: Sequence[LedImage], units: Sequence[float], precision: type[np.floating]
+) -> Iterator[NDArray[np.floating]]:
+    """`LedImage.light` of LEDs behind diffusers; all kernels run together."""
+    of_whole = []
+    for image, unit in zip(images, units, strict=True):
+        diffuser, height_m = image.leds.diffusers[image.index], float(image.leds.centers_m[image.index, 2])
+        assert diffuser is not None
+        nodes = _pixel_nodes(image.posed, image.roi, height_m, diffuser)
+        of_whole.append(light_of_diffuser(image.posed, diffuser, height_m, nodes, unit, precision, image.roi))
+    with exact_math():
+        dr.eval(of_whole)
+    for image, light in zip(images, of_whole, strict=True):
+        pixels: NDArray[np.floating] = light.numpy().reshape(image.roi.shape)
+        image.face.reduce(pixels)
+        if not isinstance(image.clear, float):
+            pixels *= image.clear
+        yield pixels
 
 
 def led_images(
@@ -240,8 +209,9 @@ def _pattern(leds: Leds, i: int, posed: PosedCamera, roi: Roi) -> Callable[[Arra
     """`luminance_pattern` as a function of pixel centres u and v in the region; None for 1 in all pixels."""
     diffuser, order = leds.diffusers[i], float(leds.orders[i])
     if diffuser is not None:
-        on_diffuser = partial(intersections_with_plane, posed, np.array([0.0, 0.0, leds.centers_m[i, 2]]))
-        nodes = _pixel_nodes(roi, on_diffuser, diffuser.distance_m)
+        height_m = float(leds.centers_m[i, 2])
+        on_diffuser = partial(intersections_with_plane, posed, np.array([0.0, 0.0, height_m]))
+        nodes = _pixel_nodes(posed, roi, height_m, diffuser)
 
         def mean(u: Array, v: Array) -> Array:
             total: Array = sum((diffuser.at(*on_diffuser(u + a, v + b)) for a, b in nodes), np.zeros(()))
@@ -259,11 +229,10 @@ def beam(posed: PosedCamera, order: float, u: Array, v: Array) -> Array:
     return luminance
 
 
-def _pixel_nodes(
-    roi: Roi, on_plane: Callable[[Array, Array], tuple[Array, Array]], distance_m: float
-) -> list[tuple[float, float]]:
+def _pixel_nodes(posed: PosedCamera, roi: Roi, height_m: float, diffuser: Diffuser) -> list[tuple[float, float]]:
     """Positions in a pixel, from its centre, whose mean is that over the pixel of a diffuser's luminance."""
-    if _max_pixel_width_m(roi, on_plane) < MAX_UNIFORM_SHARE * distance_m:
+    on_plane = partial(intersections_with_plane, posed, np.array([0.0, 0.0, height_m]))
+    if _max_pixel_width_m(roi, on_plane) < MAX_UNIFORM_SHARE * diffuser.distance_m:
         return [(0.0, 0.0)]
     return list(itertools.product((-GAUSS_PX, GAUSS_PX), repeat=2))
 

@@ -29,7 +29,7 @@ from vlcrender.rendering.crosstalk import REACH_PX, shared_patch, with_crosstalk
 from vlcrender.rendering.electron_rates import ElectronRates
 from vlcrender.rendering.expected_image import ExpectedImage, ExpectedRegion, Image, LedPatch, SpecularReflection
 from vlcrender.rendering.halo import GlareHalo, glare_halo, halo_of_sources
-from vlcrender.rendering.led_blur import SHARP, LedBlur, led_blur
+from vlcrender.rendering.led_blur import LedBlur, led_blur
 from vlcrender.rendering.led_radiance import LedImage, led_images, light_of_diffusers
 from vlcrender.rendering.led_slopes import Cameras, led_slopes
 from vlcrender.rendering.led_view import During, LedBand, LedView, cut, patch_rois, read_out, union_of
@@ -370,13 +370,13 @@ class Renderer:
     def _light_of_diffusers(
         self, view: LedView, led_rate: float, precision: type[np.floating]
     ) -> dict[int, NDArray[np.floating]]:
-        """`_light_of` of the LEDs behind diffusers at rest and without blur, in the regions that they light."""
+        """`_light_of` of the LEDs behind diffusers that are at rest and not blurred, whose kernels run together."""
         images, leds = view.bands[0].images[0], self.scene.leds
-        still = view.rolling is None and len(view.bands[0].poses) == 1
+        at_rest = view.rolling is None and len(view.bands[0].poses) == 1
         behind = [
             i
             for i, roi in view.patch_rois.items()
-            if still and leds.diffusers[i] is not None and view.blurs.kernel(i) is SHARP and images[i].roi == roi
+            if at_rest and leds.diffusers[i] is not None and view.blurs.kernel(i).whole is None and images[i].roi == roi
         ]
         units = [led_rate * float(leds.luminances_cd_m2[i]) for i in behind]
         return dict(zip(behind, light_of_diffusers([images[i] for i in behind], units, precision), strict=True))

@@ -11,6 +11,7 @@ The lit part ends at MIN_RELATIVE_LUMINANCE of the luminance at the foot, and at
 
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,16 +73,18 @@ class Diffuser:
             area_m2=self.area_m2 * size**2,
         )
 
-    def at(self, x_m: Array, y_m: Array) -> Array:
-        """Luminance of the diffuser at (x, y) over that of the LED: T A cos^(m+3)(theta) / (pi d^2)."""
-        square_m2 = (x_m - self.foot_m[0]) ** 2 + (y_m - self.foot_m[1]) ** 2 + self.distance_m**2
+    def at(self, x_m: Any, y_m: Any) -> Any:
+        """Luminance of the diffuser at (x, y) over that of the LED: T A cos^(m+3)(theta) / (pi d^2); elementwise.
+
+        Arrays are NumPy's or Dr.Jit's, in the latter case with the diffuser's numbers as data.
+        """
+        x, y, d = x_m - self.foot_m[0], y_m - self.foot_m[1], self.distance_m
+        square_m2 = x * x + y * y + d * d
         # T A d^(m+1) / pi over the distance from the LED to the power m + 3
-        scale = self.transmittance * self.area_m2 * self.distance_m ** (self.order + 1) / np.pi
+        scale = self.transmittance * self.area_m2 * d ** (self.order + 1) / float(np.pi)
         if abs(self.order - 1) < 1e-12:  # a square takes a tenth of the time of a power
-            luminance: Array = scale / np.square(square_m2)
-        else:
-            luminance = scale * square_m2 ** (-(self.order + 3) / 2)
-        return luminance
+            return scale / (square_m2 * square_m2)
+        return scale * square_m2 ** (-(self.order + 3) / 2)
 
     def slopes(self, x_m: Array, y_m: Array) -> tuple[Array, Array]:
         """Slopes of `at` by x and by y, 1/m."""
