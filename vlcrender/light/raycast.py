@@ -67,8 +67,7 @@ class Room:
         parameters["faces"] = all_faces.astype(np.uint32).ravel()
         parameters.update()
         self._scene = mi.load_dict({"type": "scene", "room": shape}, optimize=False)
-        self._vertices = [mi.UInt32(all_faces[:, i].astype(np.uint32)) for i in range(3)]
-        self._owners = mi.UInt32(np.append(np.concatenate(owners), self.nothing).astype(np.uint32))
+        self._faces, self._owners = all_faces, np.append(np.concatenate(owners), self.nothing)
         normals = np.zeros((self.nothing + 1, 3))
         indices = np.ones(self.nothing + 1)
         for number, glazing in enumerate(glazings):
@@ -84,16 +83,23 @@ class Room:
                 self._textured[mesh.faces[mesh.owners == number]] = True
 
     def values(self, light: Lightmap, led_rate: float, ambient_rate: float) -> "mi.Float":
-        """Values of the vertices for `trace`: luminance by LEDs times one rate plus other luminance times another.
+        """Values for `trace`: luminance by LEDs times one rate plus other luminance times another.
 
-        Vertices of textured surfaces have the value of a reflectance of 1.
+        Four numbers for each triangle, which lie together in memory: the value of its first vertex, the differences of
+        the others from that, and the surface's number; and four for no triangle. Vertices of textured surfaces have the
+        value of a reflectance of 1.
         """
         count = len(light.mesh.vertices_m)
         surfaces = led_rate * light.led_cd_m2()[:count] + ambient_rate * light.ambient_cd_m2()[:count]
         lux = led_rate * light.led_lux[:count] + ambient_rate * light.ambient_lux[:count]
         surfaces = np.where(self._textured, lux / np.pi, surfaces)
         glazings = np.repeat([ambient_rate * glazing.luminance_cd_m2 for glazing in self._glazings], 4)
-        return mi.Float(np.concatenate([surfaces, glazings]).astype(np.float32))
+        values = np.concatenate([surfaces, glazings]).astype(np.float32)
+        table = np.zeros((self._triangles + 1, 4), dtype=np.float32)
+        first, second, third = (values[vertices] for vertices in self._faces.T)
+        table[:-1, 0], table[:-1, 1], table[:-1, 2] = first, second - first, third - first
+        table[:, 3] = self._owners
+        return mi.Float(table.ravel())
 
     def trace(
         self, origin: Any, direction: Any, values: Any, coherent: bool = True, spread: tuple[Any, Any] | None = None
@@ -130,9 +136,9 @@ class Room:
         valid = hit.is_valid() & active
         triangle = dr.select(valid, hit.prim_index, self._triangles)
         b1, b2 = hit.prim_uv.x, hit.prim_uv.y
-        at = [dr.gather(mi.Float, values, dr.gather(mi.UInt32, c, triangle, valid), valid) for c in self._vertices]
-        value = dr.fma(b2, at[2] - at[0], dr.fma(b1, at[1] - at[0], at[0]))
-        return dr.select(valid, value, 0.0), dr.gather(mi.UInt32, self._owners, triangle), dr.select(valid, hit.t, 1e9)
+        first, along_1, along_2, owner = dr.gather(mi.Vector4f, values, triangle)
+        value = dr.fma(b2, along_2, dr.fma(b1, along_1, first))
+        return dr.select(valid, value, 0.0), mi.UInt32(owner), dr.select(valid, hit.t, 1e9)
 
 
 def _mirrored(vector: Any, normal: Any) -> Any:

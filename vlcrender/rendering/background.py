@@ -34,12 +34,12 @@ MAX_RATES = 8
 class BackgroundRegion:
     """The room in one region: the mean over each pixel, electrons a second, and the surface at its centre.
 
-    Both (rows, columns); surfaces are numbered as in `raycast.Hit`.
+    Both (rows, columns); surfaces are numbered as in `raycast.Hit`, in 8 bits where these suffice.
     """
 
     roi: Roi
     image: Image
-    surfaces: NDArray[np.uint32]
+    surfaces: NDArray[np.unsignedinteger]
 
 
 class Background:
@@ -111,8 +111,9 @@ class Background:
         padded = [roi.padded(1).intersection(sensor) if sensor.contains(roi) else roi.padded(1) for roi in rois]
         with exact_math():
             hit = self.trace(posed, *_pixel_centers(padded, sensor), rates, lines=lines)
-            dr.eval(hit.value, hit.surface)
-            values, surfaces = hit.value.numpy(), hit.surface.numpy()
+            numbers: Any = getattr(mi, "UInt8" if self.room.nothing < 2**8 else "UInt32")(hit.surface)
+            dr.eval(hit.value, numbers)
+            values, surfaces = hit.value.numpy(), numbers.numpy()
             starts = np.cumsum([0, *(roi.pixels for roi in padded)])
             regions, edges = [], []
             for outer, roi, start in zip(padded, rois, starts, strict=False):
@@ -120,7 +121,7 @@ class Background:
                 labels = surfaces[pixels].reshape(outer.rows, outer.columns)
                 image = values[pixels].reshape(outer.rows, outer.columns)[inner]
                 regions.append(BackgroundRegion(roi, image, labels[inner]))
-                edges.append(np.nonzero(_edges(labels, outer, sensor)[inner]))
+                edges.append(np.divmod(np.flatnonzero(_edges(labels, outer, sensor)[inner]), roi.columns))
             rows = np.concatenate([r + roi.row for (r, _), roi in zip(edges, rois, strict=True)])
             columns = np.concatenate([c + roi.column for (_, c), roi in zip(edges, rois, strict=True)])
             if len(rows):
@@ -160,7 +161,7 @@ def _opaque(matrix: NDArray[np.float64]) -> "list[list[mi.Float]]":
     return [[dr.opaque(mi.Float, number) for number in row] for row in matrix.tolist()]
 
 
-def _edges(surfaces: NDArray[np.uint32], roi: Roi, sensor: Roi) -> NDArray[np.bool_]:
+def _edges(surfaces: NDArray[np.unsignedinteger], roi: Roi, sensor: Roi) -> NDArray[np.bool_]:
     """Pixels of a region in which surfaces may meet; `surfaces` are the numbers at the pixel centres."""
     edges = differs_from_neighbour(surfaces)
     if not sensor.contains(roi) and sensor.overlaps(roi):
@@ -170,16 +171,21 @@ def _edges(surfaces: NDArray[np.uint32], roi: Roi, sensor: Roi) -> NDArray[np.bo
 
 
 def differs_from_neighbour(labels: NDArray[Any]) -> NDArray[np.bool_]:
-    """Pixels (rows, columns) with another label than one of their 8 neighbours."""
-    labels = labels.astype(np.min_scalar_type(labels.max(initial=0)), copy=False)  # most scenes: 8 bits, a pass of 4
-    differs = np.zeros(labels.shape, dtype=bool)
-    for here, there in (
-        (np.s_[:, 1:], np.s_[:, :-1]),
-        (np.s_[1:, :], np.s_[:-1, :]),
-        (np.s_[1:, 1:], np.s_[:-1, :-1]),
-        (np.s_[1:, :-1], np.s_[:-1, 1:]),
-    ):
-        change = labels[here] != labels[there]
-        differs[here] |= change
-        differs[there] |= change
-    return differs
+    """Pixels (rows, columns) with another label than one of their 8 neighbours.
+
+    These are the pixels of all 2 x 2 squares with two labels, and each such square has a change across or down. Changes
+    are few, so each is marked by itself.
+    """
+    rows, columns = labels.shape
+    flat = labels.ravel()
+    wide = np.zeros((rows + 2, columns + 2), dtype=bool)  # squares may extend beyond the border
+    row, column = np.divmod(np.flatnonzero(flat[1:] != flat[:-1]), columns)
+    row, column = row[column < columns - 1], column[column < columns - 1]
+    for down in (0, 1, 2):
+        for right in (1, 2):
+            wide[row + down, column + right] = True
+    row, column = np.divmod(np.flatnonzero(flat[columns:] != flat[:-columns]), columns)
+    for down in (1, 2):
+        for right in (0, 1, 2):
+            wide[row + down, column + right] = True
+    return wide[1:-1, 1:-1]
