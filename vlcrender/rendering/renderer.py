@@ -34,7 +34,7 @@ from vlcrender.rendering.led_radiance import LedImage, led_images, light_of_diff
 from vlcrender.rendering.led_slopes import Cameras, led_slopes
 from vlcrender.rendering.led_view import During, LedBand, LedView, cut, patch_rois, read_out, union_of
 from vlcrender.rendering.occlusion import Occlusion
-from vlcrender.rendering.readout import Knot, RollingPoses, image_at_own_line
+from vlcrender.rendering.readout import Knot, LinePoses, RollingPoses, image_at_own_line
 from vlcrender.rendering.specular_reflection import blurred, specular_reflections
 from vlcrender.scene.leds import Leds
 from vlcrender.scene.loader import Scene
@@ -248,13 +248,20 @@ class Renderer:
         sensor = Roi.of_sensor(camera)
         padded = [roi.padded(blurs.radius_px) for roi in rois]
         wide = [p.intersection(sensor) if sensor.contains(roi) else p for roi, p in zip(rois, padded, strict=True)]
-        steps = len(view.bands[0].poses)
+        poses = view.bands[0].poses
+        rolling = () if view.rolling is None else view.rolling.steps
+        during = rolling or tuple(LinePoses.of(each.pose) for each in poses)
+        reach_px = self._background.reach_px(view.posed, during)
+        steps = len(during)
         totals: list[Image] | None = None
         reflections: list[SpecularReflection] = []
-        for step in range(steps):
-            lines = None if view.rolling is None else view.rolling.steps[step]
-            rooms = self._background.regions(view.bands[0].poses[step], wide, rates, lines)
-            self._cover_with_faces(rooms, view.bands, step, rates)
+        for group in [range(steps)] if reach_px is not None else [range(step, step + 1) for step in range(steps)]:
+            if len(group) > 1:
+                rooms = self._background.regions(view.posed, wide, rates, during, reach_px or 0)
+            else:
+                first = group.start
+                rooms = self._background.regions(poses[first], wide, rates, rolling[first : first + 1])
+            self._cover_with_faces(rooms, view.bands, group, rates)
             if totals is None:
                 totals = [room.image for room in rooms]
             else:
@@ -263,11 +270,12 @@ class Renderer:
             for number in range(len(self.scene.glazings) if with_reflections else 0):
                 label = self._background.room.first_glazing + number
                 if any((room.surfaces == label).any() for room in rooms):
-                    reflections += self._reflections(view, step, number, wide, rois, rates.led / steps)
+                    for step in group:
+                        reflections += self._reflections(view, step, number, wide, rois, rates.led / steps)
         assert totals is not None  # there is at least one pose
         means = []
         for total, outer, roi in zip(totals, wide, rois, strict=True):
-            mean = total if steps == 1 else total / np.float32(steps)
+            mean = total if reach_px is not None else total / np.float32(steps)
             means.append(np.ascontiguousarray(blur(mean, blurs.typical, "edge")[outer.slices(roi)]))
         return means, reflections
 
@@ -293,32 +301,37 @@ class Renderer:
         return found
 
     def _cover_with_faces(
-        self, rooms: Sequence[BackgroundRegion], bands: Sequence[LedBand], step: int, rates: ElectronRates
+        self, rooms: Sequence[BackgroundRegion], bands: Sequence[LedBand], steps: range, rates: ElectronRates
     ) -> None:
         """Put the LEDs' faces, which reflect the room's light, before the room; changes its images.
 
-        step: the number of the pose of each band.
+        steps: the numbers of the poses of each band, over which the faces' images are means.
         """
         places = slice(len(self._light.mesh.vertices_m), None)  # the lightmap has the faces after the mesh
         faces = rates.led * self._light.led_cd_m2(places) + rates.ambient * self._light.ambient_cd_m2(places)
         sharp = [room.image.copy() for room in rooms] if len(bands) > 1 else [room.image for room in rooms]
         for band in bands:
-            for i, led in band.images[step].items():
+            for i in sorted({i for step in steps for i in band.images[step]}):
                 if self.scene.leds.diffusers[i] is not None:
                     continue  # a diffuser is one of the room's surfaces
-                covered, weight = led.coverage, led.weight
+                of_led = [band.images[step][i] for step in steps if i in band.images[step]]
+                led_roi = union_of(of_led)
+                covered, light = np.zeros(led_roi.shape), np.zeros(led_roi.shape)
+                for led in of_led:
+                    inside, coverage = led_roi.slices(led.roi), led.coverage
+                    covered[inside] += coverage
+                    light[inside] += faces[i] * coverage * led.weight
                 for room, before in zip(rooms, sharp, strict=True):
-                    shared = band.share(led.roi)
+                    shared = band.share(led_roi)
                     if shared is not None and room.roi.overlaps(shared[0]):
                         both = room.roi.intersection(shared[0])
-                        here, there = room.roi.slices(both), led.roi.slices(both)
-                        coverage = covered[there]
+                        here, there = room.roi.slices(both), led_roi.slices(both)
+                        share = covered[there] / len(steps)
+                        of_face = light[there] / len(steps)
                         if band.knot is None:
-                            uncovered = room.image[here] * (1 - coverage)
-                            room.image[here] = uncovered + faces[i] * coverage * weight[there]
+                            room.image[here] = room.image[here] * (1 - share) + of_face
                         else:
-                            share = coverage * band.knot.weights_in(both)
-                            room.image[here] += share * (faces[i] * weight[there] - before[here])
+                            room.image[here] += band.knot.weights_in(both) * (of_face - share * before[here])
 
     def _patches(self, view: LedView, precision: type[np.floating] = np.float32) -> tuple[LedPatch, ...]:
         """Patches of the LEDs: means over the images at several poses, blurred."""
