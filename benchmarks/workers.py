@@ -4,8 +4,8 @@
 
 Wall-clock time of `generate`, the difference between FRAMES and a quarter of them, so that start-up cancels; CPU time
 of all processes; and the share of time in which the machine's cores are idle. Two workers are wanted to be 1.7 times as
-fast as one, unless they leave no core idle: one process already uses all cores for rays and noise, and one for EXR, hash
-and preview. The last lines are the rates of background and noise of one process, with one thread and with all cores.
+fast as one, unless they leave no core idle: one process already uses all cores for rays and noise, and one for EXR,
+hash and preview. The last lines are rates of background and noise in one process, with one thread and with all cores.
 Run it without other work, which it would take for that of the workers.
 """
 
