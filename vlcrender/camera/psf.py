@@ -110,14 +110,16 @@ class SplitKernel:
 
     @cached_property
     def deviations(self) -> Array:
-        """Kernels of the parts minus their mean, (n, n, k, k) with k odd: all that exceed MIN_DEVIATION."""
+        """Kernels of the parts minus their mean, (n, n, k, k) with k odd: all that exceed MIN_DEVIATION; sum 0 each."""
         deviations = self.parts - self.whole
         radius = self.parts.shape[-1] // 2
         far = np.maximum(*np.abs(np.indices(deviations.shape[2:]) - radius))[
             np.abs(deviations).max(axis=(0, 1)) > MIN_DEVIATION
         ]
         cut = radius - int(far.max(initial=0))
-        return np.ascontiguousarray(deviations[:, :, cut : 2 * radius + 1 - cut, cut : 2 * radius + 1 - cut])
+        near = deviations[:, :, cut : 2 * radius + 1 - cut, cut : 2 * radius + 1 - cut]
+        near = near - near.mean(axis=(2, 3), keepdims=True)  # no light is lost
+        return np.ascontiguousarray(near)
 
 
 def split_for(camera: Camera, depth_m: float, sigma_px: float = 0.0) -> int:
