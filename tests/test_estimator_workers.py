@@ -17,7 +17,7 @@ from estimator.evaluate.workers import _interrupts_deferred, estimate_with_worke
 from estimator.io.dataset import read_dataset
 from estimator.io.estimates import EstimateRow
 from estimator.methods.catalogue import VARIANTS
-from vlcrender.dataset.generate import _interrupts_deferred as _interrupts_of_generate_deferred
+from vlcrender.dataset.workers import _interrupts_deferred as _interrupts_of_generate_deferred
 
 
 @pytest.fixture(scope="module")

@@ -19,8 +19,8 @@ import pytest
 from conftest import HANG_S, ROOT, SMALL, small_plan, started, wait_until
 
 from vlcrender.dataset.generate import generate
+from vlcrender.dataset.plan import load_plan
 from vlcrender.dataset.progress import Progress, ProgressCallback
-from vlcrender.dataset.recipe import load_plan
 from vlcrender.dataset.verify import verify
 from vlcrender.errors import InputError
 

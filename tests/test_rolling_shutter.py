@@ -20,7 +20,7 @@ from vlcrender.camera.vignetting import relative_illumination
 from vlcrender.dataset import frame_job
 from vlcrender.dataset.light_checks import light_warnings
 from vlcrender.dataset.motion import Motion, poses_during
-from vlcrender.dataset.recipe import Plan
+from vlcrender.dataset.plan import Plan
 from vlcrender.dataset.schema import FrameRow, MapTruthRow, TruthRow
 from vlcrender.dataset.tables import read_table, write_table
 from vlcrender.dataset.true_world import gyro_rad_s

@@ -63,6 +63,7 @@ def test_the_columns_are_those_of_the_format() -> None:
         "angular_velocity_rad_s": pa.list_(pa.float64(), 3),
         "linear_velocity_m_s": pa.list_(pa.float64(), 3),
         "leds": pa.list_(pa.struct([*SPOT, ("visible_fraction", pa.float64()), *WAVE])),
+        "added_noise_dn": pa.float64(),
         "bound_m2": pa.list_(pa.float64(), 9),
         "bound_exact_m2": pa.list_(pa.float64(), 9),
     }
@@ -129,6 +130,7 @@ def record(rng: np.random.Generator, bound: bool) -> FrameRecord:
         "leds": (LedTruth(led=7, u_px=v, v_px=u, visible_fraction=share, **wave),),
         "bound_m2": numbers(9) if bound else None,
         "bound_exact_m2": numbers(9) if bound else None,
+        "added_noise_dn": float(rng.uniform()) if bound else None,
     }
     return FrameRecord(device=FrameRow.model_validate(device), truth=TruthRow.model_validate(truth))
 

@@ -138,6 +138,8 @@ class TruthRow(Settings):
     linear_velocity_m_s: Triple | None
     """Velocity of the projection centre, world axes; None at rest."""
     leds: tuple[LedTruth, ...]
+    added_noise_dn: float | None
+    """Standard deviation of the noise that `[added_noise]` adds before rounding, digital numbers; None without."""
     bound_m2: Flat9 | None
     """Cramér-Rao bound of the position; hybrid with a belief."""
     bound_exact_m2: Flat9 | None

@@ -15,7 +15,7 @@ from vlcrender.camera.intrinsics import Camera, transform
 from vlcrender.camera.roi import Roi
 from vlcrender.config.toml_model import check
 from vlcrender.dataset.exr import read_exr_parts
-from vlcrender.dataset.files import EXPECTED, PREVIEWS, PROCESSED, read_dataset_file, sha256_of
+from vlcrender.dataset.files import EXPECTED, PREVIEWS, PROCESSED, read_dataset_file, read_sweep_file, sha256_of
 from vlcrender.dataset.schema import (
     CameraEntry,
     DatasetFile,
@@ -26,7 +26,8 @@ from vlcrender.dataset.schema import (
     five,
     flat9,
 )
-from vlcrender.dataset.tables import read_table
+from vlcrender.dataset.sweep import SWEEP_FILE, sweep_columns
+from vlcrender.dataset.tables import Constants, read_table
 from vlcrender.errors import InputError
 from vlcrender.modulation.transmission import Transmitter, led_waves
 from vlcrender.modulation.wave import Wave
@@ -47,10 +48,29 @@ LINE_ROUNDS = 200
 
 
 def verify(directory: Path) -> list[str]:
-    """Problems of a dataset, one line each; empty where it is complete and intact.
+    """Problems of a dataset, or of all cells of a sweep, one line each; empty where it is complete and intact.
 
-    Raises InputError where there is no readable dataset.json, or where one of its cameras is impossible.
+    Raises InputError where there is no readable dataset.json or sweep.json, or where a dataset's camera is impossible.
     """
+    if not (directory / SWEEP_FILE).is_file():
+        return _problems(directory)
+    problems = []
+    for cell in read_sweep_file(directory).cells:
+        folder = directory / cell.folder
+        try:
+            found = _problems(folder)
+            values = read_dataset_file(folder).provenance.get("sweep")
+        except InputError as error:
+            problems.append(str(error))
+            continue
+        problems += found
+        if values != cell.values:
+            problems.append(f"{folder / 'dataset.json'}: its values are {values}; {SWEEP_FILE} has {cell.values}")
+    return problems
+
+
+def _problems(directory: Path) -> list[str]:
+    """`verify` of one dataset."""
     dataset = read_dataset_file(directory)
     cameras = {
         name: _camera_of(entry, f"{directory / 'dataset.json'}: camera {name}")
@@ -58,7 +78,8 @@ def verify(directory: Path) -> list[str]:
     }
     problems: list[str] = []
     frames = _read_rows(directory / "frames.parquet", FrameRow, dataset.frame_count, problems)
-    truth = _read_rows(directory / "truth.parquet", TruthRow, dataset.frame_count, problems)
+    columns = sweep_columns(dataset.provenance.get("sweep") or {})
+    truth = _read_rows(directory / "truth.parquet", TruthRow, dataset.frame_count, problems, columns)
     for row in frames:
         problems += _frame_problems(directory, row, dataset)
     recipe = dataset.provenance.get("recipe", {})
@@ -150,10 +171,12 @@ def _true_camera_of(entry: CameraEntry, row: TruthRow) -> Camera:
     return _camera_of(entry.model_copy(update=changes), f"truth.parquet: frame {row.frame}")
 
 
-def _read_rows(path: Path, model: type[R], count: int, problems: list[str]) -> list[R]:
+def _read_rows(
+    path: Path, model: type[R], count: int, problems: list[str], constants: Constants | None = None
+) -> list[R]:
     """Rows of a table; none, and a line in `problems`, where the table is damaged."""
     try:
-        rows = read_table(path, model)
+        rows = read_table(path, model, constants)
     except InputError as error:
         problems.append(str(error))
         return []
