@@ -42,6 +42,7 @@ bench: $(READY)
 	$(BIN)/python benchmarks/sensor.py
 	$(BIN)/python benchmarks/memory.py
 	$(BIN)/python benchmarks/growth.py
+	$(BIN)/python benchmarks/sweep.py
 	$(BIN)/python benchmarks/denoise.py
 	$(BIN)/vlcrender generate datasets/office20.toml --out out/bench/full --set poses.count=8 --set bound=false
 	$(BIN)/vlcrender generate datasets/office200.toml --out out/bench/regions --set poses.count=60 --set bound=false
