@@ -138,9 +138,8 @@ def make_frame(job: Job, frame: int, twin: Files | None = None) -> FrameRecord:
             camera=told.name,
             added=exposed.added(random_key(recipe.seed, number, "added-noise")),
         )
-        attributes = exr_attributes(
-            camera, told.name, exposure.exposure_s, frame
-        )  # of the told camera: readers see them
+        # Of the told camera: readers see them.
+        attributes = exr_attributes(camera, told.name, exposure.exposure_s, frame)
         digest = write_exr(directory / file, dn, sensor, attributes)
         if recipe.expected:
             write_exr(directory / EXPECTED / f"{frame:06d}.exr", exposed.expected, sensor, attributes)
