@@ -45,6 +45,7 @@ from estimator.io.records import (
     read_rows,
 )
 from estimator.io.shutter import Gyroscope
+from estimator.io.sweep import read_sweep
 
 FORMAT_VERSION = 4
 SPOT_TYPE = pa.struct([("led", pa.int64()), ("u_px", pa.float64()), ("v_px", pa.float64())])
@@ -181,6 +182,8 @@ def read_dataset(path: str | Path) -> Dataset:
     try:
         content = description_path.read_bytes()
     except FileNotFoundError:
+        if (sweep := read_sweep(folder)) is not None:
+            raise InputError(f"{folder}: a sweep; needed one dataset, such as {sweep.cells[0]}") from None
         raise InputError(f"{folder}: not a dataset (it has no dataset.json)") from None
     except OSError as error:
         raise InputError(f"{description_path}: {error.strerror or error}") from None

@@ -1,5 +1,6 @@
-"""Inline SVG for the report: lines, text, and the marks and colours of the variants."""
+"""SVG for the report and for files: lines, text, and the marks and colours of the variants."""
 
+import hashlib
 from collections.abc import Sequence
 from html import escape
 
@@ -14,6 +15,29 @@ MARKS = (
     ((0.0, -1.35), (1.35, 0.0), (0.0, 1.35), (-1.35, 0.0)),
 )
 DASHES = ("none", "7 3", "2 3", "9 3 2 3")
+FILE_STYLE = """svg { background: #fff; font: 12px system-ui, sans-serif; }
+svg text { fill: #444; }
+svg path { fill: none; stroke-width: 1.6; }
+svg .rule { stroke: #dde2e6; }
+svg .bound { stroke: #1c2024; stroke-width: 2; }
+svg .mark { stroke: none !important; }"""
+"""Style of a file; the report's page has its own."""
+
+
+def slots_of(names: Sequence[str], known: Sequence[str]) -> list[int]:
+    """Index of the mark and colour of each name, fixed by the name: the place in `known`, or one by its hash.
+
+    A name whose place another one of `names` has takes the next that is free.
+    """
+    places = len(COLOURS) * len(MARKS)
+    taken: dict[str, int] = {}
+    for name in sorted(names, key=lambda name: (name not in known, name)):
+        digest = hashlib.sha256(name.encode()).digest()
+        slot = known.index(name) if name in known else int.from_bytes(digest[:4], "big")
+        if len(taken) < places:
+            slot = next(one % places for one in range(slot, slot + places) if one % places not in taken.values())
+        taken[name] = slot % places
+    return [taken[name] for name in names]
 
 
 def style_of_variants(count: int) -> str:
@@ -30,6 +54,15 @@ def picture(width: float, height: float, label: str, parts: Sequence[str]) -> st
     """SVG element as wide as its container, with a label for screen readers."""
     body = "\n".join(parts)
     return f'<svg viewBox="0 0 {width:.0f} {height:.0f}" role="img" aria-label="{escape(label)}">\n{body}\n</svg>'
+
+
+def svg_file(element: str, style: str) -> str:
+    """A `picture` as a file of its own, with its styles."""
+    head, body = element.split(">", 1)
+    size = head.split('viewBox="0 0 ')[1].split('"')[0].split()
+    root = f'{head} xmlns="http://www.w3.org/2000/svg" width="{size[0]}" height="{size[1]}"'
+    whole = escape(f"{FILE_STYLE}\n{style}", quote=False)
+    return f"{root}>\n<style>{whole}</style>{body}\n"
 
 
 def key(index: int) -> str:
