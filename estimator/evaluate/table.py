@@ -281,4 +281,6 @@ def _statistic(name: str, sizes: Floats, answered: NDArray[np.bool_], samples: S
 
 
 def _with_ends(value: float, limits: tuple[float, float] | None) -> Statistic:
-    return Statistic(value, *(limits or (math.nan, math.nan)))
+    """A statistic of sizes, of which none is below 0."""
+    low, high = limits or (math.nan, math.nan)
+    return Statistic(value, low if low > 0 or math.isnan(low) else 0.0, high)

@@ -72,8 +72,7 @@ def ends_text(name: str, one: Statistic) -> str:
     """Ends of an interval; a dash without one."""
     if math.isnan(one.low):
         return "–"
-    low = "–∞" if one.low == -math.inf else value_text(name, one.low)
-    return f"{low} to {value_text(name, one.high)}"
+    return f"{value_text(name, one.low)} to {value_text(name, one.high)}"
 
 
 def table_csv(table: Table) -> str:

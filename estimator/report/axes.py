@@ -30,10 +30,10 @@ class Axis:
             logarithmic = bool(positive) and len(positive) == len(finite) and max(positive) >= MIN_SPAN * min(positive)
         if logarithmic and positive:
             ends = math.log10(min(positive)), math.log10(max(positive))
-            space = pad * (ends[1] - ends[0]) or 0.1
+            space = pad * (ends[1] - ends[0]) if ends[1] > ends[0] else 0.1
             return cls(10 ** (ends[0] - space), 10 ** (ends[1] + space), True)
         low, high = min(finite, default=0.0), max(finite, default=1.0)
-        space = pad * (high - low) or pad * abs(high) or 1.0
+        space = pad * (high - low) if high > low else 0.04 * abs(high) or 1.0
         return cls(low - space, high + space)
 
     @classmethod
