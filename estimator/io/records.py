@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, TypeVar
 
 import numpy as np
@@ -100,15 +101,21 @@ def missing_key(value: object) -> str | None:
     return None
 
 
-def read_rows(path: Path, columns: Mapping[str, pa.DataType], row: type[RowT]) -> tuple[RowT, ...]:
-    """Read the named columns of a Parquet file as rows of a model; other columns are ignored.
+def read_rows(
+    path: Path,
+    columns: Mapping[str, pa.DataType],
+    row: type[RowT],
+    optional: Mapping[str, pa.DataType] = MappingProxyType({}),
+) -> tuple[RowT, ...]:
+    """Read the named columns of a Parquet file as rows of a model, the optional ones if there; others are ignored.
 
     Raises InputError if the file is missing or damaged, a column is missing or of another type, or a value is not
     allowed.
     """
     with _parquet(path) as file:
-        _check_columns(path, file.schema_arrow, columns)
-        records = file.read(columns=list(columns)).to_pylist()
+        there = {name: kind for name, kind in optional.items() if name in file.schema_arrow.names}
+        _check_columns(path, file.schema_arrow, {**columns, **there})
+        records = file.read(columns=[*columns, *there]).to_pylist()
     try:
         return tuple(TypeAdapter(list[row]).validate_python(records))  # type: ignore[valid-type]
     except ValidationError as error:

@@ -1,6 +1,6 @@
 """One frame of a dataset: render, expose, write its files, and return its rows."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache, partial
 from pathlib import Path
@@ -22,6 +22,7 @@ from vlcrender.dataset.pose_sampling import pose_of_frame
 from vlcrender.dataset.preview import write_preview
 from vlcrender.dataset.recipe import Plan, Recipe
 from vlcrender.dataset.schema import Flat9, FrameRecord, FrameRow, LedTruth, SpotRow, TruthRow, five, flat9, triple
+from vlcrender.dataset.shard import Shard
 from vlcrender.dataset.true_world import (
     built_leds,
     device_of_pose,
@@ -72,14 +73,28 @@ _loaded: dict[tuple[str, str], Scene] = {}
 
 
 def make_frames(job: Job, frames: Sequence[int]) -> list[FrameRecord]:
-    """`make_frame` of several frames."""
-    return [make_frame(job, frame) for frame in frames]
+    """`made_frames` of several frames, made."""
+    return list(made_frames(job, frames))
 
 
-def make_frame(job: Job, frame: int) -> FrameRecord:
+def made_frames(job: Job, frames: Sequence[int]) -> Iterator[FrameRecord]:
+    """`make_frame` of several frames, one after another. Where a file holds several, `frames` are those of one file."""
+    recipe, _ = _renderer(job.recipe_json, job.scene_json, job.scene_folder)
+    per_file = recipe.files.frames_per_file
+    if per_file == 1:
+        yield from (make_frame(job, frame) for frame in frames)
+        return
+    shard = Shard(Path(job.directory), frames[0] // per_file)
+    records = [make_frame(job, frame, shard) for frame in frames]
+    digest = shard.write()
+    yield from (record.with_digest(digest) for record in records)
+
+
+def make_frame(job: Job, frame: int, shard: Shard | None = None) -> FrameRecord:
     """Render, expose and write one frame, and return its rows; depends on nothing but its arguments.
 
     A view that the frame before had too, such as that of a burst, is not rendered again.
+    shard: to which the frame is added, in place of a file of its own; the record then has no digest yet.
     """
     recipe, renderer = _renderer(job.recipe_json, job.scene_json, job.scene_folder)
     directory = Path(job.directory)
@@ -101,12 +116,18 @@ def make_frame(job: Job, frame: int) -> FrameRecord:
     of_device = device_sensor(recipe, device)
     dn = expose_regions(of_device, exposed.expected, noise, exposure_s=exposure_s, camera=told.name)
     attributes = exr_attributes(camera, told.name, exposure_s, frame)  # of the told camera: a reader sees them
-    file = f"{FRAMES}/{frame:06d}.exr"
-    digest = write_exr(directory / file, dn, sensor, attributes)
+    part = None
+    if shard is None:
+        file = f"{FRAMES}/{frame:06d}.exr"
+        digest = write_exr(directory / file, dn, sensor, attributes)
+    else:
+        file, digest = shard.file, ""
+        part = shard.add(frame, dn, sensor, attributes)
     if recipe.expected:
         write_exr(directory / EXPECTED / f"{frame:06d}.exr", exposed.expected, sensor, attributes)
-    preview = directory / PREVIEWS / f"{frame:06d}.png"
-    write_preview(preview, dn, sensor, recipe.sensor.largest_dn, recipe.sensor.black_level_dn)
+    if recipe.files.has_preview(frame):
+        preview = directory / PREVIEWS / f"{frame:06d}.png"
+        write_preview(preview, dn, sensor, recipe.sensor.largest_dn, recipe.sensor.black_level_dn)
     if recipe.processed is not None:
         picture = recipe.processed.develop(
             dn[0][1], recipe.sensor, _white_balance(camera, recipe.sensor, renderer.scene)
@@ -128,6 +149,7 @@ def make_frame(job: Job, frame: int) -> FrameRecord:
         pose=pose_number,
         device=device,
         file=file,
+        part=part,
         sha256=digest,
         camera=told.name,
         exposure_s=exposure_s,

@@ -23,7 +23,7 @@ from pydantic import ValidationError
 from vlcrender.core.warn_once import warn_once
 from vlcrender.dataset.downlink_entry import downlink_entry
 from vlcrender.dataset.files import FRAMES, sha256_of, whole_file, write_json
-from vlcrender.dataset.frame_job import Job, make_frame, make_frames, poses_of
+from vlcrender.dataset.frame_job import Job, made_frames, make_frames, poses_of
 from vlcrender.dataset.light_checks import light_warnings
 from vlcrender.dataset.progress import FRAMES_STAGE, Progress, ProgressCallback
 from vlcrender.dataset.recipe import Plan, Recipe
@@ -44,6 +44,7 @@ from vlcrender.dataset.schema import (
     luminaire_entries,
     map_datum_entry,
 )
+from vlcrender.dataset.shard import incomplete
 from vlcrender.dataset.tables import write_table
 from vlcrender.dataset.true_world import built_leds, device_of_pose, device_rows, map_rows, true_camera
 from vlcrender.dataset.verify import extra_folders, missing_files, verify
@@ -157,11 +158,11 @@ def _warn_of_flicker(plan: Plan) -> None:
 
 
 def _bursts(frames: list[int], recipe: Recipe) -> list[list[int]]:
-    """Frames that one worker makes, one after another, since they share a view: those of a burst."""
-    per_burst = len(recipe.cameras) * recipe.burst_frames
-    if recipe.burst_frames == 1:
-        return [[frame] for frame in frames]
-    return [list(group) for _, group in groupby(frames, key=lambda frame: frame // per_burst)]
+    """Frames that one worker makes, one after another: those of a burst, which share a view, or those of a file."""
+    together = recipe.files.frames_per_file
+    if together == 1 and recipe.burst_frames > 1:
+        together = len(recipe.cameras) * recipe.burst_frames
+    return [list(group) for _, group in groupby(frames, key=lambda frame: frame // together)]
 
 
 def _records(job: Job, bursts: list[list[int]], workers: int, scheduler: str | None) -> Iterator[FrameRecord]:
@@ -169,8 +170,7 @@ def _records(job: Job, bursts: list[list[int]], workers: int, scheduler: str | N
         yield from _on_cluster(job, bursts, scheduler)
     elif workers == 1 or len(bursts) <= 1:
         for burst in bursts:
-            for frame in burst:
-                yield make_frame(job, frame)
+            yield from made_frames(job, burst)
     else:
         yield from _in_processes(job, bursts, workers)
 
@@ -281,7 +281,7 @@ def _prepare(directory: Path, provenance: dict[str, Any], recipe: Recipe) -> Non
         _check_same(plan_file, provenance, "an unfinished dataset of another recipe, scene or version")
     elif directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
         raise InputError(f"{directory}: neither empty nor a dataset; nothing was changed; choose another --out")
-    for name in [FRAMES, *extra_folders(recipe.expected, recipe.processed is not None)]:
+    for name in [FRAMES, *extra_folders(recipe.expected, recipe.processed is not None, recipe.files)]:
         (directory / name).mkdir(parents=True, exist_ok=True)
     for leftover in directory.rglob("*.partial"):
         leftover.unlink()
@@ -297,6 +297,7 @@ def _journal(directory: Path, recipe: Recipe) -> dict[int, int]:
     if not path.exists():
         return {}
     done: dict[int, bytes] = {}
+    digest = cache(sha256_of)
     lines = path.read_text(encoding="utf-8").splitlines()
     for line in lines:
         try:
@@ -304,10 +305,12 @@ def _journal(directory: Path, recipe: Recipe) -> dict[int, int]:
         except ValidationError:
             continue  # a line that a crash truncated: its frame is made again
         file = directory / record.device.file
-        if file.is_file() and sha256_of(file) == record.device.sha256:
+        if file.is_file() and digest(file) == record.device.sha256:
             done[record.frame] = _line(record)
-    folders = extra_folders(recipe.expected, recipe.processed is not None)
-    for frame in missing_files(directory, folders, list(done)):
+    folders = extra_folders(recipe.expected, recipe.processed is not None, recipe.files)
+    for frame in missing_files(directory, folders, list(done), recipe.files):
+        del done[frame]
+    for frame in incomplete(done, recipe.files.frames_per_file, recipe.frame_count):
         del done[frame]
     if len(done) < len(lines):
         log.warning("%s: %d frames are damaged or incomplete and are made again", path, len(lines) - len(done))

@@ -1,0 +1,248 @@
+"""Shards: several region frames in a file, with the pixels, estimates and scores of a file for each frame; previews."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from conftest import ROOT, SMALL, copy_of
+
+import estimator as est
+import vlcrender as vr
+from estimator.io import dataset as reader
+from estimator.io.shard import Shard
+from vlcrender.dataset import frame_job
+from vlcrender.dataset.generate import _bursts
+from vlcrender.dataset.shard import incomplete
+from vlcrender.dataset.verify import verify
+
+REGIONS = 'regions={ kind = "leds", margin_px = 2 }'
+
+
+def plan(*assignments: str) -> vr.Plan:
+    """Six small frames of LED regions, half of which see one LED or a few."""
+    return vr.load_recipe(ROOT / "datasets/quickstart.toml", [*SMALL, "poses.count=6", REGIONS, *assignments])
+
+
+@pytest.fixture(scope="module")
+def single(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A file for each frame."""
+    folder = tmp_path_factory.mktemp("single") / "set"
+    assert vr.generate(plan(), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Files of four and two frames, and two previews."""
+    folder = tmp_path_factory.mktemp("shards") / "set"
+    assert vr.generate(plan("files.frames_per_file=4", "files.previews=2"), folder)
+    return folder
+
+
+def rows_of(folder: Path) -> list[dict[str, object]]:
+    rows: list[dict[str, object]] = pq.read_table(folder / "frames.parquet").to_pylist()
+    return rows
+
+
+def change_rows(folder: Path, change: Callable[[list[dict[str, object]]], object]) -> None:
+    table = pq.read_table(folder / "frames.parquet")
+    rows = table.to_pylist()
+    change(rows)
+    pq.write_table(pa.Table.from_pylist(rows, table.schema), folder / "frames.parquet")
+
+
+def test_frames_per_file_makes_as_many_files(single: Path, shards: Path) -> None:
+    assert len(list((single / "frames").iterdir())) == 6
+    assert sorted(path.name for path in (shards / "frames").iterdir()) == ["shard-000000.exr", "shard-000001.exr"]
+    rows = rows_of(shards)
+    assert [row["file"] for row in rows] == ["frames/shard-000000.exr"] * 4 + ["frames/shard-000001.exr"] * 2
+    assert [row["part"] for row in rows_of(single)] == [None] * 6
+    # Number of the first part: those of the frames before in the file.
+    regions = [len(est.read_frame(est.read_dataset(single), frame).parts) for frame in range(6)]
+    assert max(regions) > 1
+    assert [row["part"] for row in rows] == [*np.cumsum([0, *regions[:3]]).tolist(), 0, regions[4]]
+
+
+def test_other_programs_read_the_parts_by_frame_and_region(shards: Path, single: Path) -> None:
+    """OpenEXR itself reads a shard: names, attributes, windows and pixels of each part."""
+    with OpenEXR.File(str(shards / "frames/shard-000001.exr"), separate_channels=True) as file:
+        parts = file.parts
+    expected = []
+    for frame in (4, 5):
+        with OpenEXR.File(str(single / f"frames/{frame:06d}.exr"), separate_channels=True) as file:
+            expected += [(f"frame {frame} region {number}", part) for number, part in enumerate(file.parts)]
+    assert [part.name() for part in parts] == [name for name, _ in expected]
+    for part, (name, one) in zip(parts, expected, strict=True):
+        assert np.array_equal(part.channels["Y"].pixels, one.channels["Y"].pixels), name
+        for key, value in one.header.items():
+            if key not in ("name", "chunkCount", "channels"):
+                assert np.array_equal(part.header[key], value), (name, key)
+
+
+def test_shards_have_the_pixels_estimates_and_scores_of_single_files(
+    single: Path, shards: Path, tmp_path: Path
+) -> None:
+    folders = [copy_of(single, tmp_path / "single"), copy_of(shards, tmp_path / "shards")]
+    frames = [est.read_dataset(folder) for folder in folders]
+    for frame in range(6):
+        ours, theirs = (est.read_frame(dataset, frame).parts for dataset in frames)
+        assert [(part.row, part.column) for part in ours] == [(part.row, part.column) for part in theirs]
+        assert all(np.array_equal(a.image_dn, b.image_dn) for a, b in zip(ours, theirs, strict=True))
+    results = []
+    for folder in folders:
+        rows = est.run(folder, ["gravity-fit"])["gravity-fit"]
+        assert any(row.status == "ok" for row in rows)
+        scores = est.score(folder).variants[0]
+        left_out = {"time_s", "median_time_s"}
+        results.append(
+            (
+                [row.model_dump(exclude=left_out) for row in rows],
+                scores.model_dump(exclude={"median_time_s": True, "rows": {"__all__": {"time_s"}}}),
+            )
+        )
+    assert results[0] == results[1]
+
+
+def test_a_frame_is_read_without_decoding_the_others(shards: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    decoded: list[int] = []
+    whole = OpenEXR.File
+
+    def counted(*arguments: object, **options: object) -> OpenEXR.File:
+        file = whole(*arguments, **options)
+        decoded.append(len(file.parts))
+        return file
+
+    monkeypatch.setattr(reader.OpenEXR, "File", counted)
+    frame = est.read_frame(est.read_dataset(shards), 1)
+    assert decoded == [len(frame.parts)] * 2  # headers, then pixels
+
+
+def test_the_same_shards_by_any_number_of_workers_and_after_an_interrupt(
+    shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Interrupted in the last frame of the first shard: nothing of it is there, and it is made anew."""
+    assert verify(shards) == []
+    sharded = plan("files.frames_per_file=4", "files.previews=2")
+    make_frame = frame_job.make_frame
+    calls: list[int] = []
+
+    def interrupted(job: frame_job.Job, frame: int, shard: object = None) -> object:
+        calls.append(frame)
+        if calls == [0, 1, 2, 3]:
+            raise KeyboardInterrupt
+        return make_frame(job, frame, shard)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(frame_job, "make_frame", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        vr.generate(sharded, tmp_path / "set")
+    assert list((tmp_path / "set/frames").iterdir()) == []
+    assert vr.generate(sharded, tmp_path / "set")
+    assert calls == [0, 1, 2, 3, 0, 1, 2, 3, 4, 5]
+    for name in ("frames/shard-000000.exr", "frames/shard-000001.exr", "frames.parquet", "truth.parquet"):
+        assert (tmp_path / "set" / name).read_bytes() == (shards / name).read_bytes()
+
+
+def test_a_shard_of_which_the_journal_has_some_frames_is_made_anew() -> None:
+    """Frames 0 to 3 and 4 and 5 are the files of six frames; 8 is the last one, alone in its file, of nine."""
+    assert incomplete([0, 1, 2, 3, 4], 4, 6) == [4]
+    assert incomplete([0, 1, 3, 4, 5], 4, 6) == [0, 1, 3]
+    assert incomplete([8], 4, 9) == []
+    assert incomplete(range(6), 1, 6) == []
+
+
+def test_the_plan_of_122_500_poses_makes_123_files() -> None:
+    recipe = plan("files.frames_per_file=1000", "poses.count=122_500").recipe
+    files = _bursts(list(range(recipe.frame_count)), recipe)
+    assert len(files) == 123
+    assert [len(files[0]), len(files[-1])] == [1000, 500]
+
+
+def test_the_first_frames_have_previews(single: Path, shards: Path, tmp_path: Path) -> None:
+    assert len(list((single / "previews").iterdir())) == 6
+    assert sorted(path.name for path in (shards / "previews").iterdir()) == ["000000.png", "000001.png"]
+    assert (shards / "previews/000001.png").read_bytes() == (single / "previews/000001.png").read_bytes()
+    none = tmp_path / "none"
+    assert vr.generate(plan("files.previews=0", "poses.count=1"), none)
+    assert not (none / "previews").exists()
+    assert verify(none) == []
+    folder = copy_of(shards, tmp_path / "shards")
+    (folder / "previews/000001.png").unlink()
+    assert verify(folder) == [f"{folder / 'previews/000001'}: is missing"]
+
+
+def test_verify_finds_a_wrong_part_and_a_changed_shard(shards: Path, tmp_path: Path) -> None:
+    folder = copy_of(shards, tmp_path / "set")
+    change_rows(folder, lambda rows: rows[2].update(part=rows[1]["part"]))
+    (problem,) = verify(folder)
+    assert problem.endswith(f"part {rows_of(folder)[2]['part']} is not the first one of frame 2")
+    path = folder / "frames/shard-000001.exr"
+    path.write_bytes(path.read_bytes()[:-1])
+    assert sum("SHA-256 differs from frames.parquet" in line for line in verify(folder)) == 2
+
+
+@pytest.mark.parametrize(("part", "message"), [(1, "part 1 is not the first one of frame 0"), (99999, "part 99999")])
+def test_the_estimator_refuses_a_wrong_part(shards: Path, tmp_path: Path, part: int, message: str) -> None:
+    folder = copy_of(shards, tmp_path / "set")
+    change_rows(folder, lambda rows: rows[0].update(part=part))
+    with pytest.raises(est.InputError, match=f"frames/shard-000000.exr: not a readable EXR image .{message}"):
+        est.read_frame(est.read_dataset(folder), 0)
+    with pytest.raises(est.InputError, match="regions|overlap"):  # read as the file of one frame
+        change_rows(folder, lambda rows: rows[0].update(part=None))
+        est.read_frame(est.read_dataset(folder), 0)
+
+
+def test_the_estimator_refuses_a_changed_shard(shards: Path, tmp_path: Path) -> None:
+    folder = copy_of(shards, tmp_path / "set")
+    dataset = est.read_dataset(folder)
+    est.read_frame(dataset, 5)
+    path = folder / "frames/shard-000001.exr"
+    data = bytearray(path.read_bytes())
+    data[-1] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(est.InputError, match="shard-000001.exr: damaged or changed"):
+        est.read_frame(dataset, 5)
+    path.unlink()
+    with pytest.raises(est.InputError, match="shard-000001.exr: No such file"):
+        est.read_frame(dataset, 5)
+
+
+def test_a_set_without_the_column_part_is_read(single: Path, tmp_path: Path) -> None:
+    folder = copy_of(single, tmp_path / "set")
+    pq.write_table(pq.read_table(folder / "frames.parquet").drop_columns(["part"]), folder / "frames.parquet")
+    assert est.read_dataset(folder).frames[0].part is None
+    assert est.read_frame(est.read_dataset(folder), 0).parts
+
+
+def test_bytes_that_are_no_shard_are_refused_in_one_line(shards: Path, tmp_path: Path) -> None:
+    """With the digest of each, so that the layout alone is at fault."""
+    import hashlib
+
+    folder = copy_of(shards, tmp_path / "set")
+    path = folder / "frames/shard-000001.exr"
+    whole = path.read_bytes()
+    for data in (b"", whole[:8], whole[:300], whole[:4] + b"\2\0\0\0" + whole[8:], whole[: len(whole) // 2]):
+        path.write_bytes(data)
+        digest = hashlib.sha256(data).hexdigest()
+        change_rows(folder, lambda rows, digest=digest: [row.update(sha256=digest) for row in rows[4:]])  # type: ignore[misc]
+        with pytest.raises(est.InputError, match="shard-000001.exr: not a readable EXR image") as refusal:
+            est.read_frame(est.read_dataset(folder), 5)
+        assert "\n" not in str(refusal.value)
+    assert Shard(b"", ()).parts == ()
+
+
+def test_shards_of_full_frames_are_refused() -> None:
+    small = [*SMALL, "poses.count=2", "files.frames_per_file=2"]
+    with pytest.raises(vr.InputError, match=r"files.frames_per_file = 2: files of several frames hold regions"):
+        vr.load_recipe(ROOT / "datasets/quickstart.toml", small)
+    with pytest.raises(vr.InputError, match=r"files.previews = -1"):
+        vr.load_recipe(ROOT / "datasets/quickstart.toml", [*SMALL, "files.previews=-1"])
+
+
+def test_provenance_says_how_files_are_laid_out(shards: Path) -> None:
+    recipe = json.loads((shards / "dataset.json").read_text())["provenance"]["recipe"]
+    assert recipe["files"] == {"previews": 2, "frames_per_file": 4}
