@@ -1,7 +1,8 @@
 """Shards: several region frames in a file, with the pixels, estimates and scores of a file for each frame; previews."""
 
+import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +15,10 @@ from conftest import ROOT, SMALL, copy_of
 import estimator as est
 import vlcrender as vr
 from estimator.io import dataset as reader
-from estimator.io.shard import Shard
 from vlcrender.dataset import frame_job
 from vlcrender.dataset.generate import _bursts
-from vlcrender.dataset.shard import incomplete
+from vlcrender.dataset.schema import FrameRecord
+from vlcrender.dataset.shard import Shard, incomplete
 from vlcrender.dataset.verify import verify
 
 REGIONS = 'regions={ kind = "leds", margin_px = 2 }'
@@ -56,6 +57,12 @@ def change_rows(folder: Path, change: Callable[[list[dict[str, object]]], object
     pq.write_table(pa.Table.from_pylist(rows, table.schema), folder / "frames.parquet")
 
 
+def content(path: Path) -> list[tuple[dict[str, object], np.ndarray]]:
+    """Header and pixels of each part."""
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        return [(dict(part.header), part.channels["Y"].pixels) for part in file.parts]
+
+
 def test_frames_per_file_makes_as_many_files(single: Path, shards: Path) -> None:
     assert len(list((single / "frames").iterdir())) == 6
     assert sorted(path.name for path in (shards / "frames").iterdir()) == ["shard-000000.exr", "shard-000001.exr"]
@@ -70,18 +77,14 @@ def test_frames_per_file_makes_as_many_files(single: Path, shards: Path) -> None
 
 def test_other_programs_read_the_parts_by_frame_and_region(shards: Path, single: Path) -> None:
     """OpenEXR itself reads a shard: names, attributes, windows and pixels of each part."""
-    with OpenEXR.File(str(shards / "frames/shard-000001.exr"), separate_channels=True) as file:
-        parts = file.parts
-    expected = []
-    for frame in (4, 5):
-        with OpenEXR.File(str(single / f"frames/{frame:06d}.exr"), separate_channels=True) as file:
-            expected += [(f"frame {frame} region {number}", part) for number, part in enumerate(file.parts)]
-    assert [part.name() for part in parts] == [name for name, _ in expected]
-    for part, (name, one) in zip(parts, expected, strict=True):
-        assert np.array_equal(part.channels["Y"].pixels, one.channels["Y"].pixels), name
-        for key, value in one.header.items():
-            if key not in ("name", "chunkCount", "channels"):
-                assert np.array_equal(part.header[key], value), (name, key)
+    parts = content(shards / "frames/shard-000001.exr")
+    expected = [part for frame in (4, 5) for part in content(single / f"frames/{frame:06d}.exr")]
+    numbers = [(frame, part) for frame in (4, 5) for part in range(len(content(single / f"frames/{frame:06d}.exr")))]
+    assert [header["name"] for header, _ in parts] == [f"frame {frame} region {part}" for frame, part in numbers]
+    for (header, image_dn), (alone, expected_dn) in zip(parts, expected, strict=True):
+        assert np.array_equal(image_dn, expected_dn)
+        for key in set(alone) - {"name", "chunkCount", "channels"}:
+            assert np.array_equal(header[key], alone[key]), key
 
 
 def test_shards_have_the_pixels_estimates_and_scores_of_single_files(
@@ -122,29 +125,40 @@ def test_a_frame_is_read_without_decoding_the_others(shards: Path, monkeypatch: 
     assert decoded == [len(frame.parts)] * 2  # headers, then pixels
 
 
-def test_the_same_shards_by_any_number_of_workers_and_after_an_interrupt(
-    shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("stop", "lines", "made"),
+    [(3, 0, range(6)), (4, 4, (4, 5)), (4, 3, range(6))],
+    ids=["in a shard", "between shards", "while its frames are noted"],
+)
+def test_an_interrupted_run_makes_the_same_shards_and_only_whole_ones_are_kept(
+    shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop: int, lines: int, made: Sequence[int]
 ) -> None:
-    """Interrupted in the last frame of the first shard: nothing of it is there, and it is made anew."""
-    assert verify(shards) == []
+    """Interrupted before frame `stop`, with as many lines of the journal left."""
     sharded = plan("files.frames_per_file=4", "files.previews=2")
     make_frame = frame_job.make_frame
     calls: list[int] = []
 
-    def interrupted(job: frame_job.Job, frame: int, shard: object = None) -> object:
-        calls.append(frame)
-        if calls == [0, 1, 2, 3]:
+    def counted(job: frame_job.Job, frame: int, shard: Shard | None = None) -> FrameRecord:
+        if frame == stop and stop not in calls:
+            calls.append(frame)
             raise KeyboardInterrupt
-        return make_frame(job, frame, shard)  # type: ignore[arg-type]
+        calls.append(frame)
+        return make_frame(job, frame, shard)
 
-    monkeypatch.setattr(frame_job, "make_frame", interrupted)
+    monkeypatch.setattr(frame_job, "make_frame", counted)
     with pytest.raises(KeyboardInterrupt):
         vr.generate(sharded, tmp_path / "set")
-    assert list((tmp_path / "set/frames").iterdir()) == []
+    assert len(list((tmp_path / "set/frames").iterdir())) == (1 if lines else 0)
+    journal = tmp_path / "set/journal.jsonl"
+    written = journal.read_text().splitlines(keepends=True)
+    assert len(written) == (4 if lines else 0)
+    journal.write_text("".join(written[:lines]))
+    calls[:] = [stop]
     assert vr.generate(sharded, tmp_path / "set")
-    assert calls == [0, 1, 2, 3, 0, 1, 2, 3, 4, 5]
+    assert calls[1:] == list(made)
     for name in ("frames/shard-000000.exr", "frames/shard-000001.exr", "frames.parquet", "truth.parquet"):
         assert (tmp_path / "set" / name).read_bytes() == (shards / name).read_bytes()
+    assert verify(tmp_path / "set") == []
 
 
 def test_a_shard_of_which_the_journal_has_some_frames_is_made_anew() -> None:
@@ -191,8 +205,8 @@ def test_the_estimator_refuses_a_wrong_part(shards: Path, tmp_path: Path, part: 
     change_rows(folder, lambda rows: rows[0].update(part=part))
     with pytest.raises(est.InputError, match=f"frames/shard-000000.exr: not a readable EXR image .{message}"):
         est.read_frame(est.read_dataset(folder), 0)
-    with pytest.raises(est.InputError, match="regions|overlap"):  # read as the file of one frame
-        change_rows(folder, lambda rows: rows[0].update(part=None))
+    change_rows(folder, lambda rows: rows[0].update(part=None))  # as if it were the file of one frame
+    with pytest.raises(est.InputError, match="overlap"):
         est.read_frame(est.read_dataset(folder), 0)
 
 
@@ -204,10 +218,10 @@ def test_the_estimator_refuses_a_changed_shard(shards: Path, tmp_path: Path) -> 
     data = bytearray(path.read_bytes())
     data[-1] ^= 1
     path.write_bytes(data)
-    with pytest.raises(est.InputError, match="shard-000001.exr: damaged or changed"):
+    with pytest.raises(est.InputError, match=r"shard-000001.exr: damaged or changed"):
         est.read_frame(dataset, 5)
     path.unlink()
-    with pytest.raises(est.InputError, match="shard-000001.exr: No such file"):
+    with pytest.raises(est.InputError, match=r"shard-000001.exr: No such file"):
         est.read_frame(dataset, 5)
 
 
@@ -220,8 +234,6 @@ def test_a_set_without_the_column_part_is_read(single: Path, tmp_path: Path) -> 
 
 def test_bytes_that_are_no_shard_are_refused_in_one_line(shards: Path, tmp_path: Path) -> None:
     """With the digest of each, so that the layout alone is at fault."""
-    import hashlib
-
     folder = copy_of(shards, tmp_path / "set")
     path = folder / "frames/shard-000001.exr"
     whole = path.read_bytes()
@@ -229,10 +241,9 @@ def test_bytes_that_are_no_shard_are_refused_in_one_line(shards: Path, tmp_path:
         path.write_bytes(data)
         digest = hashlib.sha256(data).hexdigest()
         change_rows(folder, lambda rows, digest=digest: [row.update(sha256=digest) for row in rows[4:]])  # type: ignore[misc]
-        with pytest.raises(est.InputError, match="shard-000001.exr: not a readable EXR image") as refusal:
+        with pytest.raises(est.InputError, match=r"shard-000001.exr: not a readable EXR image") as refusal:
             est.read_frame(est.read_dataset(folder), 5)
         assert "\n" not in str(refusal.value)
-    assert Shard(b"", ()).parts == ()
 
 
 def test_shards_of_full_frames_are_refused() -> None:
