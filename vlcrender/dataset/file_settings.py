@@ -8,7 +8,7 @@ from vlcrender.config.toml_model import Settings
 
 
 class FileSettings(Settings):
-    """Files of the dataset."""
+    """Settings of the dataset's files."""
 
     previews: Annotated[int, Field(ge=0)] | None = None
     """Number of frames, the first ones, that have a preview; every frame where not given."""

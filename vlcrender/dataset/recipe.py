@@ -69,7 +69,7 @@ class Recipe(Settings):
     processed: Processed | None = None
     """Settings of processed pictures, as a phone makes them; none are written where not given."""
     files: FileSettings = FileSettings()
-    """Files of the dataset."""
+    """How many frames have previews, and how many share a file."""
     bound: bool = False
     """Whether each frame's Cramér-Rao bound is computed: some seconds for a full frame of many LEDs."""
     camera: Camera = Camera()
