@@ -1,4 +1,4 @@
-"""True positions of the frames and LEDs. Only the scorer imports this module, which alone opens the truth's files."""
+"""True positions of the frames and LEDs. Scores and tables alone import this module, which opens the truth's files."""
 
 from pathlib import Path
 from typing import Annotated
