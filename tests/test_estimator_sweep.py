@@ -62,7 +62,7 @@ def test_run_and_score_print_the_sweep_as_a_whole(sweep: Path, tmp_path: Path) -
     header, line, *note = finished.stdout.splitlines()
     assert header.split()[:3] == ["variant", "frames", "answered"]
     assert line.split()[:3] == ["pnp", "9", "8"]
-    assert line.endswith("1 x read: frames/000001.exr: No such file or directory")
+    assert line.endswith("1 x read: frames/N.exr: No such file or directory")
     assert note[0].startswith("Statistics with their 95 % intervals.")
     for number in range(3):
         scores = json.loads((folder / f"cells/{number:06d}/scores.json").read_text())

@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+from dataclasses import replace
 from math import inf, isnan
 from pathlib import Path
 
@@ -16,6 +17,7 @@ import estimator as est
 from estimator.evaluate.frame_columns import read_frame_columns
 from estimator.evaluate.table import Key, Table, TableRow, table
 from estimator.evaluate.table_text import table_csv, table_json, table_text
+from estimator.io.estimates import read_estimates, write_estimates
 from estimator.io.sweep import read_sweep
 
 A = [0.01, 0.02, 0.04, None]
@@ -252,6 +254,24 @@ def test_json_has_null_where_a_value_is_infinite(plain: Path) -> None:
     first = found["rows"][0]
     assert (first["variant"], first["error_3d_m_p95_of_all"]) == ("a", None)
     assert first["failures"] == {"detect: no spot": 1}
+
+
+def test_reasons_are_counted_whatever_their_numbers(plain: Path, tmp_path: Path) -> None:
+    """Three frames fail alike but for their numbers; a line shows two reasons, the CSV all."""
+    folder = copy_of(plain, tmp_path / "set")
+    reasons = ["identify: 3 of 12", "identify: 0.5 of 7", "identify: 10 of 1", "position: a"]
+    rows = read_estimates(folder / "estimates/b.parquet", 4)
+    failed = [
+        row.model_copy(update={"status": "failed", "position_m": None, "reason": reason})
+        for row, reason in zip(rows, reasons, strict=True)
+    ]
+    write_estimates(folder, "b", failed)
+    found = table(folder, variants=["b"])
+    assert found.rows[0].failures == {"identify: N of N": 3, "position: a": 1}
+    many = replace(found.rows[0], failures={"a: x": 5, "b: x": 4, "c: x": 3, "d: x": 2})
+    both = replace(found, rows=(many,))
+    assert table_text(both).endswith("5 x a: x; 4 x b: x; 5 x other")
+    assert "3 x c: x; 2 x d: x" in table_csv(both)
 
 
 def test_pandas_gets_the_records(plain: Path) -> None:

@@ -150,9 +150,10 @@ def test_an_interrupted_run_makes_the_same_shards_and_only_whole_ones_are_kept(
         vr.generate(sharded, tmp_path / "set")
     assert len(list((tmp_path / "set/frames").iterdir())) == (1 if lines else 0)
     journal = tmp_path / "set/journal.jsonl"
-    written = journal.read_text().splitlines(keepends=True)
-    assert len(written) == (4 if lines else 0)
-    journal.write_text("".join(written[:lines]))
+    if lines:
+        written = journal.read_text().splitlines(keepends=True)
+        assert len(written) == 4
+        journal.write_text("".join(written[:lines]))
     calls[:] = [stop]
     assert vr.generate(sharded, tmp_path / "set")
     assert calls[1:] == list(made)

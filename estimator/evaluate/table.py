@@ -59,7 +59,7 @@ class TableRow:
     statistics: tuple[Statistic, ...]
     """In the order of the table's."""
     failures: Mapping[str, int]
-    """Number of failed frames by reason."""
+    """Number of failed frames by reason, most frequent first; N stands for any number."""
 
 
 @dataclass(frozen=True)
@@ -193,7 +193,7 @@ def _table(
     rows = []
     for number, code in enumerate(found.T.tolist()):
         of = inside[of_row.ravel() == number]
-        reasons = Counter(frames.columns["reason"][of[failed[of]]].tolist())
+        reasons = Counter(re.sub(r"\d+(\.\d+)?", "N", text) for text in frames.columns["reason"][of[failed[of]]])
         row = TableRow(
             keys=tuple(labels[index] for index, (_, labels) in zip(code, keys, strict=False)),
             group=tuple(_text(labels[index]) for index, (_, labels) in zip(code[len(x) :], groups, strict=True)),

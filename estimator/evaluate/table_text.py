@@ -5,6 +5,7 @@ import io
 import json
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 from estimator.evaluate.score_table import length_text, share_text
@@ -16,6 +17,10 @@ TABLE_NOTE = (
     "interval, quantiles and shares that by order statistics and the binomial distribution. Frames of one pose, or of "
     "one device where there are several, count as dependent."
 )
+
+
+MAX_REASONS = 2
+"""Reasons of failed frames that a line shows."""
 
 
 def table_text(table: Table) -> str:
@@ -30,7 +35,10 @@ def table_text(table: Table) -> str:
         for name, one in zip(table.statistics, row.statistics, strict=True):
             rate = share_text(row.answered, row.frames) if name == SUCCESS_RATE else value_text(table.metric, one.value)
             cells += [rate, ends_text(table.metric if name != SUCCESS_RATE else SUCCESS_RATE, one)]
-        lines.append([*cells, failures_text(row)])
+        reasons = list(row.failures.items())
+        shown = failures_text(replace(row, failures=dict(reasons[:MAX_REASONS])))
+        rest = sum(count for _, count in reasons[MAX_REASONS:])
+        lines.append([*cells, f"{shown}; {rest} x other" if rest else shown])
     return _aligned(lines, left=range(len(table.x), len(table.x) + len(table.by)))
 
 
