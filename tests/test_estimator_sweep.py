@@ -14,13 +14,13 @@ VARIANTS = ["pnp", "self-calibrated"]
 
 @pytest.fixture(scope="module")
 def sweep(synthetic_set: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three cells of the synthetic frames, of which the second lacks an image."""
+    """Three cells of the synthetic frames, of which the first lacks an image."""
     folder = tmp_path_factory.mktemp("sweep")
     cells = []
     for number in range(3):
         copy_of(synthetic_set, folder / f"cells/{number:06d}")
         cells.append({"folder": f"cells/{number:06d}", "pose": None, "values": {"sigma": float(number)}})
-    (folder / "cells/000001/frames/000001.exr").unlink()
+    (folder / "cells/000000/frames/000001.exr").unlink()
     swept = [{"name": "sigma", "key": "camera.sigma", "kind": "values"}]
     content = {"format": "vlcrender-sweep", "version": 1, "name": "swept", "sweep": swept, "cells": cells}
     (folder / "sweep.json").write_text(json.dumps(content | {"provenance": {}}))
@@ -40,12 +40,12 @@ def test_cells_have_the_rows_of_each_by_itself(sweep: Path, tmp_path: Path, work
     assert calls == [(done, 18) for done in range(19)]
     alone = {
         name: without_times(of)
-        for name, of in est.run(copy_of(sweep / "cells/000001", tmp_path / "one"), VARIANTS).items()
+        for name, of in est.run(copy_of(sweep / "cells/000000", tmp_path / "one"), VARIANTS).items()
     }
     for name in VARIANTS:
         assert len(rows[name]) == 9
-        assert without_times(rows[name])[3:6] == alone[name]
-        assert without_times(rows[name])[:3] == without_times(rows[name])[6:]
+        assert without_times(rows[name])[:3] == alone[name]
+        assert without_times(rows[name])[3:6] == without_times(rows[name])[6:]
         assert [row.reason.split(":")[0] for row in rows[name] if row.status == "failed"] == ["read"]
         for number in range(3):
             assert (folder / f"cells/{number:06d}/estimates/{name}.parquet").is_file()
@@ -66,7 +66,7 @@ def test_run_and_score_print_the_sweep_as_a_whole(sweep: Path, tmp_path: Path) -
     assert note[0].startswith("Statistics with their 95 % intervals.")
     for number in range(3):
         scores = json.loads((folder / f"cells/{number:06d}/scores.json").read_text())
-        assert scores["variants"][0]["ok"] == (2 if number == 1 else 3)
+        assert scores["variants"][0]["ok"] == (2 if number == 0 else 3)
     found = json.loads(run("estimator", "score", str(folder), "--json").stdout)
     assert (found["format"], found["rows"][0]["answered"]) == ("estimator-table", 8)
 

@@ -136,9 +136,9 @@ def test_frames_of_a_device_are_one_sample(tmp_path: Path) -> None:
 
 
 def test_columns_of_truth_and_scores_are_keys_and_metrics(tmp_path: Path) -> None:
-    """LEDs at x = 2.8 and 3.2 m, 3 m up; the camera at 3 m sees both, that at 4 m the first alone."""
+    """LEDs at x = 2.8 and 3.2 m, 3 m up; the camera at 3.1 m sees both, that at 4 m the first alone."""
     views = [
-        View(400, 300, 1500.0, (3.0, 3.0, 0.5)),
+        View(400, 300, 1500.0, (3.1, 3.0, 0.5)),
         View(400, 300, 1500.0, (4.0, 3.0, 0.5), 30.0, 0.0),
     ]
     folder = write_set(tmp_path / "set", {"a": [0.01, 0.03]}, views=views)
@@ -146,8 +146,10 @@ def test_columns_of_truth_and_scores_are_keys_and_metrics(tmp_path: Path) -> Non
     assert columns["leds"].tolist() == [2.0, 1.0]
     assert columns["tilt_deg"].tolist() == pytest.approx([0.0, 30.0])
     assert columns["tilt_x_deg"].tolist() == pytest.approx([0.0, 30.0])
-    assert columns["distance_m"].tolist() == pytest.approx([np.hypot(0.2, 3.0), np.hypot(1.2, 3.0)])
-    assert columns["x_m"].tolist() == [3.0, 4.0]
+    assert columns["distance_m"].tolist() == pytest.approx(
+        [(np.hypot(0.3, 3.0) + np.hypot(0.1, 3.0)) / 2, np.hypot(1.2, 3.0)]
+    )
+    assert columns["x_m"].tolist() == [3.1, 4.0]
     assert values(table(folder, x=["leds"])) == {(1.0, "a"): [pytest.approx(0.03)], (2.0, "a"): [pytest.approx(0.01)]}
     assert values(table(folder, metric="capturable", statistics=["mean"])) == {("a",): [0.5]}
     assert values(table(folder, metric="vertical_error_m")) == {("a",): [0.0]}
