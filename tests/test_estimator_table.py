@@ -61,15 +61,24 @@ def test_statistics_of_a_plain_set_by_variant(plain: Path) -> None:
     assert (row.frames, row.answered, row.failures) == (4, 3, {"detect: no spot": 1})
 
 
+def test_the_interval_of_an_rmse_is_that_of_the_mean_square(plain: Path) -> None:
+    """10, 20 and 40 mm have the mean square 7 cm2; Student's quantile with 2 degrees of freedom is 4.3027."""
+    squares = np.array([1.0, 4.0, 16.0])
+    half = 4.30265 * squares.std(ddof=1) / np.sqrt(3)
+    one = rows(table(plain, statistics=["rmse"]))["a",].statistics[0]
+    assert (one.value, one.low) == (pytest.approx(0.07**0.5 / 10), 0.0)
+    assert one.high == pytest.approx(0.01 * (7 + half) ** 0.5, rel=1e-5)
+
+
 def test_the_scores_agree_with_the_table(plain: Path, tmp_path: Path) -> None:
     """`of_all` means what it means in scores.json, and so does an interpolated percentile."""
     scores = est.score(copy_of(plain, tmp_path))
-    found = values(table(plain, statistics=["mean", "median", "p95", "of_all"]))
+    found = values(table(plain, statistics=["mean", "median", "p95", "of_all", "rmse"]))
     for one in scores.variants:
         assert one.of_all is not None
         assert one.error_3d is not None
         of_all = [inf if size is None else size for size in (one.of_all.median_m, one.of_all.p95_m)]
-        expected = [one.error_3d.mean_m, one.error_3d.median_m, one.error_3d.p95_m, *of_all]
+        expected = [one.error_3d.mean_m, one.error_3d.median_m, one.error_3d.p95_m, *of_all, one.error_3d.rmse_m]
         assert found[one.variant,] == pytest.approx(expected)
 
 
@@ -204,7 +213,7 @@ def test_several_sets_are_told_apart(plain: Path, swept: Path, tmp_path: Path) -
         (["--metric", "error"], "metric error: no such column; there are: "),
         (["--metric", "camera"], "metric camera: holds texts, needed numbers"),
         (["--by", "variant,lens"], "column lens: no such column"),
-        (["--stat", "average"], "statistic average: unknown; allowed: mean, median, pN such as p75"),
+        (["--stat", "average"], "statistic average: unknown; allowed: mean, rmse, median, pN such as p75"),
         (["--stat", "p0"], "statistic p0: unknown"),
         (["--stat", "p100"], "statistic p100: unknown"),
         (["--by", ""], "keys: needed one key, or one column for groups"),

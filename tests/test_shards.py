@@ -15,6 +15,8 @@ from conftest import ROOT, SMALL, copy_of
 import estimator as est
 import vlcrender as vr
 from estimator.io import dataset as reader
+from estimator.io.shard import frame_of_shard
+from vlcrender.camera.roi import RegionImage, Roi
 from vlcrender.dataset import frame_job
 from vlcrender.dataset.generate import _bursts
 from vlcrender.dataset.schema import FrameRecord
@@ -123,6 +125,31 @@ def test_a_frame_is_read_without_decoding_the_others(shards: Path, monkeypatch: 
     monkeypatch.setattr(reader.OpenEXR, "File", counted)
     frame = est.read_frame(est.read_dataset(shards), 1)
     assert decoded == [len(frame.parts)] * 2  # headers, then pixels
+
+
+def test_regions_of_any_height_are_parts(tmp_path: Path, rng: np.random.Generator) -> None:
+    """Chunks have 32 lines: regions of 1 to 65 lines have one to three. A frame with one region is one part."""
+    heights = [[1], [32, 33], [64], [65, 31]]
+    (tmp_path / "frames").mkdir()
+    shard, sensor = Shard(tmp_path, 7), Roi(0, 0, 300, 400)
+    images = [
+        [
+            RegionImage(Roi(100 * k, 5, rows, 20), rng.poisson(1000, (rows, 20)).astype(np.uint32))
+            for k, rows in enumerate(of)
+        ]
+        for of in heights
+    ]
+    firsts = [shard.add(20 + frame, regions, sensor, {"expTime": 1e-3}) for frame, regions in enumerate(images)]
+    assert firsts == [0, 1, 3, 4]
+    digest = shard.write()
+    found = content(tmp_path / "frames/shard-000007.exr")
+    for (_, image_dn), region in zip(found, [region for regions in images for region in regions], strict=True):
+        assert np.array_equal(image_dn, region.image)
+    for frame, first in enumerate(firsts):
+        one = tmp_path / "one.exr"
+        one.write_bytes(frame_of_shard(tmp_path / shard.file, digest, 20 + frame, first))
+        for (_, image_dn), region in zip(content(one), images[frame], strict=True):
+            assert np.array_equal(image_dn, region.image)
 
 
 @pytest.mark.parametrize(

@@ -62,7 +62,10 @@ def run(
         estimates_path(folder, name)
     cells = dataset_folders(folder)
     # A cell that cannot be read is refused before the first frame is estimated. Not all are in memory at a time.
-    frames = sum(len(read_dataset(cell).frames) for cell in cells)
+    frames = 0
+    for cell in cells:
+        dataset = read_dataset(cell)
+        frames += len(dataset.frames)
     done, total = 0, frames * steps(chosen.values())
 
     def on_frame() -> None:
@@ -73,7 +76,7 @@ def run(
 
     if progress is not None:
         progress(0, total)
-    datasets = map(read_dataset, cells)
+    datasets = [dataset] if len(cells) == 1 else map(read_dataset, cells)
     of_cells: Iterator[dict[str, tuple[EstimateRow, ...]]]
     if workers == 1:
         of_cells = (estimate_dataset(dataset, list(chosen.values()), on_frame) for dataset in datasets)

@@ -24,7 +24,7 @@ Floats = NDArray[np.float64]
 MAX_DISTINCT = 24
 """A key with more distinct numbers is binned."""
 BINS = 10
-STATISTICS = "mean, median, pN such as p75, success_rate, median_of_all, pN_of_all, of_all (median and p95)"
+STATISTICS = "mean, rmse, median, pN such as p75, success_rate, median_of_all, pN_of_all, of_all (median and p95)"
 
 
 @dataclass(frozen=True)
@@ -104,6 +104,8 @@ def failures_text(row: TableRow) -> str:
 
 
 SUCCESS_RATE = "success_rate"
+MOMENTS = {"mean": 1, "rmse": 2}
+"""Statistics that are roots of the mean of a power: the power."""
 Bins = int | Sequence[float]
 """Number of bins of equal width, or their edges, rising."""
 
@@ -132,8 +134,9 @@ def table(
     by
         Columns whose values make groups; `set` is added where there are several directories.
     statistics
-        Any of `mean`, `median`, `pN` (percentile, `p75`), `success_rate`, and `median_of_all` and `pN_of_all`, in which
-        failed frames count as infinite (`of_all`: median and p95). The others are over frames that have the metric.
+        Any of `mean`, `rmse`, `median`, `pN` (percentile, `p75`), `success_rate`, and `median_of_all` and `pN_of_all`,
+        in which failed frames count as infinite (`of_all`: median and p95). The others are over frames that have the
+        metric.
     metric
         A column of numbers; of signed errors the size counts.
     bins
@@ -159,7 +162,7 @@ def table(
         groups.insert(0, "set")
     names = [name for one in statistics for name in (("median_of_all", "p95_of_all") if one == "of_all" else (one,))]
     for name in names:
-        if name not in ("mean", SUCCESS_RATE):
+        if name not in (*MOMENTS, SUCCESS_RATE):
             _share(name)
     if len(set(x) | set(groups)) < len(x) + len(groups):
         raise InputError(f"keys {', '.join([*x, *groups])}: one is given twice")
@@ -267,15 +270,17 @@ def _statistic(name: str, sizes: Floats, answered: NDArray[np.bool_], samples: S
     if name == SUCCESS_RATE:
         return _with_ends(float(answered.mean()), share_interval(answered, samples))
     there = ~np.isnan(sizes)
-    if name != "mean" and _share(name)[1]:
+    if name not in MOMENTS and _share(name)[1]:
         share, filled = _share(name)[0], np.where(there, sizes, np.inf)
         value = float(np.sort(filled)[max(0, math.ceil(share * len(filled) - 1e-9) - 1)])
         return _with_ends(value, quantile_interval(filled, share, samples))
     if not there.any():
         return Statistic(math.nan, math.nan, math.nan)
     present, of_present = sizes[there], [one[there] for one in samples]
-    if name == "mean":
-        return _with_ends(float(present.mean()), mean_interval(present, of_present))
+    if power := MOMENTS.get(name):
+        limits = mean_interval(present**power, of_present)
+        ends = None if limits is None else tuple(max(end, 0.0) ** (1 / power) for end in limits)
+        return _with_ends(float(np.mean(present**power)) ** (1 / power), ends)
     share = _share(name)[0]
     return _with_ends(float(np.percentile(present, 100 * share)), quantile_interval(present, share, of_present))
 

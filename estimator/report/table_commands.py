@@ -41,8 +41,8 @@ def table(
     by
         Columns whose values make groups, such as variant,camera.
     stat
-        Statistics: mean, median, pN, success_rate, median_of_all, pN_of_all, of_all (median and p95 of all frames, a
-        failed one being infinite).
+        Statistics: mean, rmse, median, pN, success_rate, median_of_all, pN_of_all, of_all (median and p95 of all
+        frames, a failed one being infinite).
     metric
         Column of numbers: error_3d_m, horizontal_error_m, vertical_error_m (its size), nees, bound_m, time_s, ...
     bins
