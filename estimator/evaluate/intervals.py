@@ -49,7 +49,7 @@ def quantile_interval(values: Floats, share: float, samples: Sequence[Integers])
     Of independent frames the number of values below the quantile is binomial (H. A. David and H. N. Nagaraja, Order
     Statistics, 2003, 7.1). Else the share of values up to the quantile has Student's interval, and its ends are ranks
     (R. S. Woodruff, Confidence Intervals for Medians and Other Position Measures, 1952). An end is infinite where no
-    value is sure to lie beyond the quantile, such as above the 95th percentile of fewer than 73 frames. None for fewer
+    value is sure to lie beyond the quantile, such as above the 95th percentile of fewer than 72 frames. None for fewer
     than two samples.
     """
     from scipy.stats import binom
