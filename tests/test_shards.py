@@ -139,7 +139,10 @@ def test_regions_of_any_height_are_parts(tmp_path: Path, rng: np.random.Generato
         ]
         for of in heights
     ]
-    firsts = [shard.add(20 + frame, regions, sensor, {"expTime": 1e-3}) for frame, regions in enumerate(images)]
+    firsts = []
+    for frame, regions in enumerate(images):
+        firsts.append(shard.part_count)
+        shard.add(20 + frame, regions, sensor, {"expTime": 1e-3})
     assert firsts == [0, 1, 3, 4]
     digest = shard.write()
     found = content(tmp_path / "frames/shard-000007.exr")
@@ -165,12 +168,12 @@ def test_an_interrupted_run_makes_the_same_shards_and_only_whole_ones_are_kept(
     make_frame = frame_job.make_frame
     calls: list[int] = []
 
-    def counted(job: frame_job.Job, frame: int, shard: Shard | None = None) -> FrameRecord:
+    def counted(job: frame_job.Job, frame: int, *, shard: Shard) -> FrameRecord:
         if frame == stop and stop not in calls:
             calls.append(frame)
             raise KeyboardInterrupt
         calls.append(frame)
-        return make_frame(job, frame, shard)
+        return make_frame(job, frame, shard=shard)
 
     monkeypatch.setattr(frame_job, "make_frame", counted)
     with pytest.raises(KeyboardInterrupt):

@@ -85,7 +85,7 @@ def made_frames(job: Job, frames: Sequence[int]) -> Iterator[FrameRecord]:
         yield from (make_frame(job, frame) for frame in frames)
         return
     shard = Shard(Path(job.directory), frames[0] // per_file)
-    records = [make_frame(job, frame, shard) for frame in frames]
+    records = [make_frame(job, frame, shard=shard) for frame in frames]
     digest = shard.write()
     yield from (record.with_digest(digest) for record in records)
 
@@ -122,7 +122,8 @@ def make_frame(job: Job, frame: int, shard: Shard | None = None) -> FrameRecord:
         digest = write_exr(directory / file, dn, sensor, attributes)
     else:
         file, digest = shard.file, ""
-        part = shard.add(frame, dn, sensor, attributes)
+        part = shard.part_count
+        shard.add(frame, dn, sensor, attributes)
     if recipe.expected:
         write_exr(directory / EXPECTED / f"{frame:06d}.exr", exposed.expected, sensor, attributes)
     if recipe.files.has_preview(frame):

@@ -41,12 +41,15 @@ class Shard:
         """Path below the dataset, with `/`."""
         return f"{FRAMES}/shard-{self.number:06d}.exr"
 
-    def add(self, frame: int, images: Sequence[RegionImage], sensor: Roi, attributes: Mapping[str, Any]) -> int:
-        """Add the regions of a frame as the parts `frame N region 0`, ...; returns the number of its first part."""
+    @property
+    def part_count(self) -> int:
+        """Number of parts so far, which is the number of the next frame's first part."""
+        return len(self._parts)
+
+    def add(self, frame: int, images: Sequence[RegionImage], sensor: Roi, attributes: Mapping[str, Any]) -> None:
+        """Add the regions of a frame as the parts `frame N region 0`, ..."""
         names = [_name(frame, number) for number in range(len(images))]
-        first = len(self._parts)
         self._parts += _parts_of(exr_bytes(images, sensor, attributes, names))
-        return first
 
     def write(self) -> str:
         """Write the file, durably, and return its SHA-256. Raises InputError where it cannot be written."""
