@@ -116,16 +116,35 @@ def test_texts_stand_side_by_side() -> None:
     assert [place[0] for place in places.values()] == pytest.approx([across(0.25), across(0.75)], abs=0.06)
 
 
+def slots(names: list[str]) -> list[int]:
+    return slots_of([(name, "") for name in names], NAMES)
+
+
 def test_marks_are_fixed_by_the_name() -> None:
     """Whatever else is drawn, a variant of the catalogue has its mark, and another name has one by its hash."""
-    alone = {name: slots_of([name], NAMES)[0] for name in [*NAMES, "mine", "huynh2016:denoise=none"]}
+    alone = {name: slots([name])[0] for name in [*NAMES, "mine", "huynh2016:denoise=none"]}
     assert [alone[name] for name in NAMES] == list(range(len(NAMES)))
-    together = dict(zip(alone, slots_of(list(alone), NAMES), strict=True))
+    together = dict(zip(alone, slots(list(alone)), strict=True))
     assert {name: together[name] for name in NAMES} == {name: alone[name] for name in NAMES}
     assert len(set(together.values())) == len(together)
     many = [f"variant {number}" for number in range(len(COLOURS) * len(MARKS) + 3)]
-    assert max(slots_of(many, NAMES)) < len(COLOURS) * len(MARKS)
-    assert slots_of(many, NAMES) == slots_of(many[::-1], NAMES)[::-1]
+    assert max(slots(many)) < len(COLOURS) * len(MARKS)
+    assert slots(many) == slots(many[::-1])[::-1]
+
+
+def test_cameras_of_a_variant_have_its_colour_and_marks_of_their_own() -> None:
+    groups = [(name, camera) for name in NAMES[:3] for camera in ("left", "main", "right")]
+    found = slots_of(groups, NAMES)
+    assert [slot % len(COLOURS) for slot in found] == [0, 0, 0, 1, 1, 1, 2, 2, 2]
+    assert len(set(found)) == len(found)
+    rows = [
+        TableRow((Key(x),), (camera, name), 1, 1, (Statistic(x + 1, nan, nan),), {})
+        for name, camera in groups
+        for x in (0.0, 1.0)
+    ]
+    svg = plot(Table("error_3d_m", ("sigma",), ("camera", "variant"), ("mean",), tuple(rows)), [])
+    for slot in found:
+        assert f'class="curve v{slot}"' in svg
 
 
 def test_the_same_table_gives_the_same_bytes(tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
 """Plots of tables of settings, as SVG: lines with their intervals for one key, heat maps for two."""
 
 import math
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from html import escape
 
 from estimator.errors import InputError
@@ -67,12 +67,19 @@ def plot(table: Table, log: Collection[str] | None = None, lines: Sequence[Line]
     return _heat_maps(table, log)
 
 
-def _groups(table: Table) -> dict[str, list[TableRow]]:
-    """Rows of each group, by its label."""
-    groups: dict[str, list[TableRow]] = {}
+def _groups(table: Table) -> dict[tuple[str, ...], list[TableRow]]:
+    """Rows of each group."""
+    groups: dict[tuple[str, ...], list[TableRow]] = {}
     for row in table.rows:
-        groups.setdefault(", ".join(row.group), []).append(row)
+        groups.setdefault(row.group, []).append(row)
     return groups
+
+
+def _slots(table: Table, groups: Iterable[tuple[str, ...]]) -> list[int]:
+    """Mark and colour of each group, fixed by its variant where it has one."""
+    at = table.by.index("variant") if "variant" in table.by else None
+    pairs = [(", ".join(g), "") if at is None else (g[at], ", ".join(g[:at] + g[at + 1 :])) for g in groups]
+    return slots_of(pairs, list(VARIANTS))
 
 
 def _asked(log: Collection[str] | None, name: str) -> bool | None:
@@ -109,7 +116,7 @@ def _name(table: Table) -> str:
 
 def _line_plot(table: Table, log: Collection[str] | None, lines: Sequence[Line]) -> str:
     groups = _groups(table)
-    slots = slots_of(list(groups), list(VARIANTS))
+    slots = _slots(table, groups)
     across = _axis_of_keys([row.keys[0] for row in table.rows], log)
     shown = [row.statistics[0] for row in table.rows]
     ends = [end for one in shown for end in (one.low, one.high)]
@@ -150,9 +157,9 @@ def _line_plot(table: Table, log: Collection[str] | None, lines: Sequence[Line])
                 parts.append(cross(x(row.keys[0]), TOP, slot, _title(table, row)))
             elif not math.isnan(value):
                 parts.append(mark(x(row.keys[0]), y(value), 3.5, slot, _title(table, row)))
-    for place, (slot, label_text) in enumerate(zip(slots, groups, strict=True)):
+    for place, (slot, group) in enumerate(zip(slots, groups, strict=True)):
         parts.append(mark(LEFT + WIDTH + 24, TOP + LINE * (place + 0.5), 4, slot))
-        parts.append(text(LEFT + WIDTH + 36, TOP + LINE * (place + 0.5) + 4, label_text, "start"))
+        parts.append(text(LEFT + WIDTH + 36, TOP + LINE * (place + 0.5) + 4, ", ".join(group), "start"))
     whole = picture(LEFT + WIDTH + LEGEND, TOP + height + BOTTOM, f"{_name(table)} by {table.x[0]}", parts)
     return svg_file(whole, f"{style_of_variants(max(slots) + 1)}\n{BAND}")
 
@@ -190,9 +197,9 @@ def _heat_maps(table: Table, log: Collection[str] | None) -> str:
     scale = Axis.of([row.statistics[0].value for row in table.rows], _asked(log, "value"), pad=0.0)
     width, height = PANEL / len(across), PANEL / len(down)
     parts = [text(LEFT, 18, _name(table), "start")]
-    for number, (label, rows) in enumerate(groups.items()):
+    for number, (group, rows) in enumerate(groups.items()):
         left, top = LEFT + number * (PANEL + LEFT), TOP + 20
-        parts.append(text(left + PANEL / 2, top - 8, label, "middle"))
+        parts.append(text(left + PANEL / 2, top - 8, ", ".join(group), "middle"))
         for row in rows:
             x = left + width * across.index(row.keys[0])
             y = top + PANEL - height * (down.index(row.keys[1]) + 1)

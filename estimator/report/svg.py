@@ -24,20 +24,23 @@ svg .mark { stroke: none !important; }"""
 """Style of a file; the report's page has its own."""
 
 
-def slots_of(names: Sequence[str], known: Sequence[str]) -> list[int]:
-    """Index of the mark and colour of each name, fixed by the name: the place in `known`, or one by its hash.
+def slots_of(groups: Sequence[tuple[str, str]], known: Sequence[str]) -> list[int]:
+    """Index of the mark and colour of each group, given by a name, which fixes them, and what else tells it apart.
 
-    A name whose place another one of `names` has takes the next that is free.
+    That of a name is its place in `known`, or one by its hash. Groups of one name have its colour, and the marks from
+    its own on. A group whose place another one has takes the next that is free.
     """
     places = len(COLOURS) * len(MARKS)
-    taken: dict[str, int] = {}
-    for name in sorted(names, key=lambda name: (name not in known, name)):
+    others = sorted({other for _, other in groups})
+    taken: dict[tuple[str, str], int] = {}
+    for name, other in sorted(groups, key=lambda group: (group[0] not in known, group)):
         digest = hashlib.sha256(name.encode()).digest()
         slot = known.index(name) if name in known else int.from_bytes(digest[:4], "big")
+        slot += len(COLOURS) * others.index(other)
         if len(taken) < places:
-            slot = next(one % places for one in range(slot, slot + places) if one % places not in taken.values())
-        taken[name] = slot % places
-    return [taken[name] for name in names]
+            slot = next(one for one in range(slot, slot + places) if one % places not in taken.values())
+        taken[name, other] = slot % places
+    return [taken[group] for group in groups]
 
 
 def style_of_variants(count: int) -> str:
