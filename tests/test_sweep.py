@@ -374,6 +374,7 @@ SHARED_BY = {
     "sensor.gain_e_per_dn=2.0": ("views", ()),
     "added_noise={ level_db = -9, relative_to = 'peak' }": ("views", ()),
     "expected=true": ("views", ()),
+    "files.previews=0": ("views", ()),
     "sensor.crosstalk=0.1": ("nothing", ()),
     "camera.f_number=4.0": ("nothing", ()),
     "seed=1": ("nothing", ()),

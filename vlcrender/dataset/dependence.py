@@ -15,7 +15,7 @@ NOT_IN_FILES: dict[str, Any] = {
 """Keys of a recipe without effect on the files of a frame: they act on tables alone."""
 NOT_IN_VIEWS: dict[str, Any] = {
     **NOT_IN_FILES,
-    **dict.fromkeys(("exposure_s", "exposure", "added_noise", "expected", "processed", "sensor"), True),
+    **dict.fromkeys(("exposure_s", "exposure", "added_noise", "expected", "processed", "files", "sensor"), True),
 }
 """Keys of a recipe without effect on expected images a second. Of the sensor, its spectral response has one; the
 exposure time has one where the camera moves."""

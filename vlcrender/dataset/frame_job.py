@@ -1,8 +1,9 @@
 """One frame of a dataset: render, expose, write its files, and return its rows."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import groupby
 from pathlib import Path
 from typing import Self
 
@@ -20,6 +21,7 @@ from vlcrender.dataset.pose_sampling import pose_of_frame
 from vlcrender.dataset.preview import write_preview
 from vlcrender.dataset.recipe import Recipe
 from vlcrender.dataset.schema import FrameRecord, FrameRow, LedTruth, SpotRow, TruthRow, five, flat9, triple
+from vlcrender.dataset.shard import Shard
 from vlcrender.dataset.true_world import (
     built_leds,
     device_of_pose,
@@ -77,9 +79,11 @@ _loaded: dict[tuple[str, str], Scene] = {}
 
 @dataclass(frozen=True)
 class Files:
-    """The files of a frame: their dataset, and the digest of the frame."""
+    """The files of a frame: their dataset, and what its row says of the file with its pixels."""
 
     directory: Path
+    file: str
+    part: int | None
     sha256: str
 
 
@@ -91,21 +95,44 @@ def make_frames(frames: Sequence[tuple[Job, int]]) -> list[FrameRecord]:
 def made_frames(frames: Iterable[tuple[Job, int]]) -> Iterator[FrameRecord]:
     """`make_frame` of frames of one dataset, or of several cells of a sweep, one after another.
 
-    A frame with the same files as one before it, in another cell, is not exposed again: its files are that one's.
+    A frame with the same files as one before it, in another cell, is not exposed again: its files are that one's. Where
+    a file holds several frames, all of them are among `frames`.
     """
     made: dict[tuple[str, str, str, int], Files] = {}
-    for job, frame in frames:
-        key = job.scene_json, job.scene_folder, keyed_recipe(job.recipe_json).files_key, frame
-        record = make_frame(job, frame, made.get(key))
-        made.setdefault(key, Files(Path(job.directory), record.device.sha256))
-        yield record
+    for (job, _), of_file in groupby(frames, key=_file_of):
+        files_key = keyed_recipe(job.recipe_json).files_key
+        twins = {n: made.get((job.scene_json, job.scene_folder, files_key, n)) for _, n in of_file}
+        for record in _made_file(job, twins):
+            row = record.device
+            files = Files(Path(job.directory), row.file, row.part, row.sha256)
+            made.setdefault((job.scene_json, job.scene_folder, files_key, record.frame), files)
+            yield record
 
 
-def make_frame(job: Job, frame: int, twin: Files | None = None) -> FrameRecord:
+def _file_of(job_and_frame: tuple[Job, int]) -> tuple[Job, int]:
+    """The dataset of a frame, and the number of its file."""
+    job, frame = job_and_frame
+    return job, frame // keyed_recipe(job.recipe_json).recipe.files.frames_per_file
+
+
+def _made_file(job: Job, twins: Mapping[int, Files | None]) -> Iterator[FrameRecord]:
+    """The frames of one file, by number, each with its twin if it has one: then all of a shard have."""
+    per_file = keyed_recipe(job.recipe_json).recipe.files.frames_per_file
+    if per_file == 1 or all(twins.values()):
+        yield from (make_frame(job, frame, twin) for frame, twin in twins.items())
+        return
+    shard = Shard(Path(job.directory), min(twins) // per_file)
+    records = [make_frame(job, frame, shard=shard) for frame in twins]
+    digest = shard.write()
+    yield from (record.with_digest(digest) for record in records)
+
+
+def make_frame(job: Job, frame: int, twin: Files | None = None, shard: Shard | None = None) -> FrameRecord:
     """Render, expose and write one frame, and return its rows; depends on nothing but its arguments.
 
     A view that the frame before had too, such as that of a burst or of another cell of a sweep, is not rendered again.
-    twin: a frame with the same files, to which this one's are linked.
+    twin: a frame with the same files, to which this one's are linked. shard: to which the frame is added, in place of a
+    file of its own; the record then has no digest yet.
     """
     keyed = keyed_recipe(job.recipe_json)
     recipe, directory = keyed.recipe, Path(job.directory)
@@ -127,7 +154,7 @@ def make_frame(job: Job, frame: int, twin: Files | None = None) -> FrameRecord:
     start_s = recipe.start_s(shot, bool(waves))
     exposure = view.exposure(recipe, keyed.files_key)
     exposed = exposure.frame(waves, start_s)
-    file = f"{FRAMES}/{frame:06d}.exr"
+    file, part, digest = f"{FRAMES}/{frame:06d}.exr", None, ""
     if twin is None:
         of_device = device_sensor(recipe, device)
         dn = expose_regions(
@@ -140,18 +167,25 @@ def make_frame(job: Job, frame: int, twin: Files | None = None) -> FrameRecord:
         )
         # Of the told camera: readers see them.
         attributes = exr_attributes(camera, told.name, exposure.exposure_s, frame)
-        digest = write_exr(directory / file, dn, sensor, attributes)
+        if shard is None:
+            digest = write_exr(directory / file, dn, sensor, attributes)
+        else:
+            file, part = shard.file, shard.part_count
+            shard.add(frame, dn, sensor, attributes)
         if recipe.expected:
             write_exr(directory / EXPECTED / f"{frame:06d}.exr", exposed.expected, sensor, attributes)
-        preview = directory / PREVIEWS / f"{frame:06d}.png"
-        write_preview(preview, dn, sensor, recipe.sensor.largest_dn, recipe.sensor.black_level_dn)
+        if recipe.files.has_preview(frame):
+            preview = directory / PREVIEWS / f"{frame:06d}.png"
+            write_preview(preview, dn, sensor, recipe.sensor.largest_dn, recipe.sensor.black_level_dn)
         if recipe.processed is not None:
             balance = _white_balance(camera, recipe.sensor, view.renderer.scene)
             picture = recipe.processed.develop(dn[0][1], recipe.sensor, balance)
             recipe.processed.write(directory / PROCESSED / f"{frame:06d}{recipe.processed.suffix}", picture)
     else:
-        digest = twin.sha256
-        for folder in (FRAMES, EXPECTED, PREVIEWS, PROCESSED):
+        file, part, digest = twin.file, twin.part, twin.sha256
+        if not part:  # once a shard
+            link_or_copy(twin.directory / file, directory / file)
+        for folder in (EXPECTED, PREVIEWS, PROCESSED):
             for path in (twin.directory / folder).glob(f"{frame:06d}.*"):
                 link_or_copy(path, directory / folder / path.name)
     # The rig has one accelerometer: its error belongs to the shot. The device turns its reading by the told mounting.
@@ -170,6 +204,7 @@ def make_frame(job: Job, frame: int, twin: Files | None = None) -> FrameRecord:
         pose=pose_number - recipe.pose_numbers.start,
         device=device,
         file=file,
+        part=part,
         sha256=digest,
         camera=told.name,
         exposure_s=exposure.exposure_s,

@@ -149,19 +149,22 @@ def _check_possible(plan: Plan) -> None:
 def _tasks(datasets: Iterable[Unfinished]) -> tuple[Iterator[Task], int]:
     """The frames that are not made, in the order in which most is shared, and the number of tasks or more.
 
-    A task is a burst, or a single shot, in all datasets whose views are the same. Its datasets are open. Tasks of one
-    scene follow one another, then those of one view in the order of poses.
+    A task is a burst, a single shot, or the frames of a file that holds several, in all datasets whose views are the
+    same. Its datasets are open. Tasks of one scene follow one another, then those of one view in the order of poses.
     """
-    scenes: dict[tuple[str, str], dict[Seen, list[Unfinished]]] = {}
+    scenes: dict[tuple[str, str], dict[tuple[Seen, int], list[Unfinished]]] = {}
     for dataset in datasets:
+        recipe = keyed_recipe(dataset.job.recipe_json).recipe
+        together = len(recipe.cameras) * recipe.burst_frames
+        if recipe.files.frames_per_file > 1:
+            together = recipe.files.frames_per_file
         *scene, seen = _view_of(dataset.job)
-        scenes.setdefault((scene[0], scene[1]), {}).setdefault(seen, []).append(dataset)
+        scenes.setdefault((scene[0], scene[1]), {}).setdefault((seen, together), []).append(dataset)
     shots = [
-        (group, range(start, start + frames))
+        (group, range(start, start + together))
         for of_scene in scenes.values()
-        for seen, group in of_scene.items()
-        for frames in [len(seen.recipe.cameras) * seen.recipe.burst_frames]
-        for start in range(0, group[0].frame_count, frames)
+        for (_, together), group in of_scene.items()
+        for start in range(0, group[0].frame_count, together)
     ]
 
     def tasks() -> Iterator[Task]:

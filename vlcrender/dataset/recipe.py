@@ -14,6 +14,7 @@ from vlcrender.config.toml_model import Settings, check
 from vlcrender.dataset.added_noise import AddedNoise
 from vlcrender.dataset.auto_exposure import Metering, NoiseLevelMetering
 from vlcrender.dataset.belief import Belief
+from vlcrender.dataset.file_settings import FileSettings
 from vlcrender.dataset.motion import Motion
 from vlcrender.dataset.pose_sampling import Aim, Poses
 from vlcrender.dataset.sweep import SweepTable
@@ -65,6 +66,8 @@ class Recipe(Settings):
     """Whether the noise-free images are written too."""
     processed: Processed | None = None
     """Settings of processed pictures, as a phone makes them; none are written where not given."""
+    files: FileSettings = FileSettings()
+    """How many frames have previews, and how many share a file."""
     bound: bool = False
     """Whether each frame's Cramér-Rao bound is computed: some seconds for a full frame of many LEDs."""
     camera: Camera = Camera()
@@ -132,6 +135,15 @@ class Recipe(Settings):
     def _processed_is_of_full_frames(self) -> Self:
         if self.processed is not None and self.regions is not None:
             raise ValueError("processed: [processed] needs full frames: remove [regions] or [processed]")
+        return self
+
+    @model_validator(mode="after")
+    def _shards_are_of_regions(self) -> Self:
+        if self.files.frames_per_file > 1 and self.regions is None:
+            raise ValueError(
+                f"files.frames_per_file = {self.files.frames_per_file}: files of several frames hold regions; add "
+                "[regions] or remove frames_per_file"
+            )
         return self
 
     @model_validator(mode="after")

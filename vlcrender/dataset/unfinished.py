@@ -34,6 +34,7 @@ from vlcrender.dataset.schema import (
     luminaire_entries,
     map_datum_entry,
 )
+from vlcrender.dataset.shard import incomplete
 from vlcrender.dataset.sweep import sweep_columns
 from vlcrender.dataset.tables import write_table
 from vlcrender.dataset.true_world import device_rows, map_rows
@@ -143,7 +144,7 @@ class Unfinished:
         plan = self.plan()
         recipe, wanted = plan.recipe, {"provenance": provenance_of(plan)}
         prepare_folder(self._directory, wanted, "an unfinished dataset of another recipe, scene or version")
-        for name in [FRAMES, *extra_folders(recipe.expected, recipe.processed is not None)]:
+        for name in [FRAMES, *extra_folders(recipe.expected, recipe.processed is not None, recipe.files)]:
             (self._directory / name).mkdir(exist_ok=True)
         for leftover in self._directory.rglob("*.partial"):
             leftover.unlink()
@@ -177,6 +178,7 @@ def _journal(directory: Path, recipe: Recipe) -> dict[int, int]:
     if not path.exists():
         return {}
     done: dict[int, bytes] = {}
+    digest = cache(sha256_of)
     lines = path.read_text(encoding="utf-8").splitlines()
     for line in lines:
         try:
@@ -184,10 +186,12 @@ def _journal(directory: Path, recipe: Recipe) -> dict[int, int]:
         except ValidationError:
             continue  # a line that a crash truncated: its frame is made again
         file = directory / record.device.file
-        if file.is_file() and sha256_of(file) == record.device.sha256:
+        if file.is_file() and digest(file) == record.device.sha256:
             done[record.frame] = _line(record)
-    folders = extra_folders(recipe.expected, recipe.processed is not None)
-    for frame in missing_files(directory, folders, list(done)):
+    folders = extra_folders(recipe.expected, recipe.processed is not None, recipe.files)
+    for frame in missing_files(directory, folders, list(done), recipe.files):
+        del done[frame]
+    for frame in incomplete(done, recipe.files.frames_per_file, recipe.frame_count):
         del done[frame]
     if len(done) < len(lines):
         log.warning("%s: %d frames are damaged or incomplete and are made again", path, len(lines) - len(done))
