@@ -41,7 +41,9 @@ bench: $(READY)
 	$(BIN)/python benchmarks/errors.py
 	$(BIN)/python benchmarks/memory.py
 	$(BIN)/python benchmarks/growth.py
+	$(BIN)/python benchmarks/sweep.py
 	$(BIN)/python benchmarks/denoise.py
+	$(BIN)/python benchmarks/shards.py
 	$(BIN)/vlcrender generate datasets/office20.toml --out out/bench/full --set poses.count=8 --set bound=false
 	$(BIN)/vlcrender generate datasets/office200.toml --out out/bench/regions --set poses.count=60 --set bound=false
 	$(BIN)/vlcrender generate datasets/table1.toml --out out/bench/four --set poses.columns=8 --set poses.rows=8

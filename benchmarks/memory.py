@@ -11,7 +11,7 @@ from pathlib import Path
 from target import Targets
 
 from vlcrender.dataset.frame_job import EXPECTED, FRAMES, PREVIEWS, Job, make_frame
-from vlcrender.dataset.recipe import load_plan
+from vlcrender.dataset.plan import load_plan
 
 
 def peak_gib() -> float:

@@ -19,7 +19,7 @@ from target import Targets, alternating_s, ratio
 
 from vlcrender.dataset.files import EXPECTED, FRAMES, PREVIEWS
 from vlcrender.dataset.frame_job import Job, make_frame
-from vlcrender.dataset.recipe import load_plan
+from vlcrender.dataset.plan import load_plan
 
 ROOT = Path(__file__).parent.parent
 QUICKSTART, REGIONS = ROOT / "datasets/quickstart.toml", ROOT / "datasets/office200.toml"

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from vlcrender.config.presets import KINDS, presets
-from vlcrender.dataset.recipe import Recipe
+from vlcrender.dataset.recipe import RecipeFile
 from vlcrender.scene.schema import SceneSettings
 
 DOCS = Path(__file__).parent
@@ -71,7 +71,7 @@ def scene_schema() -> Schema:
 
 def recipe_schema() -> Schema:
     """JSON Schema of a recipe file, with the key `preset` that stands for several others."""
-    tree = Recipe.model_json_schema()
+    tree = RecipeFile.model_json_schema()
     tables, properties = tree["$defs"], tree["properties"]
     of_camera = _preset("camera")
     of_camera["description"] += " It is whole: the sensor's preset is in it. Under [camera] alone, not in a rig."
@@ -187,7 +187,7 @@ def _types(root: Schema, node: Schema) -> list[str]:
     kind = node.get("type")
     if kind == "array":
         items = node.get("prefixItems") or [node.get("items", {})]
-        inner = _types(root, items[0])
+        inner = _types(root, items[0]) if items[0] else ["value"]
         count = f"{len(node['prefixItems'])} " if "prefixItems" in node else ""
         plural = {"number": "numbers", "integer": "integers", "text": "texts"}
         return [f"list of {count}{_or([plural.get(text, text + 's') for text in inner])}"] if inner else []
@@ -215,7 +215,7 @@ def _range(root: Schema, node: Schema) -> str:
         items = node.get("prefixItems") or [node.get("items", {})]
         ranges = [_range(root, item) for item in items]
         if len(set(ranges)) > 1:
-            return ", ".join(ranges)
+            return "; ".join(text or "any" for text in ranges)
         own = [f"{node['minItems']} or more"] if node.get("minItems") and "prefixItems" not in node else []
         return ", ".join([*own, *([f"each {ranges[0].removeprefix('each ')}"] if ranges[0] else [])])
     signs = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}

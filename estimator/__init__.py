@@ -8,7 +8,8 @@ EstimationFailure. Submodules are loaded on first use; `import estimator` loads 
     dataset = est.read_dataset("out/quickstart")
     answer = est.estimate(est.read_frame(dataset, 0), "ml")
     est.run("out/quickstart", ["ml", "gravity-fit"])
-    table = est.score("out/quickstart").to_pandas()
+    scores = est.score("out/quickstart").to_pandas()
+    by_tilt = est.table("out/quickstart", x=["tilt_deg"], statistics=["median", "p95"]).to_pandas()
 """
 
 from importlib import import_module
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from estimator.errors import EstimationFailure, InputError
     from estimator.evaluate.run import run
     from estimator.evaluate.score import Scores, score
+    from estimator.evaluate.table import Table, table
     from estimator.io.dataset import Dataset, read_dataset, read_frame
     from estimator.io.device import DeviceFrame, frame
     from estimator.methods.registry import estimate, estimate_device, variants
@@ -35,6 +37,7 @@ __all__ = [
     "InputError",
     "Needs",
     "Scores",
+    "Table",
     "Variant",
     "__version__",
     "estimate",
@@ -45,6 +48,7 @@ __all__ = [
     "receive_frames",
     "run",
     "score",
+    "table",
     "variants",
 ]
 
@@ -57,6 +61,7 @@ _MODULES = {
     "InputError": "estimator.errors",
     "Needs": "estimator.methods.variant",
     "Scores": "estimator.evaluate.score",
+    "Table": "estimator.evaluate.table",
     "Variant": "estimator.methods.variant",
     "estimate": "estimator.methods.registry",
     "estimate_device": "estimator.methods.registry",
@@ -66,6 +71,7 @@ _MODULES = {
     "receive_frames": "estimator.receiver.receive",
     "run": "estimator.evaluate.run",
     "score": "estimator.evaluate.score",
+    "table": "estimator.evaluate.table",
     "variants": "estimator.methods.registry",
 }
 

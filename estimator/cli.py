@@ -1,4 +1,4 @@
-"""Command line `estimator variants | run | score | compare | report | levels | photo`, a thin client of the package.
+"""Command line of the estimator, a thin client of the package.
 
 Errors are one line on stderr and exit code 2. A command loads the modules that it needs when it runs, so that
 `estimator --help` loads neither OpenCV nor SciPy.
@@ -9,21 +9,17 @@ from __future__ import annotations
 import logging
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from io import TextIOWrapper
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from cyclopts import App, CycloptsError, Parameter
 
 import estimator
 from estimator.errors import InputError
-
-if TYPE_CHECKING:
-    from rich.table import Table
-
-    from estimator.evaluate.score import Scores, VariantScore
+from estimator.report.table_commands import plot, table
 
 INTERNAL_ERROR = 1
 USER_ERROR = 2
@@ -70,7 +66,7 @@ def run(
     Parameters
     ----------
     dataset
-        Folder of a dataset.
+        Folder of a dataset, or of a sweep, whose cells are estimated one after another by the same processes.
     variant
         Variant to run; may be given several times. Default: all that `estimator variants` does not mark "where named".
     workers
@@ -84,6 +80,7 @@ def run(
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     from estimator.io.estimates import estimates_path
+    from estimator.io.sweep import read_sweep
 
     if workers < 1:
         raise InputError(f"--workers {workers}: is not 1 or more")
@@ -100,7 +97,9 @@ def run(
         rows = estimator.run(dataset, _with_centroid_sigma(variant, centroid_sigma), workers, draw)
     for name, of_variant in rows.items():
         ok = sum(row.status == "ok" for row in of_variant)
-        print(f"{name}: {ok} of {len(of_variant)} frames ok -> {estimates_path(dataset, name)}")
+        sweep = read_sweep(dataset)
+        where = estimates_path(dataset, name) if sweep is None else f"the {len(sweep.cells)} cells of {dataset}"
+        print(f"{name}: {ok} of {len(of_variant)} frames ok -> {where}")
 
 
 def _with_centroid_sigma(names: list[str] | None, sigma_px: float | None) -> list[str] | None:
@@ -125,15 +124,31 @@ def score(dataset: Path, /, *, json: Annotated[bool, Parameter(negative=())] = F
     Parameters
     ----------
     dataset
-        Folder of a dataset with estimates.
+        Folder of a dataset with estimates, or of a sweep: each cell gets its scores.json, the table is of all cells.
     json
-        Print scores.json instead of a table.
+        Print scores.json instead of a table; of a sweep, the table as JSON.
     """
-    scores = estimator.score(dataset)
-    if json:
-        print(scores.model_dump_json(indent=1))
-    else:
-        _print_scores(scores)
+    from estimator.evaluate.table import table as table_of
+    from estimator.evaluate.table_text import TABLE_NOTE, table_json, table_text
+    from estimator.io.sweep import read_sweep
+    from estimator.report.terminal import print_scores
+
+    sweep = read_sweep(dataset)
+    if sweep is None:
+        scores = estimator.score(dataset)
+        if json:
+            print(scores.model_dump_json(indent=1))
+        else:
+            print_scores(scores)
+        return
+    for cell in sweep.cells:
+        estimator.score(cell)
+    of_sweep = table_of(dataset, statistics=("success_rate", "of_all", "mean", "median", "p95"))
+    print(table_json(of_sweep) if json else f"{table_text(of_sweep)}\n{TABLE_NOTE}")
+
+
+app.command(table)
+app.command(plot)
 
 
 @app.command
@@ -210,13 +225,14 @@ def levels(*datasets: Annotated[Path, Parameter(required=True)], out: Path) -> N
     from estimator.evaluate.score import read_or_score
     from estimator.io.atomic import write_atomically
     from estimator.report.levels import level_picture
+    from estimator.report.terminal import print_table
 
     if out.is_dir():
         raise InputError(f"--out {out}: is a folder, needed the name of a file")
     found = levels_of([(folder, read_or_score(folder)) for folder in datasets])
     headers, rows = level_cells(found)
     write_atomically(out, level_picture(found).encode())
-    _print_table("RMSE by level", headers, rows, LEVEL_NOTE)
+    print_table("RMSE by level", headers, rows, LEVEL_NOTE)
     print(out)
 
 
@@ -289,6 +305,7 @@ def photo(
         Folder of a dataset to write (datasets/FORMAT.md).
     """
     from estimator.photo.session import PhotoRequest, run_photo
+    from estimator.report.terminal import print_table
 
     request = PhotoRequest(
         images=images,
@@ -312,7 +329,7 @@ def photo(
         overlay=overlay,
         save=save,
     )
-    run_photo(request, print, _print_table)
+    run_photo(request, print, print_table)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -364,80 +381,3 @@ def _log_on_stderr() -> Iterator[None]:
         yield
     finally:
         logger.removeHandler(handler)
-
-
-def _print_scores(scores: Scores) -> None:
-    from estimator.evaluate import score_table as cells
-
-    variants = scores.variants
-    tables: list[tuple[str, Sequence[str], Callable[[VariantScore], tuple[str, ...]], str]]
-    tables = [(f"{scores.dataset}: errors", cells.ERROR_HEADERS, cells.error_cells, cells.ERROR_NOTE)]
-    if any(of_variant.against_bound or of_variant.nees or of_variant.ambiguous for of_variant in variants):
-        title = "Cramér-Rao bound and covariance consistency"
-        tables.append((title, cells.LIMIT_HEADERS, cells.limit_cells, cells.LIMIT_NOTE))
-    if any(map(cells.has_groups, variants)):
-        tables.append(("by device and map", cells.GROUP_HEADERS, cells.group_cells, cells.GROUP_NOTE))
-    if any(of_variant.downlink for of_variant in variants):
-        tables.append(("identities", cells.IDENTITY_HEADERS, cells.identity_cells, cells.IDENTITY_NOTE))
-    if any(of_variant.failed for of_variant in variants):
-        tables.append(("failed frames by good LEDs", cells.LOST_HEADERS, cells.lost_cells, cells.LOST_NOTE))
-    for title, headers, of_variant, note in tables:
-        rows = [(variant.variant, *of_variant(variant)) for variant in variants]
-        _print_table(title, ["variant", *headers], rows, note)
-    for variant in variants:
-        for reason, count in variant.failures.items():
-            print(f"{variant.variant}: {count} x {reason}")
-
-
-def _print_table(title: str, headers: Sequence[str], rows: Sequence[Sequence[str]], note: str) -> None:
-    """Print a table and its note; on a terminal that is too narrow, some columns at a time."""
-    from rich.console import Console
-
-    console = Console()
-    if not console.is_terminal:
-        # A file or pipe has no width to fit into.
-        whole = _table(title, headers, rows)
-        console = Console(width=Console(width=10_000).measure(whole).maximum)
-    for columns in _fitting(headers, rows, console.width):
-        part = [[row[column] for column in columns] for row in rows]
-        console.print(_table(title, [headers[column] for column in columns], part))
-        title = ""
-    console.print(note, markup=False, highlight=False)
-
-
-def _fitting(headers: Sequence[str], rows: Sequence[Sequence[str]], width: int) -> list[list[int]]:
-    """Columns of each of the tables, no wider than `width` where possible, that together have all; all have the first.
-
-    A header may wrap between its words, a cell does not. An interval stays beside the column that it belongs to.
-    """
-    from rich.cells import cell_len
-
-    border = 3
-    sizes = [
-        border + max([cell_len(row[column]) for row in rows] + [cell_len(word) for word in header.split()])
-        for column, header in enumerate(headers)
-    ]
-    tables = [[0]]
-    column = 1
-    while column < len(headers):
-        end = column + 1
-        while end < len(headers) and headers[end].endswith("interval"):
-            end += 1
-        together = list(range(column, end))
-        if len(tables[-1]) > 1 and 1 + sum(sizes[one] for one in [*tables[-1], *together]) > width:
-            tables.append([0])
-        tables[-1] += together
-        column = end
-    return tables
-
-
-def _table(title: str, headers: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table(title=escape(title) if title else None, title_justify="left")
-    for column, header in enumerate(headers):
-        table.add_column(header, justify="right" if column else "left", no_wrap=column == 0)
-    for row in rows:
-        table.add_row(*map(escape, row))
-    return table

@@ -15,7 +15,7 @@ from estimator.solvers.ranging import law_of_sines, led_ranges
 from estimator.solvers.trilateration import position_from_ranges
 from vlcrender.camera.intrinsics import Camera
 from vlcrender.dataset.generate import generate
-from vlcrender.dataset.recipe import load_plan
+from vlcrender.dataset.plan import load_plan
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from pydantic import TypeAdapter
 from vlcrender.camera.roi import Roi
 from vlcrender.dataset.auto_exposure import Metering, NoiseLevelMetering, PeakMetering
 from vlcrender.dataset.generate import generate
-from vlcrender.dataset.recipe import load_plan
+from vlcrender.dataset.plan import load_plan
 from vlcrender.dataset.verify import verify
 from vlcrender.rendering.expected_image import ExpectedImage, ExpectedRegion, LedPatch
 

@@ -117,7 +117,7 @@ if variant != "unset":
     import mitsuba
     mitsuba.set_variant(variant)
 from vlcrender.dataset.generate import generate
-from vlcrender.dataset.recipe import load_plan
+from vlcrender.dataset.plan import load_plan
 plan = load_plan(Path("datasets/quickstart.toml"), sys.argv[4:])
 seen = []
 generate(plan, out, workers, progress=lambda report: seen.append(variant == "unset" or mitsuba.variant()))

@@ -19,7 +19,7 @@ from vlcrender.core.backend import dr
 from vlcrender.dataset.files import read_dataset_file
 from vlcrender.dataset.frame_job import Job, _rendered, make_frame
 from vlcrender.dataset.generate import generate
-from vlcrender.dataset.recipe import Plan, load_plan
+from vlcrender.dataset.plan import Plan, load_plan
 from vlcrender.dataset.schema import DeviceTruthRow, FrameRow, MapTruthRow, TruthRow
 from vlcrender.dataset.tables import read_table, write_table
 from vlcrender.dataset.true_world import (

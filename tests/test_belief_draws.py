@@ -10,7 +10,7 @@ from test_belief import CALIBRATED, Array, plan
 from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.config.presets import presets
 from vlcrender.dataset.belief import CAMERA_PARAMETERS, Belief
-from vlcrender.dataset.recipe import Plan, load_plan
+from vlcrender.dataset.plan import Plan, load_plan
 from vlcrender.dataset.true_world import (
     built_leds,
     device_sensor,

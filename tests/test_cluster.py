@@ -8,7 +8,7 @@ from distributed import LocalCluster
 
 from vlcrender.dataset.files import sha256_of
 from vlcrender.dataset.generate import generate
-from vlcrender.dataset.recipe import load_plan
+from vlcrender.dataset.plan import load_plan
 from vlcrender.errors import InputError
 
 

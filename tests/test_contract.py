@@ -20,7 +20,7 @@ from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.rig import mounted_cameras
 from vlcrender.core.random_keys import stream
 from vlcrender.dataset.generate import generate
-from vlcrender.dataset.recipe import load_plan
+from vlcrender.dataset.plan import load_plan
 from vlcrender.dataset.schema import camera_entry
 from vlcrender.sensor.accelerometer import TiltError
 

@@ -13,9 +13,10 @@ import pytest
 from conftest import copy_of
 
 import estimator
-from estimator.cli import _fitting, main
+from estimator.cli import main
 from estimator.io.estimates import EstimateRow, write_estimates
 from estimator.methods.catalogue import OWN, VARIANTS
+from estimator.report.terminal import fitting
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +78,7 @@ def test_score_prints_a_row_a_variant(dataset: Path, capsys: pytest.CaptureFixtu
 
 @pytest.mark.slow
 def test_score_prints_to_a_terminal_without_a_micro_sign(dataset: Path) -> None:
-    command = [sys.executable, "-c", "import sys; from estimator.cli import _fitting, main; sys.exit(main())", "score"]
+    command = [sys.executable, "-c", "import sys; from estimator.cli import main; sys.exit(main())", "score"]
     environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
     result = subprocess.run([*command, str(dataset)], env=environment, capture_output=True, check=False)
     assert (result.returncode, result.stderr) == (0, b"")
@@ -89,11 +90,11 @@ def test_a_table_is_split_where_the_terminal_is_narrow() -> None:
     The widths are 3 more than the longest cell or word of a header, and a border: 1 + 4 + 8 + 11 + 8 + 6 = 38.
     """
     headers, rows = ["a", "value", "95 % interval", "long words", "b"], [["x", "12345", "1 to 2", "1", "123"]]
-    assert _fitting(headers, rows, 200) == [[0, 1, 2, 3, 4]]
-    assert _fitting(headers, rows, 38) == [[0, 1, 2, 3, 4]]
-    assert _fitting(headers, rows, 37) == [[0, 1, 2, 3], [0, 4]]
-    assert _fitting(headers, rows, 24) == [[0, 1, 2], [0, 3, 4]]
-    assert _fitting(headers, rows, 5) == [[0, 1, 2], [0, 3], [0, 4]]
+    assert fitting(headers, rows, 200) == [[0, 1, 2, 3, 4]]
+    assert fitting(headers, rows, 38) == [[0, 1, 2, 3, 4]]
+    assert fitting(headers, rows, 37) == [[0, 1, 2, 3], [0, 4]]
+    assert fitting(headers, rows, 24) == [[0, 1, 2], [0, 3, 4]]
+    assert fitting(headers, rows, 5) == [[0, 1, 2], [0, 3], [0, 4]]
 
 
 def test_score_prints_json(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:

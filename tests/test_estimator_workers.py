@@ -18,7 +18,7 @@ from estimator.evaluate.workers import _interrupts_deferred, estimate_with_worke
 from estimator.io.dataset import FrameRecord, read_dataset
 from estimator.io.estimates import EstimateRow
 from estimator.methods.catalogue import VARIANTS
-from vlcrender.dataset.generate import _interrupts_deferred as _interrupts_of_generate_deferred
+from vlcrender.dataset.workers import _interrupts_deferred as _interrupts_of_generate_deferred
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +38,7 @@ def test_any_number_of_workers_gives_the_same_answers_in_order(folder: Path, wor
     dataset = read_dataset(folder)
     alone = estimate_dataset(dataset, list(VARIANTS.values()), on_frame=lambda: None)
     done: list[None] = []
-    shared = estimate_with_workers(dataset, list(VARIANTS), workers, on_frame=lambda: done.append(None))
+    (shared,) = estimate_with_workers([dataset], list(VARIANTS), workers, on_frame=lambda: done.append(None))
     assert without_times(shared) == without_times(alone)
     assert [row.frame for row in shared["pnp"]] == [0, 1, 2]
     assert len(done) == 2 * 3  # a variant of all frames of a device is among them
@@ -66,7 +66,7 @@ def test_frames_of_a_device_are_solved_in_order_and_counted(folder: Path, monkey
 
 def test_an_unknown_name_is_refused_before_a_process_starts(folder: Path) -> None:
     with pytest.raises(InputError, match="variant best: unknown"):
-        estimate_with_workers(read_dataset(folder), ["best"], 2, on_frame=lambda: None)
+        next(estimate_with_workers([read_dataset(folder)], ["best"], 2, on_frame=lambda: None))
 
 
 @pytest.mark.parametrize(
@@ -110,10 +110,10 @@ def test_a_worker_exits_when_its_parent_dies(folder: Path, monkeypatch: pytest.M
 
     monkeypatch.setattr(workers.multiprocessing, "parent_process", Parent)
     monkeypatch.setattr(workers.os, "_exit", leave)
-    monkeypatch.setattr(workers, "_worker_state", None, raising=False)
+    monkeypatch.setattr(workers, "_worker_variants", None, raising=False)
     threads = cv2.getNumThreads()
     try:
-        workers._start(read_dataset(folder), ["pnp"], 1)
+        workers._start(["pnp"], 1)
         assert cv2.getNumThreads() == 1
         assert not exited.wait(0.05)
     finally:

@@ -12,8 +12,8 @@ from vlcrender.camera.roi import RegionImage, Roi
 from vlcrender.dataset.exr import write_exr
 from vlcrender.dataset.files import whole_file, write_json
 from vlcrender.dataset.generate import generate
+from vlcrender.dataset.plan import load_plan
 from vlcrender.dataset.progress import Progress
-from vlcrender.dataset.recipe import load_plan
 from vlcrender.dataset.schema import FrameRecord, FrameRow
 from vlcrender.dataset.tables import write_table
 from vlcrender.errors import InputError

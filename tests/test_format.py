@@ -12,7 +12,7 @@ from conftest import ROOT, SMALL
 
 from vlcrender.dataset.files import read_dataset_file
 from vlcrender.dataset.generate import generate
-from vlcrender.dataset.recipe import Plan, load_plan
+from vlcrender.dataset.plan import Plan, load_plan
 from vlcrender.dataset.schema import DATA_VERSION, led_map
 from vlcrender.dataset.verify import verify
 from vlcrender.errors import InputError

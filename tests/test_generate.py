@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -19,10 +20,11 @@ import pytest
 from conftest import HANG_S, ROOT, SMALL, small_plan, started, wait_until
 
 from vlcrender.dataset.generate import generate
+from vlcrender.dataset.plan import load_plan
 from vlcrender.dataset.progress import Progress, ProgressCallback
-from vlcrender.dataset.recipe import load_plan
 from vlcrender.dataset.schema import DATA_VERSION, FrameRecord
 from vlcrender.dataset.verify import verify
+from vlcrender.dataset.workers import Done, Task
 from vlcrender.errors import InputError
 
 RECIPE = ROOT / "datasets/quickstart.toml"
@@ -167,7 +169,7 @@ def test_a_set_of_another_version_is_left_alone(
     """The recipe gives other bits since: a finished set does not count as made, an unfinished one is not resumed."""
     provenance = json.loads((made / "dataset.json").read_text())["provenance"]
     (tmp_path / file).write_text(json.dumps({"provenance": provenance}))
-    monkeypatch.setattr("vlcrender.dataset.generate.DATA_VERSION", DATA_VERSION + 1)
+    monkeypatch.setattr("vlcrender.dataset.unfinished.DATA_VERSION", DATA_VERSION + 1)
     with pytest.raises(InputError, match="another recipe, scene or version; nothing was changed"):
         generate(small_plan("expected=true"), tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == [file]
@@ -184,7 +186,11 @@ def test_a_frame_is_in_the_journal_before_it_is_reported(
     made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A run that is killed then loses no frame that it reported. The frames here are those of another set."""
-    monkeypatch.setattr("vlcrender.dataset.generate._records", lambda *_: iter(records_of(made)))
+
+    def done_frames(tasks: Iterable[Task], *_: object) -> Iterator[Done]:
+        return zip((job for task in tasks for job, _ in task), records_of(made), strict=True)
+
+    monkeypatch.setattr("vlcrender.dataset.generate.done_frames", done_frames)
     lines: list[int] = []
 
     def count(report: Progress) -> None:

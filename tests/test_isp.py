@@ -9,7 +9,7 @@ from PIL import Image
 from test_bayer import QE
 
 from vlcrender.dataset.generate import generate
-from vlcrender.dataset.recipe import load_plan
+from vlcrender.dataset.plan import load_plan
 from vlcrender.sensor.isp import Processed
 from vlcrender.sensor.sensor import Sensor
 from vlcrender.sensor.signal_chain import expose

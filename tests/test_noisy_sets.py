@@ -12,8 +12,8 @@ from conftest import ROOT, SMALL
 
 from vlcrender.dataset.frame_job import Job, make_frame
 from vlcrender.dataset.generate import generate
+from vlcrender.dataset.plan import Plan, load_plan
 from vlcrender.dataset.progress import Progress
-from vlcrender.dataset.recipe import Plan, load_plan
 from vlcrender.dataset.verify import verify
 
 LEFT = "rig=[{ name = 'left', offset_m = [-0.1, 0.0, 0.0], tilt_x_deg = 0.0, tilt_y_deg = 1.0 }]"

@@ -14,7 +14,15 @@ from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.config.toml_model import check, read_toml
 from vlcrender.core.random_keys import stream
 from vlcrender.dataset import pose_sampling
-from vlcrender.dataset.pose_sampling import AimedPoses, GridPoses, ListedPoses, PoseEntry, pose_of_frame
+from vlcrender.dataset.plan import load_plan
+from vlcrender.dataset.pose_sampling import (
+    AimedPoses,
+    GridPoses,
+    ListedPoses,
+    PoseEntry,
+    TiltGridPoses,
+    pose_of_frame,
+)
 from vlcrender.errors import InputError
 from vlcrender.scene.loader import Scene, build_scene
 from vlcrender.scene.schema import SceneSettings
@@ -164,6 +172,57 @@ def test_the_poses_of_a_set_share_their_two_permutations(central: Scene, monkeyp
     poses_of(OPEN, central, seed=991, count=10)
     assert drawn_keys.count("aim") == 10
     assert sorted(key for key in drawn_keys if "strata" in key) == ["tilt-x-strata", "tilt-y-strata"]
+
+
+GRID = TiltGridPoses(
+    kind="tilt-grid",
+    tilt_x_deg=(-20.0, 20.0, 3),
+    tilt_y_deg=(0.0, 30.0, 4),
+    per_cell=2,
+    height_m=(1.0, 2.0),
+    min_leds=1,
+    border_px=0.0,
+)
+
+
+def test_a_grid_of_tilts_has_each_pair_in_order(central: Scene) -> None:
+    assert GRID.count == 24
+    poses = [pose_of_frame(GRID, number, 7, NARROW, central) for number in range(GRID.count)]
+    pairs = [(x, y) for x in (-20.0, 0.0, 20.0) for y in (0.0, 10.0, 20.0, 30.0) for _ in range(2)]
+    assert [(pose.tilt_x_deg, pose.tilt_y_deg) for pose in poses] == pairs
+    assert len({pose.position_m for pose in poses}) == 24
+
+
+def test_poses_of_a_grid_are_aimed_by_the_same_rules(central: Scene) -> None:
+    """A pose is that of a set of aimed poses whose tilts have no spread: target, height, yaw and place are its own."""
+    for number in (0, 13, 23):
+        x, y = GRID.tilts_deg(number)
+        aimed = OPEN.model_copy(update={"tilt_x_deg": (x, x), "tilt_y_deg": (y, y)})
+        assert pose_of_frame(GRID, number, 7, NARROW, central) == pose_of_frame(aimed, number, 7, NARROW, central)
+
+
+def test_a_scaled_grid_keeps_its_border_in_the_image() -> None:
+    table = (
+        "{ kind = 'tilt-grid', tilt_x_deg = [0, 60, 7], tilt_y_deg = [5, 5, 1], per_cell = 3, height_m = [0.1, 1.8] }"
+    )
+    recipe = load_plan(ROOT / "datasets/quickstart.toml", [f"poses={table}"], scale=10).recipe
+    assert isinstance(recipe.poses, TiltGridPoses)
+    assert (recipe.poses.border_px, recipe.frame_count) == (2.0, 21)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"tilt_x_deg": [10, 0, 3]}, "tilt_x_deg = [10.0, 0.0, 3]: the lower value comes first"),
+        ({"tilt_y_deg": [0, 10, 1]}, "tilt_y_deg = [0.0, 10.0, 1]: a single value is lowest and highest"),
+        ({"tilt_x_deg": [0, 86, 3]}, "tilt_x_deg[1] = 86: input should be less"),
+        ({"height_m": [2, 1]}, "height_m = [2.0, 1.0]: the lower value comes first"),
+    ],
+)
+def test_a_grid_that_is_impossible_is_refused(change: dict[str, object], words: str) -> None:
+    with pytest.raises(InputError) as refusal:
+        check({**GRID.model_dump(mode="json"), **change}, TiltGridPoses, "poses")
+    assert words in str(refusal.value)
 
 
 def test_positions_keep_the_distance_from_the_walls() -> None:

@@ -2,7 +2,7 @@
 
 from conftest import ROOT
 
-from vlcrender.dataset.recipe import load_plan
+from vlcrender.dataset.plan import load_plan
 from vlcrender.sensor.accelerometer import TiltError
 
 

@@ -3,18 +3,20 @@
 import pytest
 from pydantic import BaseModel
 
+from vlcrender.dataset.added_noise import AddedNoise
 from vlcrender.dataset.auto_exposure import NoiseLevelMetering, PeakMetering
 from vlcrender.dataset.motion import Motion
-from vlcrender.dataset.pose_sampling import AimedPoses, GridPoses, ListedPoses, PoseEntry
-from vlcrender.dataset.recipe import Recipe
+from vlcrender.dataset.pose_sampling import AimedPoses, GridPoses, ListedPoses, PoseEntry, TiltGridPoses
+from vlcrender.dataset.recipe import RecipeFile
+from vlcrender.dataset.sweep import SweepTable
 from vlcrender.sensor.accelerometer import Imu, TiltError
 from vlcrender.sensor.isp import Processed
 from vlcrender.sensor.quantum_efficiency import QuantumEfficiency
 from vlcrender.sensor.sensor import Sensor
 
 MODELS: tuple[type[BaseModel], ...] = (
-    *(Recipe, Sensor, QuantumEfficiency, TiltError, Imu, Processed, Motion),
-    *(AimedPoses, ListedPoses, PoseEntry, GridPoses, PeakMetering, NoiseLevelMetering),
+    *(RecipeFile, SweepTable, AddedNoise, Sensor, QuantumEfficiency, TiltError, Imu, Processed, Motion),
+    *(AimedPoses, TiltGridPoses, ListedPoses, PoseEntry, GridPoses, PeakMetering, NoiseLevelMetering),
 )
 
 

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from vlcrender.config.presets import presets
 from vlcrender.config.toml_model import read_toml
-from vlcrender.dataset.recipe import Plan, Recipe, load_plan, scaled
+from vlcrender.dataset.plan import Plan, load_plan
+from vlcrender.dataset.recipe import Recipe, scaled
 from vlcrender.errors import InputError
 from vlcrender.sensor.sensor import Sensor
 
@@ -22,11 +23,12 @@ TABLES: dict[str, tuple[str, ...]] = {
     "sensor": (*Sensor.model_fields, "preset"),
     "accelerometer": ("kind", "error_deg", "bias_m_s2", "bits", "range_g", "samples", "temperature_c", "preset"),
     "exposure": ("kind", "share_of_saturation", "level_db", "max_s"),
+    "added_noise": ("level_db", "relative_to"),
     "processed": ("curve", "gamma", "format", "quality"),
 }
 WORDS = (
     *("shot", "none", "full", "rggb", "silicon", "tilt-error", "imu", "peak", "noise-level", "srgb", "gamma", "jpeg"),
-    *("png", "../../etc", "\x00", "ünï\n", *presets("sensors"), *presets("accelerometers")),
+    *("png", "photon", "../../etc", "\x00", "ünï\n", *presets("sensors"), *presets("accelerometers")),
 )
 NUMBERS = st.one_of(
     st.integers(-1, 20), st.integers(), st.floats(), st.sampled_from([0.0, 1.0, 12, 16, 100.0, 4900.0, 2**63])

@@ -16,7 +16,7 @@ from estimator.methods.catalogue import VARIANTS
 from vlcrender.camera.intrinsics import Pose
 from vlcrender.camera.rig import pose_of
 from vlcrender.dataset.generate import generate
-from vlcrender.dataset.recipe import load_plan
+from vlcrender.dataset.plan import load_plan
 from vlcrender.dataset.verify import verify
 
 angles = st.floats(-179, 179)

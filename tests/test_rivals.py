@@ -13,7 +13,7 @@ from estimator.io.dataset import read_dataset
 from estimator.io.estimates import EstimateRow
 from estimator.methods.catalogue import OWN
 from vlcrender.dataset.generate import generate
-from vlcrender.dataset.recipe import load_plan
+from vlcrender.dataset.plan import load_plan
 
 STEREO = (*SMALL, "regions.margin_px=8", "poses.count=2", "accelerometer.error_deg=0")
 FISH_EYE = (

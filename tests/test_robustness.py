@@ -26,7 +26,7 @@ from estimator.spots.correspondences import find_correspondences
 from estimator.spots.detect import detect
 from estimator.spots.led_light import Readout
 from vlcrender.dataset.generate import generate
-from vlcrender.dataset.recipe import load_plan
+from vlcrender.dataset.plan import load_plan
 
 SIZE = (800, 600, 3000.0)
 RADIUS_M = 0.01

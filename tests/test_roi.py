@@ -14,7 +14,7 @@ from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.roi import LedRegions, Roi, led_regions
 from vlcrender.core.backend import dr
 from vlcrender.dataset.generate import generate
-from vlcrender.dataset.recipe import load_plan
+from vlcrender.dataset.plan import load_plan
 from vlcrender.dataset.verify import verify
 from vlcrender.errors import InputError
 from vlcrender.rendering.background import _edges

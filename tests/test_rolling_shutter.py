@@ -15,7 +15,7 @@ from vlcrender.camera.roi import Roi
 from vlcrender.camera.vignetting import relative_illumination
 from vlcrender.dataset.light_checks import light_warnings
 from vlcrender.dataset.motion import Motion, poses_during
-from vlcrender.dataset.recipe import Plan
+from vlcrender.dataset.plan import Plan
 from vlcrender.errors import InputError
 from vlcrender.modulation.exposure import LineGains, MeanWave
 from vlcrender.modulation.transmission import led_waves

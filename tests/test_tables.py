@@ -40,6 +40,7 @@ def test_the_columns_are_those_of_the_format() -> None:
         "pose": pa.int64(),
         "device": pa.int64(),
         "file": pa.string(),
+        "part": pa.int64(),
         "sha256": pa.string(),
         "camera": pa.string(),
         "exposure_s": pa.float64(),
@@ -63,6 +64,7 @@ def test_the_columns_are_those_of_the_format() -> None:
         "angular_velocity_rad_s": pa.list_(pa.float64(), 3),
         "linear_velocity_m_s": pa.list_(pa.float64(), 3),
         "leds": pa.list_(pa.struct([*SPOT, ("visible_fraction", pa.float64()), *WAVE])),
+        "added_noise_dn": pa.float64(),
         "bound_m2": pa.list_(pa.float64(), 9),
         "bound_exact_m2": pa.list_(pa.float64(), 9),
     }
@@ -104,6 +106,7 @@ def record(rng: np.random.Generator, bound: bool) -> FrameRecord:
         "pose": 1,
         "device": 1,
         "file": "frames/000003.exr",
+        "part": 5 if bound else None,
         "sha256": "0" * 64,
         "camera": "main",
         "exposure_s": exposure,
@@ -129,6 +132,7 @@ def record(rng: np.random.Generator, bound: bool) -> FrameRecord:
         "leds": (LedTruth(led=7, u_px=v, v_px=u, visible_fraction=share, **wave),),
         "bound_m2": numbers(9) if bound else None,
         "bound_exact_m2": numbers(9) if bound else None,
+        "added_noise_dn": float(rng.uniform()) if bound else None,
     }
     return FrameRecord(device=FrameRow.model_validate(device), truth=TruthRow.model_validate(truth))
 

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 import pytest
 from pydantic import Field, model_validator
 
-from vlcrender.config.toml_model import RENAMED_KEYS, Settings, check, key_error, override, read_toml
+from vlcrender.config.toml_model import RENAMED_KEYS, Settings, check, key_error, override, read_toml, toml_text
 from vlcrender.errors import InputError
 
 
@@ -174,6 +174,31 @@ def test_an_assignment_without_a_key_or_a_value_is_refused(assignment: str) -> N
 def test_an_assignment_below_a_value_is_refused() -> None:
     with pytest.raises(InputError, match=r"^--set a\.b\.c=1: b is not a table of the recipe$"):
         override({"a": {"b": 3}}, ["a.b.c=1"])
+
+
+def test_an_item_of_a_list_has_its_number_or_name() -> None:
+    given = {"rig": [{"name": "left", "yaw": 1}, {"name": "1", "yaw": 2}], "size": [1.0, 2.0]}
+    before = copy.deepcopy(given)
+    changed = override(given, ["rig.left.yaw=3", "rig.1.yaw=4", "rig.0.tilt=5", "size.1=6.0"])
+    assert changed == {
+        "rig": [{"name": "left", "yaw": 3, "tilt": 5}, {"name": "1", "yaw": 4}],
+        "size": [1.0, 6.0],
+    }
+    assert given == before
+    with pytest.raises(InputError, match=r"^--set rig\.right\.yaw=1: no item right: 2 items, .* or named left, 1$"):
+        override(given, ["rig.right.yaw=1"])
+    with pytest.raises(InputError, match=r"^here: size\.2=1: no item 2: 2 items, numbered from 0$"):
+        override(given, ["size.2=1"], "here: ")
+
+
+@pytest.mark.parametrize("value", [True, 3, -1.5e-07, 'a "b" \\ c', [1, [2.5, "x"]], {"a b": {"c": [False]}}])
+def test_a_value_survives_its_toml(value: object) -> None:
+    assert override({}, [f"key={toml_text(value, 'here')}"]) == {"key": value}
+
+
+def test_a_value_that_toml_has_not_is_refused() -> None:
+    with pytest.raises(InputError, match=r"^here = None: has to be a number, a text"):
+        toml_text(None, "here")
 
 
 def test_a_file_that_is_no_toml_is_refused_by_its_path(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from vlcrender.camera.roi import RegionImage, Roi
 from vlcrender.dataset.exr import write_exr
 from vlcrender.dataset.files import sha256_of
 from vlcrender.dataset.generate import generate
-from vlcrender.dataset.recipe import load_plan
+from vlcrender.dataset.plan import load_plan
 from vlcrender.dataset.schema import FrameRow, TruthRow, flat9
 from vlcrender.dataset.tables import read_table, write_table
 from vlcrender.dataset.verify import verify

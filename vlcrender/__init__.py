@@ -31,8 +31,9 @@ if TYPE_CHECKING:
     from vlcrender.camera.posed_camera import PosedCamera
     from vlcrender.camera.roi import LedRegions, Roi
     from vlcrender.dataset.error_budget import BudgetRow, ErrorBudget
+    from vlcrender.dataset.plan import Plan
     from vlcrender.dataset.progress import Progress
-    from vlcrender.dataset.recipe import Plan, Recipe
+    from vlcrender.dataset.recipe import Recipe
     from vlcrender.errors import InputError
     from vlcrender.rendering.expected_image import ExpectedImage
     from vlcrender.scene.loader import Scene
@@ -57,7 +58,7 @@ _MODULES = {
     "Progress": "vlcrender.dataset.progress",
     "Scene": "vlcrender.scene.loader",
     "Recipe": "vlcrender.dataset.recipe",
-    "Plan": "vlcrender.dataset.recipe",
+    "Plan": "vlcrender.dataset.plan",
     "Camera": "vlcrender.camera.intrinsics",
     "Pose": "vlcrender.camera.intrinsics",
     "PosedCamera": "vlcrender.camera.posed_camera",

@@ -4,7 +4,6 @@ Modules that need Mitsuba, SciPy or Parquet are imported inside the functions th
 recipe is refused before Mitsuba is loaded.
 """
 
-import json
 import threading
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.roi import LedRegions, RegionImage, Roi
 from vlcrender.config.packaged import find_file
+from vlcrender.config.toml_model import toml_text
 from vlcrender.errors import InputError
 from vlcrender.rendering.expected_image import ExpectedImage, Gain, Gains, Image
 from vlcrender.scene.loader import Scene
@@ -27,8 +27,8 @@ from vlcrender.sensor.sensor import Sensor
 if TYPE_CHECKING:
     from vlcrender.dataset.downlink_entry import Demodulation
     from vlcrender.dataset.error_budget import ErrorBudget
+    from vlcrender.dataset.plan import Plan
     from vlcrender.dataset.progress import ProgressCallback
-    from vlcrender.dataset.recipe import Plan
     from vlcrender.dataset.schema import SpotRow
     from vlcrender.rendering.bayer import MosaicRenderer
     from vlcrender.rendering.renderer import Renderer
@@ -175,12 +175,13 @@ def load_recipe(
 ) -> "Plan":
     """Read and check a recipe: the name of one that comes with the package, such as "quickstart", or a TOML file.
 
-    Returns a `Plan`: the recipe, with `overrides` and presets put in, and its scene. `overrides` maps dotted keys to
-    values, `{"poses.count": 20}`, or lists `key=value` texts as after `--set`. With `scale` N, N x N pixels are binned
-    into one; `scale_mode` says whether larger pixels keep all photons ("binned") or the exposure is shortened
-    ("same-photons"). Raises InputError naming file, key and value.
+    Returns a `Plan`: the recipe, with `overrides` and presets put in, and its scene. Of a recipe with [[sweep]] these
+    are of the first cell, and `cells` has all: `len(plan.cells)`, `plan.cells.plan(number)`. `overrides` maps dotted
+    keys to values, `{"poses.count": 20, "scene.ambient.illuminance_lux": 800}`, or lists `key=value` texts as after
+    `--set`. With `scale` N, N x N pixels are binned into one; `scale_mode` says whether larger pixels keep all photons
+    ("binned") or the exposure is shortened ("same-photons"). Raises InputError naming file, key and value.
     """
-    from vlcrender.dataset.recipe import load_plan
+    from vlcrender.dataset.plan import load_plan
 
     return load_plan(find_file("recipe", name_or_path), _assignments(overrides), scale, scale_mode)
 
@@ -246,7 +247,7 @@ def expose(
     for name, number in (("seed", seed), ("frame", frame)):
         if not 0 <= int(number) < MAX_SEED:
             raise InputError(f"{name} = {number}: has to be an integer from 0 to 2**63 - 1")
-    if _spectral_response(sensor) != _spectral_response(mean.sensor):
+    if sensor.spectral_response != mean.sensor.spectral_response:
         mean = render(mean.scene, mean.camera, mean.pose, sensor=sensor, regions=mean.regions)
     device = accelerometer or TiltError()
     noise = random_key(int(seed), int(frame), "shot-noise")
@@ -295,7 +296,7 @@ def generate(
     scheduler: str | None = None,
     progress: "ProgressCallback | None" = None,
 ) -> bool:
-    """Generate the dataset of a recipe in the folder `out`. An interrupted run is continued.
+    """Generate the dataset of a recipe, or of each cell of its sweep, in the folder `out`; continue an interrupted run.
 
     `recipe` is a packaged name, the path of a TOML file, or what `load_recipe` returns; `overrides`, `scale` and
     `scale_mode` are those of `load_recipe`. `workers` processes make frames, or the workers of a dask `scheduler` (its
@@ -333,9 +334,9 @@ def budget(
 
 
 def verify(directory: str | Path) -> list[str]:
-    """Check that a dataset is complete and intact and its truth consistent: a line for each problem, or no line.
+    """Check that a dataset, or each cell of a sweep, is complete and intact and its truth consistent.
 
-    Raises InputError if the folder has no readable dataset.json.
+    Returns a line for each problem, or no line. Raises InputError if the folder has no readable dataset.json.
     """
     from vlcrender.dataset.verify import verify as problems_of
 
@@ -351,10 +352,6 @@ def _plan(
     if overrides is not None or scale != 1:
         raise InputError("overrides, scale: are for a recipe's name or path; give them to load_recipe")
     return recipe
-
-
-def _spectral_response(sensor: Sensor) -> str:
-    return sensor.model_dump_json(include={"quantum_efficiency", "mosaic", "crosstalk"})
 
 
 def renderer_of(plan: "Plan") -> "Renderer | MosaicRenderer":
@@ -374,7 +371,7 @@ def _renderer(scene: Scene, sensor: Sensor) -> "Renderer | MosaicRenderer":
     from vlcrender.rendering.renderer import Renderer
     from vlcrender.sensor.radiometry import detectors
 
-    key = id(scene), _spectral_response(sensor)
+    key = id(scene), sensor.spectral_response
     with _renderers_lock:
         renderer = _renderers.pop(key, None)
         if renderer is None:
@@ -399,20 +396,16 @@ def _assignments(overrides: Overrides | None) -> list[str]:
             f"overrides = {overrides!r}: has to be a mapping of keys to values, or a list of key=value texts"
         )
     if isinstance(overrides, Mapping):
-        return [f"{key}={_toml(value, key)}" for key, value in overrides.items()]
+        return [f"{key}={toml_text(_plain(value), f'overrides: {key}')}" for key, value in overrides.items()]
     return list(overrides)
 
 
-def _toml(value: object, key: str) -> str:
-    """A value as TOML has it. Raises InputError for one that TOML has not."""
+def _plain(value: object) -> object:
+    """A value without arrays, numbers and paths of NumPy and pathlib."""
     if isinstance(value, np.ndarray | np.generic):
-        value = value.tolist()
+        return _plain(value.tolist())
     if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{json.dumps(str(k))} = {_toml(v, key)}" for k, v in value.items()) + "}"
+        return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return "[" + ", ".join(_toml(item, key) for item in value) + "]"
-    if isinstance(value, Path):
-        value = str(value)
-    if isinstance(value, bool | int | float | str):
-        return json.dumps(value, ensure_ascii=False)
-    raise InputError(f"overrides: {key} = {value!r}: has to be a number, a text, true or false, a list or a table")
+        return [_plain(item) for item in value]
+    return str(value) if isinstance(value, Path) else value

@@ -56,7 +56,7 @@ def generate(
     workers: int = 1,
     scheduler: str | None = None,
 ) -> None:
-    """Generate the dataset of a recipe; an interrupted run is continued.
+    """Generate the dataset of a recipe, or one for each cell of its sweep; an interrupted run is continued.
 
     Parameters
     ----------
@@ -65,7 +65,8 @@ def generate(
     out
         Folder of the dataset; new, empty, or an unfinished run of the same recipe.
     set_
-        key=value that replaces a value of the recipe, e.g. camera.f_number=2.8. May be repeated.
+        key=value that replaces a value of the recipe, e.g. camera.f_number=2.8, or with scene. before its key one of
+        the scene, e.g. scene.ambient.illuminance_lux=800. An item of a list has its number or name. May be repeated.
     scale
         Bin N x N pixels into one, for previews; N has to divide the camera's width and height.
     scale_mode
@@ -81,9 +82,10 @@ def generate(
     if workers < 1:
         raise InputError(f"--workers {workers}: has to be 1 or more")
     plan = api.load_recipe(recipe, set_, scale=scale, scale_mode=scale_mode)
-    with _Bar(plan.recipe.name, plan.recipe.frame_count) as bar:
+    with _Bar(plan.recipe.name, plan.frame_count) as bar:
         made = api.generate(plan, out, workers=workers, scheduler=scheduler, progress=bar.show)
-    print(f"{out}: {plan.recipe.frame_count} frames{'' if made else ' (was already complete and intact)'}")
+    cells = "" if plan.cells is None else f"{len(plan.cells)} cells, "
+    print(f"{out}: {cells}{plan.frame_count} frames{'' if made else ' (was already complete and intact)'}")
 
 
 class _Bar:
@@ -130,23 +132,27 @@ class _Bar:
 
 @app.command
 def verify(directory: Path, /) -> None:
-    """Check that a dataset is complete and intact; the exit code is 0 only then.
+    """Check that a dataset, or each cell of a sweep, is complete and intact; the exit code is 0 only then.
 
     Parameters
     ----------
     directory
-        Folder of the dataset.
+        Folder of the dataset or sweep.
     """
     from vlcrender import api
-    from vlcrender.dataset.files import read_dataset_file
+    from vlcrender.dataset.files import read_dataset_file, read_sweep_file
+    from vlcrender.dataset.sweep import SWEEP_FILE
 
-    dataset = read_dataset_file(directory)
+    if (directory / SWEEP_FILE).is_file():
+        content = f"{len(read_sweep_file(directory).cells)} cells"
+    else:
+        content = f"{read_dataset_file(directory).frame_count} frames"
     found = api.verify(directory)
     for problem in found:
         _complain(problem)
     if found:
         sys.exit(2)
-    print(f"{directory}: {dataset.frame_count} frames, all there and intact")
+    print(f"{directory}: {content}, all there and intact")
 
 
 @app.command

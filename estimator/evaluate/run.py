@@ -1,7 +1,7 @@
-"""Run of variants over a dataset, which writes their estimates."""
+"""Run of variants over a dataset or all datasets of a sweep, which writes their estimates."""
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from estimator.errors import InputError
@@ -9,6 +9,7 @@ from estimator.evaluate.batch import estimate_dataset, steps
 from estimator.evaluate.workers import estimate_with_workers
 from estimator.io.dataset import read_dataset
 from estimator.io.estimates import EstimateRow, estimates_path, write_estimates
+from estimator.io.sweep import dataset_folders
 from estimator.methods.registry import Registry, variants
 from estimator.methods.variant import Variant
 
@@ -23,13 +24,15 @@ def run(
 ) -> dict[str, tuple[EstimateRow, ...]]:
     """Estimate every frame of a dataset, and write estimates/VARIANT.parquet for each variant.
 
+    Of a sweep every cell is estimated, all by the same processes, and each has estimates of its own.
+
     A variant that uses all frames of a device (`self-calibrated`) gets them by the column `device` of the frames. No
     variant gets the truth.
 
     Parameters
     ----------
     directory
-        Folder of the dataset.
+        Folder of the dataset, or of a sweep.
     variants
         Names of variants, or Variant objects; those that run by default if None.
     workers
@@ -41,7 +44,8 @@ def run(
     Returns
     -------
     dict
-        Rows by variant name, one a frame, in order. A frame without a position has `status` "failed" and a `reason`.
+        Rows by variant name, one a frame, in order; of a sweep, cell after cell. A frame without a position has
+        `status` "failed" and a `reason`.
 
     Raises
     ------
@@ -56,8 +60,13 @@ def run(
     chosen = _chosen(variants)
     for name in chosen:
         estimates_path(folder, name)
-    dataset = read_dataset(folder)
-    done, total = 0, len(dataset.frames) * steps(chosen.values())
+    cells = dataset_folders(folder)
+    # A cell that cannot be read is refused before the first frame is estimated. Not all are in memory at a time.
+    frames = 0
+    for cell in cells:
+        dataset = read_dataset(cell)
+        frames += len(dataset.frames)
+    done, total = 0, frames * steps(chosen.values())
 
     def on_frame() -> None:
         nonlocal done
@@ -67,16 +76,21 @@ def run(
 
     if progress is not None:
         progress(0, total)
+    datasets = [dataset] if len(cells) == 1 else map(read_dataset, cells)
+    of_cells: Iterator[dict[str, tuple[EstimateRow, ...]]]
     if workers == 1:
-        rows = estimate_dataset(dataset, list(chosen.values()), on_frame)
+        of_cells = (estimate_dataset(dataset, list(chosen.values()), on_frame) for dataset in datasets)
     else:
         _check_registered(chosen)
-        rows = estimate_with_workers(dataset, list(chosen), workers, on_frame)
-    for name, of_variant in rows.items():
-        path = write_estimates(folder, name, of_variant)
-        failed = sum(row.status == "failed" for row in of_variant)
-        logger.info("%s: %d of %d frames failed, estimates in %s", name, failed, len(of_variant), path)
-    return rows
+        of_cells = estimate_with_workers(datasets, list(chosen), min(workers, frames), on_frame)
+    rows: dict[str, list[EstimateRow]] = {name: [] for name in chosen}
+    for cell, of_cell in zip(cells, of_cells, strict=True):
+        for name, of_variant in of_cell.items():
+            path = write_estimates(cell, name, of_variant)
+            failed = sum(row.status == "failed" for row in of_variant)
+            logger.info("%s: %d of %d frames failed, estimates in %s", name, failed, len(of_variant), path)
+            rows[name] += of_variant
+    return {name: tuple(of_variant) for name, of_variant in rows.items()}
 
 
 def _chosen(selection: Sequence[str | Variant] | None) -> dict[str, Variant]:

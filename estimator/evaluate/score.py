@@ -156,7 +156,7 @@ class Scores(Row):
         InputError
             pandas is not installed.
         """
-        pd = _pandas()
+        pd = import_pandas()
         columns = list(_summary_row(None))
         return pd.DataFrame([_summary_row(variant) for variant in self.variants], columns=columns)
 
@@ -175,13 +175,14 @@ class Scores(Row):
         InputError
             pandas is not installed.
         """
-        pd = _pandas()
+        pd = import_pandas()
         columns = ["variant", *_frame_columns()]
         rows = [_frame_row(variant.variant, row) for variant in self.variants for row in variant.rows]
         return pd.DataFrame(rows, columns=columns)
 
 
-def _pandas() -> Any:
+def import_pandas() -> Any:
+    """The module pandas; raises InputError where it is not installed."""
     try:
         import pandas
     except ImportError:
@@ -414,7 +415,7 @@ def score(directory: str | Path) -> Scores:
     """
     folder = Path(directory)
     dataset = read_dataset(folder)
-    paths = _estimate_paths(folder)
+    paths = estimate_paths(folder)
     if not paths:
         raise InputError(f"{folder / 'estimates'}: no estimates to score; make them with `estimator run {folder}`")
     truth = read_truth(folder / "truth.parquet", len(dataset.frames))
@@ -422,7 +423,7 @@ def score(directory: str | Path) -> Scores:
     true_map = () if dataset.leds or not dataset.frames else read_true_map(folder / "truth_map.parquet")
     variants = []
     for path in paths:
-        rows, leds_m = _read_known(path, dataset)
+        rows, leds_m = read_known(path, dataset)
         downlink = score_identities(rows, truth, dataset, true_map)
         variants.append(score_variant(path.stem, rows, truth, leds_m, devices, downlink))
     scores = Scores(
@@ -444,7 +445,7 @@ def read_or_score(folder: Path) -> Scores:
 
     The truth may be missing if scores.json is there. Scores of an older version are computed again. Raises InputError.
     """
-    path, estimates = folder / "scores.json", _estimate_paths(folder)
+    path, estimates = folder / "scores.json", estimate_paths(folder)
     sources = [source for source in (*estimates, folder / "truth.parquet") if source.exists()]
     if not path.exists() or any(source.stat().st_mtime > path.stat().st_mtime for source in sources):
         return score(folder)
@@ -460,7 +461,8 @@ def read_or_score(folder: Path) -> Scores:
     return scores
 
 
-def _estimate_paths(folder: Path) -> list[Path]:
+def estimate_paths(folder: Path) -> list[Path]:
+    """Files with estimates of a dataset, in order of the variants' names. Raises InputError for an unprintable name."""
     paths = sorted((folder / "estimates").glob("*.parquet"), key=lambda path: path.stem)
     for path in paths:
         if not path.stem.isprintable():
@@ -468,7 +470,7 @@ def _estimate_paths(folder: Path) -> list[Path]:
     return paths
 
 
-def _read_known(path: Path, dataset: Dataset) -> tuple[tuple[EstimateRow, ...], dict[int, Position]]:
+def read_known(path: Path, dataset: Dataset) -> tuple[tuple[EstimateRow, ...], dict[int, Position]]:
     """Estimates of a file, and positions of LEDs by id: those of the map, or those that packets told.
 
     Raises InputError for a range to an LED that is in neither.

@@ -286,9 +286,9 @@ def nees(squares: Sequence[float], groups: Groups | None = None) -> Nees | None:
 
         low, high = (float(limit) / count for limit in chi2.interval(NEES_CONFIDENCE, 3 * count))
         return Nees(frames=count, devices=1, maps=1, mean=mean, low=low, high=high, within=low <= mean <= high)
-    error = _standard_error(values, groups.device)
+    error = standard_error(values, groups.device)
     if groups.maps > 1:
-        error = max(error, _standard_error(values, groups.map))
+        error = max(error, standard_error(values, groups.map))
     return _by_samples(values, groups, error, groups.devices)
 
 
@@ -297,12 +297,13 @@ def nees_by_map(squares: Sequence[float], groups: Groups) -> Nees | None:
     if not squares or groups.maps < 2:
         return None
     values = np.array(squares, dtype=np.float64)
-    return _by_samples(values, groups, _standard_error(values, groups.map), groups.maps)
+    return _by_samples(values, groups, standard_error(values, groups.map), groups.maps)
 
 
-def _standard_error(values: Floats, sample: Integers) -> float:
-    """Standard error of the mean of all values where samples of them are independent (a ratio's, by linearization)."""
-    sums = [float((values[sample == one] - values.mean()).sum()) for one in np.unique(sample)]
+def standard_error(values: Floats, sample: Integers) -> float:
+    """Standard error of the mean of values (n,) whose samples (n,) are independent (a ratio's, by linearization)."""
+    _, of_value = np.unique(sample, return_inverse=True)
+    sums = np.bincount(of_value, values - values.mean())
     return float(np.sqrt(len(sums) / (len(sums) - 1) * np.square(sums).sum())) / len(values)
 
 

@@ -1,13 +1,17 @@
-"""Estimation of a dataset by several processes, with the same results as by one."""
+"""Estimation of datasets by several processes, with the same results as by one."""
 
 import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
 
 import cv2
 
@@ -23,49 +27,80 @@ from estimator.evaluate.batch import (
     estimate_device,
     in_order,
 )
-from estimator.io.dataset import Dataset, FrameRecord
+from estimator.io.dataset import Dataset, FrameRecord, read_dataset
 from estimator.io.estimates import EstimateRow
 from estimator.methods.registry import Registry
 from estimator.methods.variant import Variant
 
+BURSTS_AHEAD = 4
+"""Bursts of the next datasets that wait for each process, so that none is idle at the end of a dataset."""
+
 
 def estimate_with_workers(
-    dataset: Dataset, names: Sequence[str], workers: int, on_frame: Callable[[], None]
-) -> dict[str, tuple[EstimateRow, ...]]:
-    """Rows as by `estimate_dataset`, for variants given by name; each of `workers` processes looks them up itself.
+    datasets: Iterable[Dataset], names: Sequence[str], workers: int, on_frame: Callable[[], None]
+) -> Iterator[dict[str, tuple[EstimateRow, ...]]]:
+    """Rows of each dataset as by `estimate_dataset`, for variants given by name.
 
-    Raises InputError for an unknown name, and if a process dies.
+    The same `workers` processes estimate all datasets; each looks the variants up itself, and reads a dataset from its
+    folder. Raises InputError for an unknown name, and if a process dies.
     """
     registry = Registry.read()
     variants = [registry.named(name) for name in names]
-    todo = bursts(dataset)
-    workers = min(workers, len(todo))
     if workers <= 1:
-        return estimate_dataset(dataset, variants, on_frame)
+        for dataset in datasets:
+            yield estimate_dataset(dataset, variants, on_frame)
+        return
     # A forked child of a process with threads may hang: spawn.
     pool = ProcessPoolExecutor(
-        workers, multiprocessing.get_context("spawn"), _start, (dataset, tuple(names), max(1, _cores() // workers))
+        workers, multiprocessing.get_context("spawn"), _start, (tuple(names), max(1, _cores() // workers))
     )
+    begun: deque[_Begun] = deque()
     try:
+        for dataset in datasets:
+            begun.append(_Begun.of(pool, dataset))
+            while sum(len(one.tasks) for one in begun) - len(begun[0].tasks) >= BURSTS_AHEAD * workers:
+                yield begun.popleft().finished(pool, variants, on_frame)
+        while begun:
+            yield begun.popleft().finished(pool, variants, on_frame)
+    except BrokenProcessPool:
+        raise InputError(
+            "a worker process died (out of memory?); the dataset's estimates were not written; try fewer --workers"
+        ) from None
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+@dataclass(frozen=True, eq=False)
+class _Begun:
+    """A dataset whose bursts wait for processes, or are estimated."""
+
+    dataset: Dataset
+    tasks: tuple[tuple[tuple[FrameRecord, ...], "Future[ShotResult]"], ...]
+
+    @classmethod
+    def of(cls, pool: ProcessPoolExecutor, dataset: Dataset) -> "_Begun":
+        """Submit the bursts of a dataset."""
         with _interrupts_deferred():  # submit() starts child processes
-            tasks = [pool.submit(_work, records) for records in todo]
+            tasks = [(records, pool.submit(_work, dataset.folder, records)) for records in bursts(dataset)]
+        return cls(dataset, tuple(tasks))
+
+    def finished(
+        self, pool: ProcessPoolExecutor, variants: Sequence[Variant], on_frame: Callable[[], None]
+    ) -> dict[str, tuple[EstimateRow, ...]]:
+        """Rows of the dataset, when all its bursts and then its devices are estimated."""
         results = []
-        for records, task in zip(todo, tasks, strict=True):
+        for records, task in self.tasks:
             results.append(task.result())
             for _ in records:
                 on_frame()
         of_devices = devices(results)
-        solving = [pool.submit(_solve, device) for device in of_devices]
+        solving = [pool.submit(_solve, self.dataset.folder, device) for device in of_devices]
         solved = []
         for device, solution in zip(of_devices, solving, strict=True):
             solved.append(solution.result())
             for _ in next(iter(device.values())):
                 on_frame()
-    except BrokenProcessPool:
-        raise InputError("a worker process died (out of memory?); nothing was written; try fewer --workers") from None
-    finally:
-        pool.shutdown(cancel_futures=True)
-    return in_order(dataset, variants, [*(result.rows for result in results), *solved])
+        return in_order(self.dataset, variants, [*(result.rows for result in results), *solved])
 
 
 @contextmanager
@@ -94,16 +129,16 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-_worker_state: tuple[Dataset, list[Variant]]
-"""Dataset and variants of a worker process, set as it starts."""
+_worker_variants: list[Variant]
+"""Variants of a worker process, set as it starts."""
 
 
-def _start(dataset: Dataset, names: Sequence[str], threads: int) -> None:
-    global _worker_state
+def _start(names: Sequence[str], threads: int) -> None:
+    global _worker_variants
     threading.Thread(target=_exit_with_parent, daemon=True).start()
     cv2.setNumThreads(threads)
     registry = Registry.read()
-    _worker_state = dataset, [registry.named(name) for name in names]
+    _worker_variants = [registry.named(name) for name in names]
 
 
 def _exit_with_parent() -> None:
@@ -114,11 +149,15 @@ def _exit_with_parent() -> None:
         os._exit(1)
 
 
-def _work(records: tuple[FrameRecord, ...]) -> ShotResult:
-    dataset, variants = _worker_state
-    return estimate_burst(dataset, records, variants)
+@lru_cache(maxsize=2)
+def _dataset(folder: Path) -> Dataset:
+    """A dataset of which a worker process estimates several bursts; it may have begun the next one."""
+    return read_dataset(folder)
 
 
-def _solve(observed: dict[str, list[Observed]]) -> Rows:
-    dataset, variants = _worker_state
-    return estimate_device(dataset, observed, variants)
+def _work(folder: Path, records: tuple[FrameRecord, ...]) -> ShotResult:
+    return estimate_burst(_dataset(folder), records, _worker_variants)
+
+
+def _solve(folder: Path, observed: Mapping[str, list[Observed]]) -> Rows:
+    return estimate_device(_dataset(folder), observed, _worker_variants)

@@ -44,7 +44,9 @@ from estimator.io.records import (
     missing_key,
     read_rows,
 )
+from estimator.io.shard import frame_of_shard
 from estimator.io.shutter import Gyroscope
+from estimator.io.sweep import read_sweep
 
 FORMAT_VERSION = 4
 SPOT_TYPE = pa.struct([("led", pa.int64()), ("u_px", pa.float64()), ("v_px", pa.float64())])
@@ -64,6 +66,8 @@ FRAME_COLUMNS = {
     "start_s": pa.float64(),
     "gyro_rad_s": pa.list_(pa.float64()),
 }
+OPTIONAL_FRAME_COLUMNS = {"part": pa.int64()}
+"""Null in a set whose files hold one frame each; sets without it are such."""
 
 
 class FrameRecord(Row):
@@ -83,6 +87,7 @@ class FrameRecord(Row):
     burst: int = Field(ge=0, le=INT64_MAX)
     start_s: Number
     gyro_rad_s: Triple | None
+    part: int | None = Field(default=None, ge=0)
 
     @field_validator("file")
     @classmethod
@@ -181,6 +186,8 @@ def read_dataset(path: str | Path) -> Dataset:
     try:
         content = description_path.read_bytes()
     except FileNotFoundError:
+        if (sweep := read_sweep(folder)) is not None:
+            raise InputError(f"{folder}: a sweep; needed one dataset, such as {sweep.cells[0]}") from None
         raise InputError(f"{folder}: not a dataset (it has no dataset.json)") from None
     except OSError as error:
         raise InputError(f"{description_path}: {error.strerror or error}") from None
@@ -201,7 +208,7 @@ def read_dataset(path: str | Path) -> Dataset:
         accelerometer=description.accelerometer,
         leds=leds_by_id(description.led_map or ()),
         room_m=description.room_m,
-        frames=read_rows(folder / "frames.parquet", FRAME_COLUMNS, FrameRecord),
+        frames=read_rows(folder / "frames.parquet", FRAME_COLUMNS, FrameRecord, OPTIONAL_FRAME_COLUMNS),
         luminaires=luminaires_by_id(description.luminaires, description.led_map or ()),
         map_datum=description.map_datum,
         gyroscope=description.gyroscope,
@@ -318,13 +325,7 @@ def _shot(dataset: Dataset, record: FrameRecord) -> tuple[FrameRecord, ...]:
 
 
 def _read_exr(folder: Path, record: FrameRecord, camera: Camera) -> tuple[Part, ...]:
-    try:
-        data = (folder / record.file).read_bytes()
-    except OSError as error:
-        raise InputError(f"{record.file}: {error.strerror or error}") from None
-    # The decoder accepts most flipped bits as pixels; the hash alone detects them.
-    if hashlib.sha256(data).hexdigest() != record.sha256.lower():
-        raise InputError(f"{record.file}: damaged or changed (its sha256 is not the one in frames.parquet)")
+    data = _file_of(folder, record)
     try:
         with OpenEXR.File(io.BytesIO(data), header_only=True) as file:
             boxes = _check_headers(record, [part.header for part in file.parts], camera)
@@ -344,6 +345,22 @@ def _read_exr(folder: Path, record: FrameRecord, camera: Camera) -> tuple[Part, 
             raise InputError(f"{record.file}: channel Y has to hold 32-bit unsigned integers, one a pixel")
         parts.append(Part(int(box[0, 1]), int(box[0, 0]), np.asarray(image, dtype=np.uint32)))
     return tuple(parts)
+
+
+def _file_of(folder: Path, record: FrameRecord) -> bytes:
+    """An intact EXR file of a frame alone. The decoder accepts most flipped bits as pixels; the hash detects them."""
+    path, sha256 = folder / record.file, record.sha256.lower()
+    try:
+        if record.part is not None:
+            return frame_of_shard(path, sha256, record.frame, record.part)
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{record.file}: {error.strerror or error}") from None
+    except InputError as error:
+        raise InputError(f"{record.file}: {error}") from None
+    if hashlib.sha256(data).hexdigest() != sha256:
+        raise InputError(f"{record.file}: damaged or changed (its sha256 is not the one in frames.parquet)")
+    return data
 
 
 def _check_headers(record: FrameRecord, headers: list[dict[str, object]], camera: Camera) -> list[NDArray[np.int64]]:

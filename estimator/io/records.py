@@ -1,7 +1,10 @@
 """Parquet files as validated rows, and one-line messages about invalid ones."""
 
-from collections.abc import Iterable, Mapping, Sequence
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, TypeVar
 
 import numpy as np
@@ -98,26 +101,59 @@ def missing_key(value: object) -> str | None:
     return None
 
 
-def read_rows(path: Path, columns: Mapping[str, pa.DataType], row: type[RowT]) -> tuple[RowT, ...]:
-    """Read the named columns of a Parquet file as rows of a model; other columns are ignored.
+def read_rows(
+    path: Path,
+    columns: Mapping[str, pa.DataType],
+    row: type[RowT],
+    optional: Mapping[str, pa.DataType] = MappingProxyType({}),
+) -> tuple[RowT, ...]:
+    """Read the named columns of a Parquet file as rows of a model, the optional ones if there; others are ignored.
 
     Raises InputError if the file is missing or damaged, a column is missing or of another type, or a value is not
     allowed.
     """
+    with _parquet(path) as file:
+        there = {name: kind for name, kind in optional.items() if name in file.schema_arrow.names}
+        _check_columns(path, file.schema_arrow, {**columns, **there})
+        records = file.read(columns=[*columns, *there]).to_pylist()
+    try:
+        return tuple(TypeAdapter(list[row]).validate_python(records))  # type: ignore[valid-type]
+    except ValidationError as error:
+        raise InputError(f"{path}: row {first_problem(error)}") from None
+
+
+def read_scalars(path: Path) -> dict[str, list[float | str | None]]:
+    """Columns of a Parquet file that hold one number or text a row, by name; a truth value is 1 or 0.
+
+    Raises InputError if the file is missing or damaged, or a number is not finite.
+    """
+    with _parquet(path) as file:
+        names = [field.name for field in file.schema_arrow if _is_scalar(field.type)]
+        columns: dict[str, list[float | str | None]] = file.read(columns=names).to_pydict()
+    for name, column in columns.items():
+        for index, value in enumerate(column):
+            if isinstance(value, float) and not math.isfinite(value):
+                raise InputError(f"{path}: row {index}: {name}: has to be a finite number (got {value})")
+    return columns
+
+
+def _is_scalar(kind: pa.DataType) -> bool:
+    number = pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)
+    return bool(number or pa.types.is_string(kind) or pa.types.is_large_string(kind))
+
+
+@contextmanager
+def _parquet(path: Path) -> Iterator[pq.ParquetFile]:
+    """An open Parquet file; what fails while it is open becomes an InputError."""
     try:
         with pq.ParquetFile(path) as file:
-            _check_columns(path, file.schema_arrow, columns)
-            records = file.read(columns=list(columns)).to_pylist()
+            yield file
     except InputError:
         raise
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except (pa.ArrowException, OSError, ValueError, MemoryError) as error:
         raise InputError(f"{path}: not a readable Parquet file ({first_line(error)})") from None
-    try:
-        return tuple(TypeAdapter(list[row]).validate_python(records))  # type: ignore[valid-type]
-    except ValidationError as error:
-        raise InputError(f"{path}: row {first_problem(error)}") from None
 
 
 def _check_columns(path: Path, schema: pa.Schema, columns: Mapping[str, pa.DataType]) -> None:

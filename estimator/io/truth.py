@@ -1,4 +1,4 @@
-"""True positions of the frames and LEDs. Only the scorer imports this module, which alone opens the truth's files."""
+"""True positions of the frames and LEDs. Scores and tables alone import this module, which opens the truth's files."""
 
 from pathlib import Path
 from typing import Annotated
@@ -7,7 +7,7 @@ import pyarrow as pa
 from pydantic import Field, Strict
 
 from estimator.errors import InputError
-from estimator.io.records import Covariance, LedId, Number, Positive, Row, Size, Triple, read_rows
+from estimator.io.records import Covariance, LedId, Number, Positive, Row, Size, Triple, read_rows, read_scalars
 
 COLUMNS = {
     "frame": pa.int64(),
@@ -88,3 +88,19 @@ def read_truth(path: Path, frame_count: int) -> tuple[TruthRow, ...]:
     if [row.frame for row in rows] != list(range(frame_count)):
         raise InputError(f"{path}: {len(rows)} rows, needed one for each of the {frame_count} frames, in order")
     return rows
+
+
+SWEPT = "sweep_"
+"""Start of the names of the columns with the values of a sweep."""
+
+
+def read_true_scalars(path: Path, frame_count: int) -> dict[str, list[float | str | None]]:
+    """Columns of truth.parquet that hold one number or text a frame, by name; raises InputError as `read_truth`.
+
+    Among them are `tilt_x_deg`, `tilt_y_deg`, `yaw_deg` and, in a cell of a sweep, `sweep_NAME` for each swept name.
+    """
+    columns = read_scalars(path)
+    for name, column in columns.items():
+        if len(column) != frame_count:
+            raise InputError(f"{path}: {len(column)} values of {name!r}, needed one for each of {frame_count} frames")
+    return columns

@@ -1,23 +1,16 @@
 """Plot of levels: every variant's RMSE against the bound of each of several datasets, as SVG."""
 
 from collections.abc import Sequence
-from html import escape
 
 from estimator.evaluate.levels import Level, variants_of
 from estimator.evaluate.score_table import length_text
 from estimator.report.figures import Decades
-from estimator.report.svg import line, mark, picture, style_of_variants, text
+from estimator.report.svg import line, mark, picture, style_of_variants, svg_file, text
 
 WIDTH, HEIGHT = 560, 420
 LEFT, TOP, BOTTOM = 72, 44, 44
 LEGEND = 250
 LINE = 18
-STYLE = """svg { background: #fff; font: 12px system-ui, sans-serif; }
-svg text { fill: #444; }
-svg path { fill: none; stroke-width: 1.6; }
-svg .rule { stroke: #dde2e6; }
-svg .bound { stroke: #1c2024; stroke-width: 2; }
-svg .mark { stroke: none !important; }"""
 
 
 def level_plot(levels: Sequence[Level]) -> str:
@@ -72,9 +65,4 @@ def level_plot(levels: Sequence[Level]) -> str:
 
 def level_picture(levels: Sequence[Level]) -> str:
     """The plot as a file of its own, with its styles."""
-    style = f"{STYLE}\n{style_of_variants(len(variants_of(levels)))}"
-    element = level_plot(levels)
-    head, body = element.split(">", 1)
-    size = head.split('viewBox="0 0 ')[1].split('"')[0].split()
-    root = f'{head} xmlns="http://www.w3.org/2000/svg" width="{size[0]}" height="{size[1]}"'
-    return f"{root}>\n<style>{escape(style, quote=False)}</style>{body}\n"
+    return svg_file(level_plot(levels), style_of_variants(len(variants_of(levels))))

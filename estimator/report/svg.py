@@ -1,5 +1,6 @@
-"""Inline SVG for the report: lines, text, and the marks and colours of the variants."""
+"""SVG for the report and for files: lines, text, and the marks and colours of the variants."""
 
+import hashlib
 from collections.abc import Sequence
 from html import escape
 
@@ -14,6 +15,32 @@ MARKS = (
     ((0.0, -1.35), (1.35, 0.0), (0.0, 1.35), (-1.35, 0.0)),
 )
 DASHES = ("none", "7 3", "2 3", "9 3 2 3")
+FILE_STYLE = """svg { background: #fff; font: 12px system-ui, sans-serif; }
+svg text { fill: #444; }
+svg path { fill: none; stroke-width: 1.6; }
+svg .rule { stroke: #dde2e6; }
+svg .bound { stroke: #1c2024; stroke-width: 2; }
+svg .mark { stroke: none !important; }"""
+"""Style of a file; the report's page has its own."""
+
+
+def slots_of(groups: Sequence[tuple[str, str]], known: Sequence[str]) -> list[int]:
+    """Index of the mark and colour of each group, given by a name, which fixes them, and what else tells it apart.
+
+    That of a name is its place in `known`, or one by its hash. Groups of one name have its colour, and the marks from
+    its own on. A group whose place another one has takes the next that is free.
+    """
+    places = len(COLOURS) * len(MARKS)
+    others = sorted({other for _, other in groups})
+    taken: dict[tuple[str, str], int] = {}
+    for name, other in sorted(groups, key=lambda group: (group[0] not in known, group)):
+        digest = hashlib.sha256(name.encode()).digest()
+        slot = known.index(name) if name in known else int.from_bytes(digest[:4], "big")
+        slot += len(COLOURS) * others.index(other)
+        if len(taken) < places:
+            slot = next(one for one in range(slot, slot + places) if one % places not in taken.values())
+        taken[name, other] = slot % places
+    return [taken[group] for group in groups]
 
 
 def style_of_variants(count: int) -> str:
@@ -30,6 +57,15 @@ def picture(width: float, height: float, label: str, parts: Sequence[str]) -> st
     """SVG element as wide as its container, with a label for screen readers."""
     body = "\n".join(parts)
     return f'<svg viewBox="0 0 {width:.0f} {height:.0f}" role="img" aria-label="{escape(label)}">\n{body}\n</svg>'
+
+
+def svg_file(element: str, style: str) -> str:
+    """A `picture` as a file of its own, with its styles."""
+    head, body = element.split(">", 1)
+    size = head.split('viewBox="0 0 ')[1].split('"')[0].split()
+    root = f'{head} xmlns="http://www.w3.org/2000/svg" width="{size[0]}" height="{size[1]}"'
+    whole = escape(f"{FILE_STYLE}\n{style}", quote=False)
+    return f"{root}>\n<style>{whole}</style>{body}\n"
 
 
 def key(index: int) -> str:

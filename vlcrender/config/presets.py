@@ -31,12 +31,14 @@ def preset(kind: str, name: str) -> dict[str, Any]:
     return read_toml(FOLDER / kind / f"{name}.toml")
 
 
-def with_presets(tree: Mapping[str, Any], assignments: Iterable[str], source: str) -> dict[str, Any]:
+def with_presets(
+    tree: Mapping[str, Any], assignments: Iterable[str], source: str, how: str = "--set "
+) -> dict[str, Any]:
     """A recipe's tree with presets inserted and `key=value` assignments applied (see `toml_model.override`).
 
     Keys of the recipe override a preset that it names. A preset named by an assignment replaces the recipe's table; a
     camera's replaces the sensor's table too. Other assignments override everything. Raises InputError that starts with
-    `source` for an unknown preset.
+    `source` for an unknown preset, with `how` for an impossible assignment.
     """
     given = list(assignments)
     chosen = {key: [a for a in given if a.partition("=")[0].strip() == f"{key}.preset"] for key in KINDS}
@@ -47,12 +49,12 @@ def with_presets(tree: Mapping[str, Any], assignments: Iterable[str], source: st
             own = {**tree, key: {name: value for name, value in table.items() if name != "preset"}}
             tree = _merged(_named(kind, key, table["preset"], source), own)
         for assignment in chosen[key]:
-            name = override({}, [assignment])[key]["preset"]
+            name = override({}, [assignment], how)[key]["preset"]
             named = _named(kind, key, name, source)
             replaced = named if key == "camera" else (key,)
             # No key of another preset remains.
             tree = _merged({**tree, **{table: _kept(tree, table) for table in replaced}}, named)
-    return override(tree, [a for a in given if not any(a in of_key for of_key in chosen.values())])
+    return override(tree, [a for a in given if not any(a in of_key for of_key in chosen.values())], how)
 
 
 def _kept(tree: Mapping[str, Any], key: str) -> dict[str, Any]:

@@ -50,26 +50,54 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: is not TOML: {error}") from None
 
 
-def override(tree: dict[str, Any], assignments: Iterable[str]) -> dict[str, Any]:
-    """A copy of `tree` with `key=value` assignments applied. Keys are dotted; values are TOML or bare words.
+def override(tree: Mapping[str, Any], assignments: Iterable[str], how: str = "--set ") -> dict[str, Any]:
+    """A copy of `tree` with `key=value` assignments applied. Values are TOML or bare words.
 
-    Raises InputError for an assignment without a key or value, and for a key below a value that is no table.
+    Keys are dotted. An item of a list has its number, counted from 0, or as a table its `name`: `rig.left.yaw`.
+    Raises InputError, which starts with `how`, for an assignment without a key or value, for a key below a value that
+    is no table, and for an item that a list has not.
     """
     result = dict(tree)
     for assignment in assignments:
         key, equals, text = assignment.partition("=")
-        if not equals or not all(part.strip() for part in key.split(".")):
-            raise InputError(f"--set {assignment}: is not key=value; write, for example, --set camera.f_number=2.8")
-        *parents, last = (part.strip() for part in key.split("."))
-        table = result
-        for parent in parents:
-            below = table.get(parent, {})
-            if not isinstance(below, dict):
-                raise InputError(f"--set {assignment}: {parent} is not a table of the recipe")
-            table[parent] = dict(below)  # a copy: `tree` is not changed
-            table = table[parent]
-        table[last] = _value(text)
+        parts = [part.strip() for part in key.split(".")]
+        if not equals or not all(parts):
+            raise InputError(f"{how}{assignment}: is not key=value; write, for example, --set camera.f_number=2.8")
+        node: Any = result
+        for parent in parts[:-1]:
+            place = _place(node, parent, f"{how}{assignment}")
+            below = node.get(place, {}) if isinstance(node, dict) else node[place]
+            if not isinstance(below, dict | list):
+                raise InputError(f"{how}{assignment}: {parent} is not a table of the recipe")
+            copied = dict(below) if isinstance(below, dict) else list(below)  # `tree` is not changed
+            node[place] = copied
+            node = copied
+        node[_place(node, parts[-1], f"{how}{assignment}")] = _value(text)
     return result
+
+
+def _place(node: dict[str, Any] | list[Any], part: str, source: str) -> Any:
+    """The key of a table, or the index of the item of a list that a part of a dotted key names."""
+    if isinstance(node, dict):
+        return part
+    names = [item.get("name") if isinstance(item, dict) else None for item in node]
+    if part in names:
+        return names.index(part)
+    if part.isdecimal() and int(part) < len(node):
+        return int(part)
+    known = ", ".join(name for name in names if isinstance(name, str))
+    raise InputError(f"{source}: no item {part}: {len(node)} items, numbered from 0{known and f' or named {known}'}")
+
+
+def toml_text(value: object, source: str) -> str:
+    """A value as TOML has it. Raises InputError, which starts with `source`, for one that TOML has not."""
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{json.dumps(str(k))} = {toml_text(v, source)}" for k, v in value.items()) + "}"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(toml_text(item, source) for item in value) + "]"
+    if isinstance(value, bool | int | float | str):
+        return json.dumps(value, ensure_ascii=False)
+    raise InputError(f"{source} = {value!r}: has to be a number, a text, true or false, a list or a table")
 
 
 def _value(text: str) -> Any:

@@ -13,6 +13,8 @@ from vlcrender.rendering.expected_image import ExpectedImage
 
 MaxTime = Annotated[float, Field(gt=0, le=100)]
 """Longest exposure time, seconds."""
+MIN_LEVEL_DB = -60.0
+"""Smallest noise level that an exposure time is chosen for: 10^6 electrons in a pixel."""
 
 
 class PeakMetering(Settings):
@@ -35,12 +37,13 @@ class NoiseLevelMetering(Settings):
     """Expose for a noise level at the brightest LED pixel of the noise-free image.
 
     Photon noise of mean lambda has the noise power over signal power 1 / lambda, which is -10 log10(lambda) dB. This is
-    our reading of the noise levels of Huynh & Yoo 2016, Fig. 9, which the paper does not define.
+    our reading of the noise levels of Huynh & Yoo 2016, Fig. 9, which the paper does not define. `[added_noise]` with
+    relative_to = "photon" is the same.
     """
 
     kind: Literal["noise-level"]
     """Metering method."""
-    level_db: Annotated[float, Field(ge=-60, le=30)]
+    level_db: Annotated[float, Field(ge=MIN_LEVEL_DB, le=30)]
     """Noise power over signal power, dB."""
     max_s: MaxTime = 1.0
     """Longest exposure time, seconds; also the time of a frame without LED light."""

@@ -18,8 +18,9 @@ from vlcrender.camera.rig import MAIN, Mounted
 from vlcrender.camera.roi import RegionImage
 from vlcrender.core.warn_once import warn_once
 from vlcrender.dataset.bound_uncertainty import uncertainty_of
+from vlcrender.dataset.plan import Plan
 from vlcrender.dataset.pose_sampling import pose_of_frame
-from vlcrender.dataset.recipe import Plan, Recipe
+from vlcrender.dataset.recipe import Recipe
 from vlcrender.dataset.true_world import tilt_sigmas_deg
 from vlcrender.errors import InputError
 from vlcrender.rendering.bayer import MosaicRenderer
@@ -144,6 +145,8 @@ def error_budget(
     without noise, and where no pose determines a position.
     """
     recipe, scene = plan.recipe, plan.scene
+    if plan.cells is not None:
+        raise InputError("budget: is of one recipe; remove [[sweep]], or --set sweep=[]")
     mounted = _mounted(recipe, camera)
     if recipe.motion is not None:
         raise InputError("budget: needs a camera at rest; remove [motion]")
@@ -157,7 +160,8 @@ def error_budget(
     parts = _parts(recipe, mounted)
     scales_without = [{part.effect: float(np.sqrt(max(0.0, 1.0 - part.share)))} for part in parts]
     of_scene = renderer()
-    numbers = np.unique(np.linspace(0, recipe.poses.count - 1, min(poses, recipe.poses.count)).round().astype(int))
+    made = recipe.pose_numbers
+    numbers = np.unique(np.linspace(made[0], made[-1], min(poses, len(made))).round().astype(int))
     shares, trusting, exact, bounds, leds, luminaires = [], [], [], [], [], []
     for done, number in enumerate(numbers.tolist()):
         model, of_pixels = spot_errors_at(plan, of_scene, mounted, number, uncertainty, bound)
@@ -231,15 +235,14 @@ def spot_errors_at(
     exposure_s = recipe.time_s(view)
     tilts = tilt_sigmas_deg(recipe, main)
 
+    expected = [RegionImage(part.roi, part.expected_electrons(exposure_s)) for part in view.parts]
+    added_dn = recipe.added_noise_dn(expected) or 0.0
     slopes = FrameSlopes.rendered(
         mounted,
         main,
         partial(renderer.led_slopes, regions=recipe.regions),
         exposure_s,
-        [
-            RegionImage(part.roi, variance_e2(recipe.sensor, part.expected_electrons(exposure_s), exposure_s))
-            for part in view.parts
-        ],
+        [RegionImage(roi, variance_e2(recipe.sensor, mean, exposure_s, added_dn)) for roi, mean in expected],
         float(np.median(np.linalg.norm(scene.leds.centers_m - at.position_m, axis=1))),
         recipe.regions is not None and recipe.regions.overscan,
         halo_of=renderer.halo_of(mounted.camera),

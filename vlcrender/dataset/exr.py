@@ -1,5 +1,6 @@
 """EXR files of frames: regions of a sensor as parts, with the standard attributes of the exposure."""
 
+import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,26 +21,38 @@ def write_exr(path: Path, images: Sequence[RegionImage], sensor: Roi, attributes
 
     The file appears whole or not at all. Raises InputError where it cannot be written.
     """
-    header = {
-        "compression": OpenEXR.PIZ_COMPRESSION,
-        "type": OpenEXR.scanlineimage,
-        "displayWindow": _box(sensor),
-        **attributes,
-    }
     names = [f"region {number}" for number in range(len(images))] if len(images) > 1 else [""]
-    parts = [
-        OpenEXR.Part({**header, "dataWindow": _box(roi)}, {"Y": np.ascontiguousarray(image)}, name)
-        for name, (roi, image) in zip(names, images, strict=True)
-    ]
     partial = path.with_suffix(".partial")
     try:
-        OpenEXR.File(parts).write(str(partial))
+        OpenEXR.File(_parts(images, sensor, attributes, names)).write(str(partial))
     except RuntimeError as error:  # OpenEXR raises it for a full disk as well
         partial.unlink(missing_ok=True)
         raise InputError(f"{path}: cannot be written: {' '.join(str(error).split())}") from None
     digest = sha256_of(partial)
     replace_durably(partial, path)
     return digest
+
+
+def exr_bytes(images: Sequence[RegionImage], sensor: Roi, attributes: Mapping[str, Any], names: Sequence[str]) -> bytes:
+    """The file of `write_exr` with these names of its parts, not written."""
+    buffer = io.BytesIO()
+    OpenEXR.File(_parts(images, sensor, attributes, names)).write(buffer)
+    return buffer.getvalue()
+
+
+def _parts(
+    images: Sequence[RegionImage], sensor: Roi, attributes: Mapping[str, Any], names: Sequence[str]
+) -> list[OpenEXR.Part]:
+    header = {
+        "compression": OpenEXR.PIZ_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
+        "displayWindow": _box(sensor),
+        **attributes,
+    }
+    return [
+        OpenEXR.Part({**header, "dataWindow": _box(roi)}, {"Y": np.ascontiguousarray(image)}, name)
+        for name, (roi, image) in zip(names, images, strict=True)
+    ]
 
 
 def _box(roi: Roi) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
@@ -50,8 +63,9 @@ def _box(roi: Roi) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
 
 @dataclass(frozen=True)
 class ExrPart:
-    """One part of an EXR file: its region, the whole sensor, and the type of its pixels."""
+    """One part of an EXR file: its name, its region, the whole sensor, and the type of its pixels."""
 
+    name: str
     roi: Roi
     sensor: Roi
     dtype: np.dtype[Any]
@@ -63,6 +77,7 @@ def read_exr_parts(path: Path) -> list[ExrPart]:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             return [
                 ExrPart(
+                    part.header.get("name", ""),
                     _roi(part.header["dataWindow"]),
                     _roi(part.header["displayWindow"]),
                     part.channels["Y"].pixels.dtype,

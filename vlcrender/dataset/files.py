@@ -3,13 +3,15 @@
 import hashlib
 import json
 import os
+import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from vlcrender.config.toml_model import check
+from vlcrender.config.toml_model import S, check
 from vlcrender.dataset.schema import FORMAT_VERSION, DatasetFile
+from vlcrender.dataset.sweep import SWEEP_FILE, SWEEP_FORMAT, SWEEP_VERSION, SweepFile
 from vlcrender.errors import InputError
 
 FRAMES, EXPECTED, PREVIEWS, PROCESSED = "frames", "expected", "previews", "processed"
@@ -41,6 +43,20 @@ def replace_durably(partial: Path, path: Path) -> None:
     os.replace(partial, path)
 
 
+def link_or_copy(source: Path, path: Path) -> None:
+    """Make `path` the file `source`, or a copy of it where the file system cannot link; it appears whole or not at all.
+
+    Raises InputError where it cannot be written.
+    """
+    with whole_file(path) as partial:
+        partial.unlink(missing_ok=True)
+        try:
+            os.link(source, partial)
+        except OSError:
+            shutil.copyfile(source, partial)
+    partial.unlink(missing_ok=True)  # a rename of one name of a file to another leaves both
+
+
 def first_line(text: str) -> str:
     """The first line of a text, such as a library's error message."""
     return (text.splitlines() or [""])[0]
@@ -61,17 +77,25 @@ def read_dataset_file(directory: Path) -> DatasetFile:
             "the dataset is unfinished; run the same generate again" if unfinished else "the folder holds no dataset"
         )
         raise InputError(f"{directory}: is not a complete dataset: dataset.json is missing: {advice}")
+    return _read_json(path, DatasetFile, "vlcrender-dataset", FORMAT_VERSION)
+
+
+def read_sweep_file(directory: Path) -> SweepFile:
+    """Read and check sweep.json. Raises InputError."""
+    return _read_json(directory / SWEEP_FILE, SweepFile, SWEEP_FORMAT, SWEEP_VERSION)
+
+
+def _read_json(path: Path, model: type[S], form: str, version: int) -> S:
+    """The model of a JSON file with this `format` and `version`."""
     try:
         tree = json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError, OSError) as error:
         raise InputError(f"{path}: cannot be read as JSON: {error}") from None
     if not isinstance(tree, dict):
         raise InputError(f"{path}: is not a JSON object")
-    if tree.get("format") != "vlcrender-dataset":
-        raise InputError(f"{path}: format = {json.dumps(tree.get('format'))}: has to be vlcrender-dataset")
-    if tree.get("version") != FORMAT_VERSION:
+    if tree.get("format") != form:
+        raise InputError(f"{path}: format = {json.dumps(tree.get('format'))}: has to be {form}")
+    if tree.get("version") != version:
         found = json.dumps(tree.get("version"))
-        raise InputError(
-            f"{path}: version = {found}: this program reads version {FORMAT_VERSION}; generate the dataset again"
-        )
-    return check(tree, DatasetFile, str(path))
+        raise InputError(f"{path}: version = {found}: this program reads version {version}; generate the dataset again")
+    return check(tree, model, str(path))

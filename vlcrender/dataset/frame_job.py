@@ -1,27 +1,27 @@
 """One frame of a dataset: render, expose, write its files, and return its rows."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property, lru_cache, partial
+from functools import lru_cache
+from itertools import groupby
 from pathlib import Path
 from typing import Self
 
-import numpy as np
-
 from vlcrender.camera.intrinsics import Camera, Pose
-from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.rig import Mounted
-from vlcrender.camera.roi import RegionImage, Roi
+from vlcrender.camera.roi import Roi
 from vlcrender.core.random_keys import random_key, stream
-from vlcrender.dataset.bound_uncertainty import uncertainty_of
+from vlcrender.dataset.dependence import Seen, keyed_recipe
 from vlcrender.dataset.downlink import decoded_spots
 from vlcrender.dataset.exr import exr_attributes, write_exr
-from vlcrender.dataset.files import EXPECTED, FRAMES, PREVIEWS, PROCESSED
+from vlcrender.dataset.files import EXPECTED, FRAMES, PREVIEWS, PROCESSED, link_or_copy
 from vlcrender.dataset.motion import poses_during
+from vlcrender.dataset.plan import Plan
 from vlcrender.dataset.pose_sampling import pose_of_frame
 from vlcrender.dataset.preview import write_preview
-from vlcrender.dataset.recipe import Plan, Recipe
-from vlcrender.dataset.schema import Flat9, FrameRecord, FrameRow, LedTruth, SpotRow, TruthRow, five, flat9, triple
+from vlcrender.dataset.recipe import Recipe
+from vlcrender.dataset.schema import FrameRecord, FrameRow, LedTruth, SpotRow, TruthRow, five, flat9, triple
+from vlcrender.dataset.shard import Shard
 from vlcrender.dataset.true_world import (
     built_leds,
     device_of_pose,
@@ -30,23 +30,27 @@ from vlcrender.dataset.true_world import (
     map_of_device,
     reading_m_s2,
     shots_differ,
-    tilt_sigmas_deg,
     true_camera,
 )
+from vlcrender.dataset.views import View
 from vlcrender.light.lightmap import bake
-from vlcrender.modulation.exposure import LineGains, MeanWave
+from vlcrender.modulation.exposure import MeanWave
 from vlcrender.modulation.transmission import led_waves
 from vlcrender.modulation.wave import Wave
 from vlcrender.rendering.bayer import MosaicRenderer
-from vlcrender.rendering.crlb import FrameSlopes
-from vlcrender.rendering.expected_image import ExpectedImage, Gain, Gains, LedPatch
+from vlcrender.rendering.expected_image import LedPatch
 from vlcrender.rendering.readout import RollingPoses
 from vlcrender.rendering.renderer import Renderer
 from vlcrender.scene.loader import Scene, build_scene
 from vlcrender.scene.schema import SceneSettings
 from vlcrender.sensor.radiometry import detectors, electron_rate_per_cd_m2
 from vlcrender.sensor.sensor import Sensor
-from vlcrender.sensor.signal_chain import expose_regions, variance_e2
+from vlcrender.sensor.signal_chain import expose_regions
+
+MAX_SCENES = 8
+"""Scenes and renderers that a process keeps; the one used longest ago is dropped first."""
+MAX_WORLDS = 8
+"""Kept maps of a scene, each for recipes with the same views."""
 
 
 @dataclass(frozen=True)
@@ -62,56 +66,128 @@ class Job:
     def of(cls, plan: Plan, directory: Path) -> Self:
         """The job of a plan. In this process its frames use the plan's scene, which is not loaded again."""
         scene, folder = plan.scene.settings.model_dump_json(), str(plan.scene.folder)
-        _loaded.clear()
+        _loaded.pop((scene, folder), None)
         _loaded[scene, folder] = plan.scene
+        while len(_loaded) > MAX_SCENES:
+            del _loaded[next(iter(_loaded))]
         return cls(plan.recipe.model_dump_json(), scene, folder, str(directory))
 
 
 _loaded: dict[tuple[str, str], Scene] = {}
-"""The scene of the latest job that this process made, by its JSON and folder."""
+"""Scenes of the latest jobs that this process made, by their JSON and folder."""
 
 
-def make_frames(job: Job, frames: Sequence[int]) -> list[FrameRecord]:
-    """`make_frame` of several frames."""
-    return [make_frame(job, frame) for frame in frames]
+@dataclass(frozen=True)
+class Files:
+    """The files of a frame: their dataset, and what its row says of the file with its pixels."""
+
+    directory: Path
+    file: str
+    part: int | None
+    sha256: str
 
 
-def make_frame(job: Job, frame: int) -> FrameRecord:
+def make_frames(frames: Sequence[tuple[Job, int]]) -> list[FrameRecord]:
+    """`made_frames` of several frames, made."""
+    return list(made_frames(frames))
+
+
+def made_frames(frames: Iterable[tuple[Job, int]]) -> Iterator[FrameRecord]:
+    """`make_frame` of frames of one dataset, or of several cells of a sweep, one after another.
+
+    A frame with the same files as one before it, in another cell, is not exposed again: its files are that one's. Where
+    a file holds several frames, all of them are among `frames`.
+    """
+    made: dict[tuple[str, str, str, int], Files] = {}
+    for (job, _), of_file in groupby(frames, key=_file_of):
+        files_key = keyed_recipe(job.recipe_json).files_key
+        twins = {n: made.get((job.scene_json, job.scene_folder, files_key, n)) for _, n in of_file}
+        for record in _made_file(job, twins):
+            row = record.device
+            files = Files(Path(job.directory), row.file, row.part, row.sha256)
+            made.setdefault((job.scene_json, job.scene_folder, files_key, record.frame), files)
+            yield record
+
+
+def _file_of(job_and_frame: tuple[Job, int]) -> tuple[Job, int]:
+    """The dataset of a frame, and the number of its file."""
+    job, frame = job_and_frame
+    return job, frame // keyed_recipe(job.recipe_json).recipe.files.frames_per_file
+
+
+def _made_file(job: Job, twins: Mapping[int, Files | None]) -> Iterator[FrameRecord]:
+    """The frames of one file, by number, each with its twin if it has one: then all of a shard have."""
+    per_file = keyed_recipe(job.recipe_json).recipe.files.frames_per_file
+    if per_file == 1 or all(twins.values()):
+        yield from (make_frame(job, frame, twin) for frame, twin in twins.items())
+        return
+    shard = Shard(Path(job.directory), min(twins) // per_file)
+    records = [make_frame(job, frame, shard=shard) for frame in twins]
+    digest = shard.write()
+    yield from (record.with_digest(digest) for record in records)
+
+
+def make_frame(job: Job, frame: int, twin: Files | None = None, shard: Shard | None = None) -> FrameRecord:
     """Render, expose and write one frame, and return its rows; depends on nothing but its arguments.
 
-    A view that the frame before had too, such as that of a burst, is not rendered again.
+    A view that the frame before had too, such as that of a burst or of another cell of a sweep, is not rendered again.
+    twin: a frame with the same files, to which this one's are linked. shard: to which the frame is added, in place of a
+    file of its own; the record then has no digest yet.
     """
-    recipe, renderer = _renderer(job.recipe_json, job.scene_json, job.scene_folder)
-    directory = Path(job.directory)
-    pose_number, shot, which = recipe.place_of_frame(frame)
+    keyed = keyed_recipe(job.recipe_json)
+    recipe, directory = keyed.recipe, Path(job.directory)
+    first_shot = recipe.first_shot
+    number = first_shot * len(recipe.cameras) + frame  # among the frames of all poses: random numbers depend on it
+    pose_number, shot, which = recipe.place_of_frame(number)
     device = device_of_pose(recipe, pose_number)
     map_number = map_of_device(recipe, device)
     told = recipe.cameras[which]
     camera, sensor = told.camera, Roi.of_sensor(told.camera)
-    number = 0 if recipe.motion is None else shot % recipe.burst_frames
-    views = _views_at(job, pose_number, number, frame if shots_differ(recipe) else None)
+    place = pose_number, 0 if recipe.motion is None else shot % recipe.burst_frames
+    in_frame = number if shots_differ(recipe) else None
+    views = _views_at(job.scene_json, job.scene_folder, keyed.seen, *place, in_frame)
     if which not in views:
-        views[which] = _rendered(job, pose_number, number, which, frame if shots_differ(recipe) else None)
+        views[which] = _rendered(job, *place, which, in_frame)
     view = views[which]
-    image, pose, exposure_s = view.image, view.posed.pose, view.exposure_s
-    waves = _waves(job, map_number)
+    image, pose = view.image, view.posed.pose
+    waves = _world_of(job).waves(map_number)
     start_s = recipe.start_s(shot, bool(waves))
-    exposed = view.exposed(waves, start_s)
-    noise = random_key(recipe.seed, frame, "shot-noise")
-    of_device = device_sensor(recipe, device)
-    dn = expose_regions(of_device, exposed.expected, noise, exposure_s=exposure_s, camera=told.name)
-    attributes = exr_attributes(camera, told.name, exposure_s, frame)  # of the told camera: a reader sees them
-    file = f"{FRAMES}/{frame:06d}.exr"
-    digest = write_exr(directory / file, dn, sensor, attributes)
-    if recipe.expected:
-        write_exr(directory / EXPECTED / f"{frame:06d}.exr", exposed.expected, sensor, attributes)
-    preview = directory / PREVIEWS / f"{frame:06d}.png"
-    write_preview(preview, dn, sensor, recipe.sensor.largest_dn, recipe.sensor.black_level_dn)
-    if recipe.processed is not None:
-        picture = recipe.processed.develop(
-            dn[0][1], recipe.sensor, _white_balance(camera, recipe.sensor, renderer.scene)
+    exposure = view.exposure(recipe, keyed.files_key)
+    exposed = exposure.frame(waves, start_s)
+    file, part, digest = f"{FRAMES}/{frame:06d}.exr", None, ""
+    if twin is None:
+        of_device = device_sensor(recipe, device)
+        dn = expose_regions(
+            of_device,
+            exposed.expected,
+            random_key(recipe.seed, number, "shot-noise"),
+            exposure_s=exposure.exposure_s,
+            camera=told.name,
+            added=exposed.added(random_key(recipe.seed, number, "added-noise")),
         )
-        recipe.processed.write(directory / PROCESSED / f"{frame:06d}{recipe.processed.suffix}", picture)
+        # Of the told camera: readers see them.
+        attributes = exr_attributes(camera, told.name, exposure.exposure_s, frame)
+        if shard is None:
+            digest = write_exr(directory / file, dn, sensor, attributes)
+        else:
+            file, part = shard.file, shard.part_count
+            shard.add(frame, dn, sensor, attributes)
+        if recipe.expected:
+            write_exr(directory / EXPECTED / f"{frame:06d}.exr", exposed.expected, sensor, attributes)
+        if recipe.files.has_preview(frame):
+            preview = directory / PREVIEWS / f"{frame:06d}.png"
+            write_preview(preview, dn, sensor, recipe.sensor.largest_dn, recipe.sensor.black_level_dn)
+        if recipe.processed is not None:
+            balance = _white_balance(camera, recipe.sensor, view.renderer.scene)
+            picture = recipe.processed.develop(dn[0][1], recipe.sensor, balance)
+            recipe.processed.write(directory / PROCESSED / f"{frame:06d}{recipe.processed.suffix}", picture)
+    else:
+        file, part, digest = twin.file, twin.part, twin.sha256
+        if not part:  # once a shard
+            link_or_copy(twin.directory / file, directory / file)
+        for folder in (EXPECTED, PREVIEWS, PROCESSED):
+            for path in (twin.directory / folder).glob(f"{frame:06d}.*"):
+                link_or_copy(path, directory / folder / path.name)
     # The rig has one accelerometer: its error belongs to the shot. The device turns its reading by the told mounting.
     reading = told.rotation @ reading_m_s2(recipe, device, shot, view.main)
     gyro = None
@@ -119,18 +195,19 @@ def make_frame(job: Job, frame: int) -> FrameRecord:
         gyro = triple(told.rotation @ gyro_rad_s(recipe, recipe.gyroscope, device, shot))
     spots: tuple[SpotRow, ...] = ()
     if recipe.demodulation == "given":
-        spots = decoded_spots(image.parts, camera.width_px, stream(recipe.seed, frame, "demodulator"))
+        spots = decoded_spots(image.parts, camera.width_px, stream(recipe.seed, number, "demodulator"))
     known = FrameRow(
         frame=frame,
-        shot=shot,
-        burst=shot // recipe.burst_frames,
+        shot=shot - first_shot,
+        burst=(shot - first_shot) // recipe.burst_frames,
         start_s=start_s,
-        pose=pose_number,
+        pose=pose_number - recipe.pose_numbers.start,
         device=device,
         file=file,
+        part=part,
         sha256=digest,
         camera=told.name,
-        exposure_s=exposure_s,
+        exposure_s=exposure.exposure_s,
         capturable=all(sensor.contains(part.roi) for part in image.parts),
         accelerometer_m_s2=reading.tolist(),
         gyro_rad_s=gyro,
@@ -139,9 +216,10 @@ def make_frame(job: Job, frame: int) -> FrameRecord:
     angular = linear = None
     if recipe.motion is not None:
         angular, linear = map(triple, recipe.motion.velocities_of(view.mounted, view.middle))
+    bound_m2, bound_exact_m2 = exposed.bounds_m2(recipe)
     truth = TruthRow(
         frame=frame,
-        shot=shot,
+        shot=shot - first_shot,
         map=map_number,
         K=flat9(view.mounted.camera.matrix),
         distortion=five(view.mounted.camera.distortion),
@@ -156,8 +234,9 @@ def make_frame(job: Job, frame: int) -> FrameRecord:
             _led_truth(patch, waves.get(patch.led_id), start_s)
             for patch in sorted(image.patches, key=lambda patch: patch.led_id)
         ),
-        bound_m2=exposed.bound_m2,
-        bound_exact_m2=exposed.bound_exact_m2,
+        added_noise_dn=exposed.added_dn,
+        bound_m2=bound_m2,
+        bound_exact_m2=bound_exact_m2,
     )
     return FrameRecord(device=known, truth=truth)
 
@@ -174,122 +253,29 @@ def _led_truth(patch: LedPatch, wave: Wave | None, start_s: float) -> LedTruth:
     )
 
 
-@dataclass(frozen=True)
-class _Exposed:
-    """A frame without its noise."""
-
-    expected: list[RegionImage]
-    bound_m2: Flat9 | None
-    bound_exact_m2: Flat9 | None
-
-
-@dataclass(frozen=True, eq=False)
-class _View:
-    """What a true camera sees from a pose: shared by all frames there of a camera with the same errors."""
-
-    recipe: Recipe
-    renderer: Renderer | MosaicRenderer
-    mounted: Mounted
-    """The true camera."""
-    main: Pose
-    """Pose of the camera `main` in the middle of its frame."""
-    middle: Pose
-    """Pose of the camera `main` in the middle of this camera's frame."""
-    image: ExpectedImage
-    exposure_s: float
-    room: MeanWave
-    """Light of all LEDs of the room."""
-
-    @property
-    def posed(self) -> PosedCamera:
-        """The camera in the middle of its frame."""
-        return self.mounted.posed(self.middle)
-
-    def exposed(self, waves: Mapping[int, Wave], start_s: float) -> _Exposed:
-        """The exposure of a frame that starts at `start_s`; computed once where all light is steady."""
-        return self._with_gains(waves, start_s) if waves else self._steady
-
-    @cached_property
-    def _steady(self) -> _Exposed:
-        return self._with_gains({}, 0.0)
-
-    def _with_gains(self, waves: Mapping[int, Wave], start_s: float) -> _Exposed:
-        gains: Gains | None = None
-        room_gain: Gain = 1.0
-        if waves:
-            starts_s = start_s + self.mounted.camera.line_starts_s()
-            gains = LineGains(waves, starts_s, self.exposure_s)
-            room_gain = self.room.mean(starts_s, self.exposure_s)
-        expected = [
-            RegionImage(part.roi, part.expected_electrons(self.exposure_s, gains, room_gain))
-            for part in self.image.parts
-        ]
-        return _Exposed(expected, *self._bounds_m2(expected, gains))
-
-    def _bounds_m2(self, expected: Sequence[RegionImage], gains: Gains | None) -> tuple[Flat9 | None, Flat9 | None]:
-        """Cramér-Rao bounds of the frame's position, row by row: hybrid, and exact; the same without [belief].
-
-        gains: of the LEDs by id, which the bound takes as known; 1 where not given. None where the recipe does not ask
-        for them, or where the frame does not determine a position.
-        """
-        recipe = self.recipe
-        if not recipe.bound or self._slopes is None:
-            return None, None
-        variance = [RegionImage(roi, variance_e2(recipe.sensor, mean, self.exposure_s)) for roi, mean in expected]
-        slopes = self._slopes.exposed(variance, gains)
-        tilts_deg = tilt_sigmas_deg(recipe, self.main)
-        exact = slopes.exact_bound_m2(tilts_deg)
-        hybrid = exact
-        if recipe.belief is not None:
-            uncertainty = uncertainty_of(recipe, self.renderer.scene, self.mounted)
-            hybrid = slopes.hybrid_bound_m2(tilts_deg, self.renderer.scene.leds, uncertainty)
-        return None if hybrid is None else flat9(hybrid), None if exact is None else flat9(exact)
-
-    @cached_property
-    def _slopes(self) -> FrameSlopes | None:
-        """Slopes of the LEDs' images in steady light, without the variance of an exposure."""
-        recipe, renderer, mounted, main = self.recipe, self.renderer, self.mounted, self.main
-        at = mounted.posed(main)
-        return FrameSlopes.rendered(
-            mounted,
-            main,
-            partial(renderer.led_slopes, regions=recipe.regions),
-            self.exposure_s,
-            [],
-            float(np.median(np.linalg.norm(renderer.scene.leds.centers_m - at.position_m, axis=1))),
-            recipe.regions is not None and recipe.regions.overscan,
-            halo_of=renderer.halo_of(mounted.camera),
-        )
-
-
 @lru_cache(maxsize=1)
-def _views_at(job: Job, pose_number: int, number: int, frame: int | None) -> dict[int, _View]:
+def _views_at(
+    scene_json: str, scene_folder: str, seen: Seen, pose_number: int, number: int, frame: int | None
+) -> dict[int, View]:
     """Views of the cameras of a rig at a place, by the camera's number; kept until frames at another place are made."""
     return {}
 
 
-def _rendered(job: Job, pose_number: int, number: int, which: int, frame: int | None) -> _View:
+def _rendered(job: Job, pose_number: int, number: int, which: int, frame: int | None) -> View:
     """Render camera number `which` of the rig at a pose, in shot `number` of a burst.
 
     frame: whose errors of a shot the camera has; None where no shot has errors of its own.
     """
-    recipe, of_scene = _renderer(job.recipe_json, job.scene_json, job.scene_folder)
+    recipe, world = keyed_recipe(job.recipe_json).recipe, _world_of(job)
     device = device_of_pose(recipe, pose_number)
     map_number = map_of_device(recipe, device)
-    renderer = _renderer_of_map(job.recipe_json, job.scene_json, job.scene_folder, map_number)
+    renderer, scene = world.renderer_of_map(map_number), world.renderer.scene
     mounted = true_camera(recipe, which, device, frame)
-    main, middle, during = poses_of(recipe, of_scene.scene, pose_number, mounted, number)
-    waves, leds = _waves(job, map_number), of_scene.scene.leds
+    main, middle, during = poses_of(recipe, scene, pose_number, mounted, number)
+    waves = world.waves(map_number)
     image = renderer.expected_image(mounted.posed(middle), recipe.regions, during, room_apart=bool(waves))
-    room = MeanWave.of(waves, dict(zip(leds.ids.tolist(), leds.fluxes_lm.tolist(), strict=True)))
-    return _View(recipe, renderer, mounted, main, middle, image, recipe.time_s(image), room)
-
-
-@cache
-def _waves(job: Job, map_number: int) -> dict[int, Wave]:
-    """The wave of each LED of a map that is not steady, by its id."""
-    recipe, renderer = _renderer(job.recipe_json, job.scene_json, job.scene_folder)
-    return led_waves(renderer.scene.leds.transmitters, recipe.seed, map_number)
+    room = MeanWave.of(waves, dict(zip(scene.leds.ids.tolist(), scene.leds.fluxes_lm.tolist(), strict=True)))
+    return View(renderer, recipe.regions, mounted, main, middle, image, room)
 
 
 def poses_of(
@@ -319,24 +305,48 @@ def _white_balance(camera: Camera, sensor: Sensor, scene: Scene) -> tuple[float,
     return red, green, blue
 
 
-@cache
-def _renderer(recipe_json: str, scene_json: str, scene_folder: str) -> tuple[Recipe, Renderer | MosaicRenderer]:
-    """The recipe and its renderer; one for each process and plan."""
+class _World:
+    """The renderers and waves of a scene's maps, for a recipe and all with the same views."""
+
+    def __init__(self, recipe: Recipe, renderer: Renderer | MosaicRenderer) -> None:
+        """renderer: of the LEDs as told."""
+        self.renderer = renderer
+        self._recipe = recipe
+        self._renderers: dict[int, Renderer | MosaicRenderer] = {}
+        self._waves: dict[int, dict[int, Wave]] = {}
+
+    def renderer_of_map(self, number: int) -> Renderer | MosaicRenderer:
+        """The renderer of a map's LEDs as built; the scene's own without [belief]."""
+        if self._recipe.belief is None:
+            return self.renderer
+        if number not in self._renderers:
+            self._renderers[number] = self.renderer.with_leds(built_leds(self._recipe, self.renderer.scene, number))
+        return self._renderers[number]
+
+    def waves(self, number: int) -> dict[int, Wave]:
+        """The wave of each LED of a map that is not steady, by its id."""
+        if number not in self._waves:
+            self._waves[number] = led_waves(self.renderer.scene.leds.transmitters, self._recipe.seed, number)
+        return self._waves[number]
+
+
+def _world_of(job: Job) -> _World:
+    return _world(job.scene_json, job.scene_folder, keyed_recipe(job.recipe_json).seen)
+
+
+@lru_cache(maxsize=MAX_WORLDS)
+def _world(scene_json: str, scene_folder: str, seen: Seen) -> _World:
+    return _World(seen.recipe, _renderer(scene_json, scene_folder, seen.recipe.sensor.spectral_response))
+
+
+@lru_cache(maxsize=MAX_SCENES)
+def _renderer(scene_json: str, scene_folder: str, spectral_response: str) -> Renderer | MosaicRenderer:
+    """The renderer of a scene on a sensor with this response."""
     scene = _loaded.get((scene_json, scene_folder))
     if scene is None:
         scene = build_scene(SceneSettings.model_validate_json(scene_json), "scene", Path(scene_folder))
-    recipe, light = Recipe.model_validate_json(recipe_json), bake(scene)
-    sensor = recipe.sensor
+    sensor, light = Sensor.model_validate_json(spectral_response), bake(scene)
     if sensor.mosaic == "none":
-        return recipe, Renderer(scene, light, detectors(sensor)[0], sensor.crosstalk)
+        return Renderer(scene, light, detectors(sensor)[0], sensor.crosstalk)
     of_colours = tuple(Renderer(scene, light, detector) for detector in detectors(sensor))
-    return recipe, MosaicRenderer(of_colours, sensor.mosaic, sensor.crosstalk)
-
-
-@cache
-def _renderer_of_map(
-    recipe_json: str, scene_json: str, scene_folder: str, map_number: int
-) -> Renderer | MosaicRenderer:
-    """The renderer of a map's LEDs as built; the scene's own without [belief]."""
-    recipe, renderer = _renderer(recipe_json, scene_json, scene_folder)
-    return renderer if recipe.belief is None else renderer.with_leds(built_leds(recipe, renderer.scene, map_number))
+    return MosaicRenderer(of_colours, sensor.mosaic, sensor.crosstalk)

@@ -1,66 +1,36 @@
-"""Generation of a dataset from a plan: frames, tables, dataset.json. Resumable; any number of workers, same bytes."""
+"""Generation of a dataset, or of the cells of a sweep, from a plan. Resumable; any number of workers, same bytes."""
 
-import json
 import logging
-import multiprocessing
-import os
-import platform
-import signal
-import threading
 from collections.abc import Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from dataclasses import replace
 from functools import cache, partial
-from importlib.metadata import version
-from itertools import accumulate, groupby, product
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
 
 from vlcrender.core.warn_once import warn_once
-from vlcrender.dataset.downlink_entry import downlink_entry
-from vlcrender.dataset.files import FRAMES, sha256_of, whole_file, write_json
-from vlcrender.dataset.frame_job import Job, make_frame, make_frames, poses_of
+from vlcrender.dataset.dependence import Seen, keyed_recipe
+from vlcrender.dataset.files import write_json
+from vlcrender.dataset.frame_job import Job, poses_of
 from vlcrender.dataset.light_checks import light_warnings
+from vlcrender.dataset.plan import Plan, PlannedCells
 from vlcrender.dataset.progress import FRAMES_STAGE, Progress, ProgressCallback
-from vlcrender.dataset.recipe import Plan, Recipe
-from vlcrender.dataset.schema import (
-    DATA_VERSION,
-    FORMAT_VERSION,
-    DatasetFile,
-    DeviceTruthRow,
-    FrameRecord,
-    FrameRow,
-    MapTruthRow,
-    SensorEntry,
-    TruthRow,
-    accelerometer_entry,
-    camera_entry,
-    gyroscope_entry,
-    led_map,
-    luminaire_entries,
-    map_datum_entry,
-)
-from vlcrender.dataset.tables import write_table
-from vlcrender.dataset.true_world import built_leds, device_of_pose, device_rows, map_rows, true_camera
-from vlcrender.dataset.verify import extra_folders, missing_files, verify
+from vlcrender.dataset.sweep import SWEEP_FILE, sweep_tree
+from vlcrender.dataset.true_world import built_leds, device_of_pose, true_camera
+from vlcrender.dataset.unfinished import PLAN, Unfinished, is_complete, prepare_folder, provenance_of
+from vlcrender.dataset.workers import Task, done_frames
 from vlcrender.errors import InputError
 from vlcrender.light.lightmap import Lightmap, bake, room_mesh
 from vlcrender.modulation.flicker import flicker_of, flicker_warning
 from vlcrender.rendering.electron_rates import ElectronRates
 from vlcrender.rendering.readout import RollingPoses
-from vlcrender.rendering.renderer import check_inside, share_cores
-from vlcrender.scene.as_built import luminaires_of
+from vlcrender.rendering.renderer import check_inside
 from vlcrender.sensor.quantisation import MIN_NOISE_STEPS, noise_steps
 from vlcrender.sensor.radiometry import detectors
 
 log = logging.getLogger(__name__)
-
-JOURNAL = "journal.jsonl"
-"""File of an unfinished dataset with a line for each frame that is complete."""
 
 
 def generate(
@@ -70,7 +40,7 @@ def generate(
     scheduler: str | None = None,
     progress: ProgressCallback | None = None,
 ) -> bool:
-    """Generate the dataset of a plan in `directory`. Returns False where it is already complete and intact.
+    """Generate the dataset of a plan in `directory`, or its cells; False where it is already complete and intact.
 
     Resumes an interrupted run of the same plan. `workers` is the number of processes; `scheduler` is the address of a
     dask scheduler whose workers share the folder. `progress` is called with each report. Raises InputError where the
@@ -81,17 +51,89 @@ def generate(
         str(directory).encode()
     except UnicodeEncodeError:
         raise InputError(f"--out {directory}: not a UTF-8 name; EXR files need one") from None
-    provenance = _provenance(plan)
-    if (directory / "dataset.json").exists():
-        _check_same(directory / "dataset.json", provenance, "a dataset of another recipe, scene or version")
-        damage = verify(directory)
-        if damage:
-            raise InputError(f"{directory}: complete but damaged: {damage[0]}; delete it or choose another --out")
+    if plan.cells is None:
+        file, kind = "dataset.json", "dataset"
+        wanted: dict[str, Any] = {"provenance": provenance_of(plan)}
+    else:
+        file, kind = SWEEP_FILE, "sweep"
+        wanted = {**sweep_tree(plan.recipe.name, plan.cells.sweep), "provenance": provenance_of(plan)}
+    if is_complete(directory, file, wanted, f"a {kind} of another recipe, scene or version"):
         log.info("%s: complete and intact already", directory)
         return False
+    if plan.cells is None:
+        _check_possible(plan)
+        datasets = [Unfinished(lambda: plan, Job.of(plan, directory), plan.frame_count)]
+        datasets[0].open()
+        lit = iter([plan])
+    else:
+        datasets = _cells(plan.cells, directory)
+        prepare_folder(directory, wanted, "an unfinished sweep of another recipe, scene or version")
+        datasets = [dataset for dataset in datasets if not dataset.resume()]
+        lit = _with_each_scene(datasets)
+    # Into the cache, from which every worker reads it.
+    for of_scene in lit:
+        light = bake(of_scene.scene, progress=lambda step, share: report(Progress(step, share, 1.0)))
+        _warn_of_coarse_steps(of_scene, light)
+        _warn_of_flicker(of_scene)
+        for warning in light_warnings(of_scene.recipe, of_scene.scene):
+            warn_once(log, warning)
+    done = total = plan.frame_count
+    done -= sum(dataset.frame_count - dataset.done for dataset in datasets)
+    if done:
+        log.info("%s: resumed with %d of %d frames", directory, done, total)
+        report(Progress(FRAMES_STAGE, done, total))
+    unfinished = {dataset.job.directory: dataset for dataset in datasets}
+    tasks, count = _tasks(datasets)
+    for job, record in done_frames(tasks, count, workers, scheduler, directory):
+        dataset = unfinished[job.directory]
+        dataset.add(record)
+        done += 1
+        report(Progress(FRAMES_STAGE, done, total))
+        if dataset.done == dataset.frame_count:
+            unfinished.pop(job.directory).finish()
+    for dataset in unfinished.values():  # of which an interrupted run had made all frames
+        dataset.finish()
+    if plan.cells is not None:
+        write_json(directory / SWEEP_FILE, wanted)
+        (directory / PLAN).unlink()
+    return True
+
+
+def _cells(cells: PlannedCells, directory: Path) -> list[Unfinished]:
+    """The datasets of all cells. An impossible pose, or one of the other things of `generate`, is refused by cell."""
+    datasets, possible = [], set()
+    texts: dict[str, str] = {}
+    for cell in cells.sweep:
+        plan = cells.plan(cell.number)
+        job = Job.of(plan, directory / cell.folder)
+        # One text for all cells that share a scene: a task that has many of them is then sent with one.
+        job = replace(job, scene_json=texts.setdefault(job.scene_json, job.scene_json))
+        if _view_of(job) not in possible:
+            try:
+                _check_possible(plan)
+            except InputError as error:
+                raise InputError(f"{cells.source}: {cell}: {error}") from None
+            possible.add(_view_of(job))
+        datasets.append(Unfinished(partial(cells.plan, cell.number), job, plan.frame_count))
+    return datasets
+
+
+def _view_of(job: Job) -> tuple[str, str, Seen]:
+    """What the views of a job's frames depend on."""
+    return job.scene_json, job.scene_folder, keyed_recipe(job.recipe_json).seen
+
+
+def _with_each_scene(datasets: list[Unfinished]) -> Iterator[Plan]:
+    """The plan of the first dataset with each scene, and of the last dataset; one scene at a time is in memory."""
+    first = {(d.job.scene_json, d.job.scene_folder): d for d in reversed(datasets)}
+    return (dataset.plan() for dataset in dict.fromkeys([*reversed(first.values()), *datasets[-1:]]))
+
+
+def _check_possible(plan: Plan) -> None:
+    """Raise InputError where a pose, a true camera or LED, or the furniture of a plan is impossible."""
     mounted_of = cache(partial(true_camera, plan.recipe))
     numbers = {0} if plan.recipe.motion is None else {0, plan.recipe.burst_frames - 1}
-    for pose_number in range(plan.recipe.poses.count):  # an impossible pose ends the run before the first frame
+    for pose_number in plan.recipe.pose_numbers:
         for which, number in product(range(len(plan.recipe.cameras)), numbers):
             mounted = mounted_of(which, device_of_pose(plan.recipe, pose_number))
             *_, during = poses_of(plan.recipe, plan.scene, pose_number, mounted, number)
@@ -99,31 +141,43 @@ def generate(
             check_inside(plan.scene, first)
             check_inside(plan.scene, last)
     if plan.recipe.belief is not None:
-        for map_number in range(plan.recipe.belief.maps):  # an impossible LED, too
+        for map_number in range(plan.recipe.belief.maps):
             built_leds(plan.recipe, plan.scene, map_number)
-    room_mesh(plan.scene)  # impossible furniture ends the run before anything is written
-    _prepare(directory, provenance, plan.recipe)
-    job = Job.of(plan, directory)
-    done = _journal(directory, plan.recipe)
-    total = plan.recipe.frame_count
-    missing = [frame for frame in range(total) if frame not in done]
-    if done:
-        log.info("%s: resumed with %d of %d frames", directory, len(done), total)
-        report(Progress(FRAMES_STAGE, len(done), total))
-    # Into the cache, from which every worker reads it.
-    light = bake(plan.scene, progress=lambda step, share: report(Progress(step, share, 1.0)))
-    _warn_of_coarse_steps(plan, light)
-    _warn_of_flicker(plan)
-    for warning in light_warnings(plan.recipe, plan.scene):
-        warn_once(log, warning)
-    with (directory / JOURNAL).open("ab") as journal:
-        for record in _records(job, _bursts(missing, plan.recipe), workers, scheduler):
-            done[record.frame] = journal.tell()
-            journal.write(_line(record))
-            journal.flush()
-            report(Progress(FRAMES_STAGE, len(done), total))
-    _finish(plan, directory, provenance, done)
-    return True
+    room_mesh(plan.scene)
+
+
+def _tasks(datasets: Iterable[Unfinished]) -> tuple[Iterator[Task], int]:
+    """The frames that are not made, in the order in which most is shared, and the number of tasks or more.
+
+    A task is a burst, a single shot, or the frames of a file that holds several, in all datasets whose views are the
+    same. Its datasets are open. Tasks of one scene follow one another, then those of one view in the order of poses.
+    """
+    scenes: dict[tuple[str, str], dict[tuple[Seen, int], list[Unfinished]]] = {}
+    for dataset in datasets:
+        recipe = keyed_recipe(dataset.job.recipe_json).recipe
+        together = len(recipe.cameras) * recipe.burst_frames
+        if recipe.files.frames_per_file > 1:
+            together = recipe.files.frames_per_file
+        *scene, seen = _view_of(dataset.job)
+        scenes.setdefault((scene[0], scene[1]), {}).setdefault((seen, together), []).append(dataset)
+    shots = [
+        (group, range(start, start + together))
+        for of_scene in scenes.values()
+        for (_, together), group in of_scene.items()
+        for start in range(0, group[0].frame_count, together)
+    ]
+
+    def tasks() -> Iterator[Task]:
+        for group, frames in shots:
+            missing = {dataset: dataset.missing(frames) for dataset in group}
+            task = [(dataset.job, frame) for dataset in group for frame in missing[dataset]]
+            for dataset in group:
+                if missing[dataset]:
+                    dataset.open()
+            if task:
+                yield task
+
+    return tasks(), len(shots)
 
 
 def _warn_of_coarse_steps(plan: Plan, light: Lightmap) -> None:
@@ -132,8 +186,9 @@ def _warn_of_coarse_steps(plan: Plan, light: Lightmap) -> None:
     The background is the mean over all surfaces that face down, on the axis of the camera `main`.
     """
     recipe, sensor, mesh = plan.recipe, plan.recipe.sensor, light.mesh
-    exposure_s = recipe.exposure_s if recipe.exposure is None else recipe.exposure.max_s
-    assert exposure_s is not None  # Recipe checks it
+    if recipe.added_noise is not None and recipe.added_noise.metering is None:
+        return  # rounding follows the added noise
+    exposure_s = recipe.max_exposure_s
     count = len(mesh.vertices_m)
     weights = mesh.areas_m2() * (mesh.normals[:, 2] < 0)
     led, ambient = (np.average(cd_m2[:count], weights=weights) for cd_m2 in (light.led_cd_m2(), light.ambient_cd_m2()))
@@ -154,212 +209,3 @@ def _warn_of_flicker(plan: Plan) -> None:
     warning = flicker_warning(flicker_of(plan.scene.leds.transmitters))
     if warning is not None:
         warn_once(log, f"{plan.recipe.scene}: {warning}")
-
-
-def _bursts(frames: list[int], recipe: Recipe) -> list[list[int]]:
-    """Frames that one worker makes, one after another, since they share a view: those of a burst."""
-    per_burst = len(recipe.cameras) * recipe.burst_frames
-    if recipe.burst_frames == 1:
-        return [[frame] for frame in frames]
-    return [list(group) for _, group in groupby(frames, key=lambda frame: frame // per_burst)]
-
-
-def _records(job: Job, bursts: list[list[int]], workers: int, scheduler: str | None) -> Iterator[FrameRecord]:
-    if scheduler is not None:
-        yield from _on_cluster(job, bursts, scheduler)
-    elif workers == 1 or len(bursts) <= 1:
-        for burst in bursts:
-            for frame in burst:
-                yield make_frame(job, frame)
-    else:
-        yield from _in_processes(job, bursts, workers)
-
-
-def _in_processes(job: Job, bursts: list[list[int]], workers: int) -> Iterator[FrameRecord]:
-    # spawn: a forked child of a process that ran kernels is left with one thread
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(min(workers, len(bursts)), context, _start_worker, (workers,))
-    pending: set[Future[list[FrameRecord]]] = set()
-    queue = iter(bursts)
-    try:
-        while True:
-            with _interrupts_deferred():  # submit() starts children
-                while len(pending) < 2 * workers and (burst := next(queue, None)) is not None:
-                    pending.add(pool.submit(make_frames, job, burst))
-            if not pending:
-                return
-            finished, pending = wait(pending, return_when=FIRST_COMPLETED)
-            for future in finished:
-                yield from future.result()
-    except BrokenProcessPool:
-        raise InputError(
-            f"{job.directory}: a worker process died (out of memory?); run the same command again, "
-            "with fewer --workers, to resume"
-        ) from None
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-@contextmanager
-def _interrupts_deferred() -> Iterator[None]:
-    """Deliver an interrupt (SIGINT) after this block; child processes started in it never receive one.
-
-    Children inherit the blocked signal, so that only the parent handles an interrupt and no child prints a traceback.
-    The handler is needed beside the mask: a mask holds for this thread alone, another thread may receive the signal,
-    and Python then runs the handler in the main thread, in the middle of starting a child.
-    """
-    received = threading.Event()
-    in_main_thread = threading.current_thread() is threading.main_thread()
-    handler = signal.signal(signal.SIGINT, lambda *_: received.set()) if in_main_thread else None
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-        if handler is not None:
-            signal.signal(signal.SIGINT, handler)
-    if received.is_set():
-        signal.raise_signal(signal.SIGINT)
-
-
-def _start_worker(workers: int) -> None:
-    threading.Thread(target=_exit_with_parent, daemon=True).start()
-    share_cores(workers)
-
-
-def _exit_with_parent() -> None:
-    """Exit when the parent process dies."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
-
-
-def _on_cluster(job: Job, bursts: Iterable[list[int]], address: str) -> Iterator[FrameRecord]:
-    try:
-        from dask.distributed import Client, as_completed
-    except ImportError:
-        raise InputError(f"--scheduler {address}: needs dask.distributed: pip install 'vlcrender[cluster]'") from None
-    try:
-        client = Client(address, timeout="10s")
-    except (OSError, ValueError) as error:
-        raise InputError(f"--scheduler {address}: no answer from a scheduler: {error}") from None
-    with client:
-        futures = client.map(lambda burst: make_frames(job, burst), list(bursts), pure=False)
-        for future in as_completed(futures):
-            yield from future.result()
-            future.release()
-
-
-def _provenance(plan: Plan) -> dict[str, Any]:
-    recipe = plan.recipe.model_dump(mode="json")
-    recipe["seed"] = str(plan.recipe.seed)  # JSON readers round integers beyond 2**53
-    return {
-        "recipe": recipe,
-        "scene": plan.scene.settings.model_dump(mode="json"),
-        "data_version": DATA_VERSION,
-        "versions": {
-            **{package: version(package) for package in ("vlcrender", "mitsuba", "drjit", "numpy", "OpenEXR")},
-            "python": platform.python_version(),
-        },
-    }
-
-
-def _check_same(path: Path, provenance: dict[str, Any], other: str) -> None:
-    try:
-        tree = json.loads(path.read_text(encoding="utf-8"))
-        same = tree["provenance"] == json.loads(json.dumps(provenance))
-    except (ValueError, KeyError, TypeError, OSError):
-        raise InputError(f"{path}: damaged; delete {path.parent} or choose another --out") from None
-    if not same:
-        raise InputError(f"{path.parent}: holds {other}; nothing was changed; choose another --out or delete it")
-
-
-def _prepare(directory: Path, provenance: dict[str, Any], recipe: Recipe) -> None:
-    plan_file = directory / "plan.json"
-    if plan_file.exists():
-        _check_same(plan_file, provenance, "an unfinished dataset of another recipe, scene or version")
-    elif directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
-        raise InputError(f"{directory}: neither empty nor a dataset; nothing was changed; choose another --out")
-    for name in [FRAMES, *extra_folders(recipe.expected, recipe.processed is not None)]:
-        (directory / name).mkdir(parents=True, exist_ok=True)
-    for leftover in directory.rglob("*.partial"):
-        leftover.unlink()
-    write_json(plan_file, {"provenance": provenance})
-
-
-def _journal(directory: Path, recipe: Recipe) -> dict[int, int]:
-    """Frames that an interrupted run finished and whose files are still intact; the journal then holds these alone.
-
-    Each with the place of its line in the journal: the memory of a run does not grow with records of frames.
-    """
-    path = directory / JOURNAL
-    if not path.exists():
-        return {}
-    done: dict[int, bytes] = {}
-    lines = path.read_text(encoding="utf-8").splitlines()
-    for line in lines:
-        try:
-            record = FrameRecord.model_validate_json(line)
-        except ValidationError:
-            continue  # a line that a crash truncated: its frame is made again
-        file = directory / record.device.file
-        if file.is_file() and sha256_of(file) == record.device.sha256:
-            done[record.frame] = _line(record)
-    folders = extra_folders(recipe.expected, recipe.processed is not None)
-    for frame in missing_files(directory, folders, list(done)):
-        del done[frame]
-    if len(done) < len(lines):
-        log.warning("%s: %d frames are damaged or incomplete and are made again", path, len(lines) - len(done))
-    with whole_file(path) as partial:
-        partial.write_bytes(b"".join(done.values()))
-    return dict(zip(done, accumulate(map(len, done.values()), initial=0), strict=False))
-
-
-def _line(record: FrameRecord) -> bytes:
-    """The journal's line of a frame."""
-    return record.model_dump_json().encode() + b"\n"
-
-
-def _recorded(path: Path, places: dict[int, int]) -> Iterator[FrameRecord]:
-    """The frames of a journal, of which each has its place, in order of their numbers."""
-    with path.open("rb") as journal:
-        for frame in sorted(places):
-            journal.seek(places[frame])
-            yield FrameRecord.model_validate_json(journal.readline())
-
-
-def _finish(plan: Plan, directory: Path, provenance: dict[str, Any], places: dict[int, int]) -> None:
-    recipe, scene, journal = plan.recipe, plan.scene, directory / JOURNAL
-    write_table(directory / "frames.parquet", (record.device for record in _recorded(journal, places)), FrameRow)
-    write_table(directory / "truth.parquet", (record.truth for record in _recorded(journal, places)), TruthRow)
-    sigmas = luminaires = None
-    told_map = recipe.map == "given"
-    if recipe.belief is not None:
-        sigmas = recipe.belief.stated_sigmas(recipe.cameras, recipe.accelerometer)
-        luminaires = luminaires_of(scene.settings, scene.leds) if told_map else None
-        write_table(directory / "truth_devices.parquet", device_rows(recipe), DeviceTruthRow)
-    if recipe.belief is not None or not told_map:
-        write_table(directory / "truth_map.parquet", map_rows(recipe, scene), MapTruthRow)
-    dataset = DatasetFile(
-        format="vlcrender-dataset",
-        version=FORMAT_VERSION,
-        name=recipe.name,
-        frame_count=len(places),
-        cameras={
-            mounted.name: camera_entry(mounted, None if sigmas is None else sigmas.cameras[mounted.name])
-            for mounted in recipe.cameras
-        },
-        sensor=SensorEntry(**recipe.sensor.acting()),
-        accelerometer=accelerometer_entry(recipe.accelerometer, sigmas),
-        gyroscope=gyroscope_entry(recipe.gyroscope),
-        led_map=led_map(scene.leds, luminaires, sigmas) if told_map else None,
-        luminaires=() if luminaires is None or sigmas is None else luminaire_entries(luminaires, sigmas),
-        map_datum=None if sigmas is None else map_datum_entry(sigmas),
-        downlink=downlink_entry(scene.leds, recipe.demodulation),
-        room_m=scene.settings.room.size_m,
-        provenance=provenance,
-    )
-    write_json(directory / "dataset.json", dataset.model_dump(mode="json"))
-    (directory / "plan.json").unlink()
-    journal.unlink()

@@ -1,4 +1,4 @@
-"""Poses of the frames: random ones that see LEDs, listed ones, or a grid."""
+"""Poses of the frames: ones that see LEDs at random tilts or at those of a grid, listed ones, or a grid of places."""
 
 from functools import lru_cache
 from typing import Annotated, Literal, Self
@@ -16,28 +16,22 @@ from vlcrender.scene.loader import Scene
 from vlcrender.scene.visibility import can_occlude_leds, leds_in_view
 
 Tilt = Annotated[float, Field(ge=-85, le=85)]
+Steps = Annotated[int, Field(ge=1, le=10_000)]
 MIN_RISE = 0.01
 """Smallest sine of a ray's elevation towards its target."""
 TRIES = 10_000
 """Random positions and yaws tried for the tilts of one frame before the recipe is refused."""
 
 
-class AimedPoses(Settings):
-    """Random poses that see LEDs.
+class Aim(Settings):
+    """Where a camera of given tilts may be so that it sees LEDs."""
 
-    Tilts are stratified over their ranges, so that few frames already span them. For each frame a target LED, a height,
-    a yaw and a place in the image are drawn. The camera is placed where it images the target there. The pose is kept if
-    the camera is inside the room and enough LEDs are whole in the image, hidden in no part by furniture or panels.
-    """
-
-    kind: Literal["aimed"]
+    kind: Literal["aimed", "tilt-grid"]
     """How the poses are given."""
-    count: Annotated[int, Field(ge=1, le=10_000_000)]
-    """Number of poses."""
-    tilt_x_deg: tuple[Tilt, Tilt]
-    """Range of tilt_x, degrees: [lowest, highest]."""
-    tilt_y_deg: tuple[Tilt, Tilt]
-    """Range of tilt_y, degrees: [lowest, highest]."""
+    tilt_x_deg: tuple[Tilt, Tilt] | tuple[Tilt, Tilt, Steps]
+    """Tilts about the camera's x axis."""
+    tilt_y_deg: tuple[Tilt, Tilt] | tuple[Tilt, Tilt, Steps]
+    """Tilts about the camera's y axis."""
     height_m: tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]]
     """Range of the projection centre's height over the floor, metres: [lowest, highest]."""
     min_leds: Annotated[int, Field(ge=1, le=1000)] = 4
@@ -50,10 +44,66 @@ class AimedPoses(Settings):
     @model_validator(mode="after")
     def _ranges_go_up(self) -> Self:
         for name in ("tilt_x_deg", "tilt_y_deg", "height_m"):
-            low, high = getattr(self, name)
+            low, high, *count = getattr(self, name)
             if low > high:
-                raise ValueError(f"{name} = [{low}, {high}]: the lower value comes first")
+                raise ValueError(f"{name} = {[low, high, *count]}: the lower value comes first")
         return self
+
+
+class AimedPoses(Aim):
+    """Random poses that see LEDs. Tilts are stratified over their ranges, so that few frames already span them.
+
+    For each pose a target LED, a height, a yaw and a place in the image are drawn. The camera is placed where it images
+    the target there. The pose is kept if the camera is inside the room and enough LEDs are whole in the image, hidden
+    in no part by furniture or panels.
+    """
+
+    kind: Literal["aimed"]
+    """How the poses are given."""
+    count: Annotated[int, Field(ge=1, le=10_000_000)]
+    """Number of poses."""
+    tilt_x_deg: tuple[Tilt, Tilt]
+    """Range of tilt_x, degrees: [lowest, highest]."""
+    tilt_y_deg: tuple[Tilt, Tilt]
+    """Range of tilt_y, degrees: [lowest, highest]."""
+
+
+class TiltGridPoses(Aim):
+    """Poses that see LEDs at each tilt of a grid: those of one tilt one after another, tilt_y faster than tilt_x.
+
+    Target, height, yaw and place in the image are drawn as for `aimed`.
+    """
+
+    kind: Literal["tilt-grid"]
+    """How the poses are given."""
+    tilt_x_deg: tuple[Tilt, Tilt, Steps]
+    """Values of tilt_x, degrees: [lowest, highest, count], equally spaced, both included."""
+    tilt_y_deg: tuple[Tilt, Tilt, Steps]
+    """Values of tilt_y, degrees: [lowest, highest, count], equally spaced, both included."""
+    per_cell: Annotated[int, Field(ge=1, le=1_000_000)] = 1
+    """Number of poses at each pair of tilts."""
+
+    @model_validator(mode="after")
+    def _one_value_is_lowest_and_highest(self) -> Self:
+        for name in ("tilt_x_deg", "tilt_y_deg"):
+            low, high, count = getattr(self, name)
+            if count == 1 and low != high:
+                raise ValueError(f"{name} = [{low}, {high}, 1]: a single value is lowest and highest; give it twice")
+        return self
+
+    @property
+    def count(self) -> int:
+        """Number of poses."""
+        return self.tilt_x_deg[2] * self.tilt_y_deg[2] * self.per_cell
+
+    def tilts_deg(self, number: int) -> tuple[float, float]:
+        """tilt_x and tilt_y of the pose of a number, degrees."""
+        places = divmod(number // self.per_cell, self.tilt_y_deg[2])
+        x, y = (
+            float(np.linspace(*values)[place])
+            for values, place in zip((self.tilt_x_deg, self.tilt_y_deg), places, strict=True)
+        )
+        return x, y
 
 
 class PoseEntry(Settings):
@@ -106,7 +156,7 @@ class GridPoses(Settings):
         return self.columns * self.rows
 
 
-AnyPoses = AimedPoses | ListedPoses | GridPoses
+AnyPoses = AimedPoses | TiltGridPoses | ListedPoses | GridPoses
 Poses = Annotated[AnyPoses, Field(discriminator="kind")]
 
 
@@ -120,15 +170,23 @@ def pose_of_frame(poses: AnyPoses, frame: int, seed: int, camera: Camera, scene:
     if isinstance(poses, ListedPoses):
         entry = poses.pose[frame]
         return Pose(entry.position_m, entry.tilt_x_deg, entry.tilt_y_deg, entry.yaw_deg)
-    return _aimed_pose(poses, frame, seed, camera, scene)
+    tilts = poses.tilts_deg(frame) if isinstance(poses, TiltGridPoses) else _stratified_tilts_deg(poses, frame, seed)
+    return _aimed_pose(poses, tilts, frame, seed, camera, scene)
 
 
-def _aimed_pose(poses: AimedPoses, frame: int, seed: int, camera: Camera, scene: Scene) -> Pose:
+def _stratified_tilts_deg(poses: AimedPoses, frame: int, seed: int) -> tuple[float, float]:
     tilts = []
     for axis, (low, high) in (("x", poses.tilt_x_deg), ("y", poses.tilt_y_deg)):
         within = stream(seed, frame, f"tilt-{axis}").uniform()
         tilts.append(low + (high - low) * (_strata(seed, axis, poses.count)[frame] + within) / poses.count)
     tilt_x, tilt_y = map(float, tilts)
+    return tilt_x, tilt_y
+
+
+def _aimed_pose(
+    poses: Aim, tilts_deg: tuple[float, float], frame: int, seed: int, camera: Camera, scene: Scene
+) -> Pose:
+    tilt_x, tilt_y = tilts_deg
     generator = stream(seed, frame, "aim")
     low_corner = np.array([poses.wall_distance_m, poses.wall_distance_m, 0.0])
     high_corner = scene.room_m - [poses.wall_distance_m, poses.wall_distance_m, 0.0]
@@ -169,7 +227,7 @@ def _strata(seed: int, axis: str, count: int) -> NDArray[np.int64]:
     return stream(seed, 0, f"tilt-{axis}-strata").permutation(count)
 
 
-def _leds_seen(posed: PosedCamera, scene: Scene, poses: AimedPoses) -> int:
+def _leds_seen(posed: PosedCamera, scene: Scene, poses: Aim) -> int:
     """Number of LEDs whole in the image; of those that nothing hides, where the others are enough."""
     found = leds_in_view(posed, scene, poses.border_px)
     if len(found) < poses.min_leds or not can_occlude_leds(scene):

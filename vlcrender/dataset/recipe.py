@@ -1,29 +1,26 @@
-"""Recipes: every setting of a dataset. TOML in, checked model and scene out."""
+"""Recipes: every setting of a dataset, as a checked model."""
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
 from vlcrender.camera.intrinsics import Camera
 from vlcrender.camera.rig import MAIN, Mounted, RigCamera, mounted_cameras
-from vlcrender.camera.roi import LedRegions
+from vlcrender.camera.roi import LedRegions, RegionImage
 from vlcrender.camera.shutter import RollingShutter
-from vlcrender.config.packaged import find_file
-from vlcrender.config.presets import with_presets
-from vlcrender.config.toml_model import Settings, check, read_toml
+from vlcrender.config.toml_model import Settings, check
+from vlcrender.dataset.added_noise import AddedNoise
 from vlcrender.dataset.auto_exposure import Metering, NoiseLevelMetering
 from vlcrender.dataset.belief import Belief
-from vlcrender.dataset.light_checks import check_light
+from vlcrender.dataset.file_settings import FileSettings
 from vlcrender.dataset.motion import Motion
-from vlcrender.dataset.pose_sampling import AimedPoses, Poses
+from vlcrender.dataset.pose_sampling import Aim, Poses
+from vlcrender.dataset.sweep import SweepTable
 from vlcrender.dataset.timeline import Burst, start_of_burst_s
 from vlcrender.errors import InputError
 from vlcrender.rendering.expected_image import ExpectedImage
-from vlcrender.scene.loader import Scene, load_scene
 from vlcrender.sensor.accelerometer import Accelerometer, TiltError
 from vlcrender.sensor.gyroscope import Gyroscope
 from vlcrender.sensor.isp import Processed
@@ -55,6 +52,8 @@ class Recipe(Settings):
     """Exposure time of every frame, seconds. Give either this or `exposure`."""
     exposure: Metering | None = None
     """Automatic exposure: how the exposure time of each frame is chosen."""
+    added_noise: AddedNoise | None = None
+    """A noise level beside the sensor's own noise; none where not given."""
     repeats: Annotated[int, Field(ge=1, le=1_000_000)] = 1
     """Shots, or bursts of shots, of each pose, one after another; they differ in noise, and in the phase of waves."""
     burst: Burst | None = None
@@ -67,6 +66,8 @@ class Recipe(Settings):
     """Whether the noise-free images are written too."""
     processed: Processed | None = None
     """Settings of processed pictures, as a phone makes them; none are written where not given."""
+    files: FileSettings = FileSettings()
+    """How many frames have previews, and how many share a file."""
     bound: bool = False
     """Whether each frame's Cramér-Rao bound is computed: some seconds for a full frame of many LEDs."""
     camera: Camera = Camera()
@@ -79,6 +80,9 @@ class Recipe(Settings):
     """The gyroscope of the rig; none where not given."""
     poses: Poses
     """Poses of the camera `main`."""
+    pose_range: tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]] | None = None
+    """[first, last]: the poses that are made, of those of `poses`, counted from 0; all where not given. Their frames
+    are those of the whole set, and are counted from 0 again."""
     regions: LedRegions | None = None
     """Regions of interest that are read out; the whole sensor where not given."""
     motion: Motion | None = None
@@ -90,10 +94,35 @@ class Recipe(Settings):
 
     @model_validator(mode="after")
     def _one_way_to_expose(self) -> Self:
-        if (self.exposure_s is None) == (self.exposure is None):
+        if self.metering is not None and self.metering is not self.exposure:
+            if self.exposure_s is not None or self.exposure is not None:
+                raise ValueError(
+                    'added_noise: relative_to = "photon" sets the exposure time; remove exposure_s and [exposure]'
+                )
+        elif (self.exposure_s is None) == (self.exposure is None):
             raise ValueError("exposure_s: give exactly one of exposure_s or [exposure]")
-        if self.exposure is not None and self.motion is not None:
-            raise ValueError("exposure: [motion] needs a fixed time; replace [exposure] by exposure_s")
+        if self.metering is not None and self.motion is not None:
+            key = "exposure" if self.exposure is not None else "added_noise"
+            raise ValueError(f"{key}: [motion] needs a fixed time; replace [{key}] by exposure_s")
+        return self
+
+    @model_validator(mode="after")
+    def _variance_is_of_full_frames(self) -> Self:
+        noise = self.added_noise
+        if noise is not None and noise.relative_to == "image-variance" and self.regions is not None:
+            raise ValueError(
+                'added_noise: relative_to = "image-variance" needs full frames: remove [regions], or choose "peak"'
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _pose_range_is_of_its_poses(self) -> Self:
+        if self.pose_range is not None:
+            first, last = self.pose_range
+            if not first <= last < self.poses.count:
+                raise ValueError(
+                    f"pose_range = [{first}, {last}]: has to be [first, last] within 0 to {self.poses.count - 1}"
+                )
         return self
 
     @model_validator(mode="after")
@@ -106,6 +135,15 @@ class Recipe(Settings):
     def _processed_is_of_full_frames(self) -> Self:
         if self.processed is not None and self.regions is not None:
             raise ValueError("processed: [processed] needs full frames: remove [regions] or [processed]")
+        return self
+
+    @model_validator(mode="after")
+    def _shards_are_of_regions(self) -> Self:
+        if self.files.frames_per_file > 1 and self.regions is None:
+            raise ValueError(
+                f"files.frames_per_file = {self.files.frames_per_file}: files of several frames hold regions; add "
+                "[regions] or remove frames_per_file"
+            )
         return self
 
     @model_validator(mode="after")
@@ -181,7 +219,7 @@ class Recipe(Settings):
     def _frames_of_a_burst_do_not_overlap(self) -> Self:
         if self.burst is None:
             return self
-        longest_s = max(self._readout_s(c.camera) for c in self.cameras) + self._max_exposure_s
+        longest_s = max(self._readout_s(c.camera) for c in self.cameras) + self.max_exposure_s
         if 1 / self.burst.frame_rate_hz < longest_s:
             raise ValueError(
                 f"burst.frame_rate_hz = {self.burst.frame_rate_hz:g}: a frame takes {longest_s * 1000:.4g} ms from the "
@@ -196,9 +234,16 @@ class Recipe(Settings):
         return self
 
     @property
-    def _max_exposure_s(self) -> float:
-        if self.exposure is not None:
-            return self.exposure.max_s
+    def metering(self) -> Metering | None:
+        """How exposure times are chosen; None where `exposure_s` is given."""
+        by_noise = None if self.added_noise is None else self.added_noise.metering
+        return by_noise or self.exposure
+
+    @property
+    def max_exposure_s(self) -> float:
+        """Longest exposure time of a frame, seconds."""
+        if self.metering is not None:
+            return self.metering.max_s
         assert self.exposure_s is not None  # _one_way_to_expose
         return self.exposure_s
 
@@ -215,7 +260,20 @@ class Recipe(Settings):
     @property
     def frame_count(self) -> int:
         """Number of frames: one for each pose, repeat, shot of a burst and camera."""
-        return self.poses.count * self.repeats * self.burst_frames * len(self.cameras)
+        return len(self.pose_numbers) * self.repeats * self.burst_frames * len(self.cameras)
+
+    @property
+    def pose_numbers(self) -> range:
+        """Numbers of the poses that are made."""
+        if self.pose_range is None:
+            return range(self.poses.count)
+        first, last = self.pose_range
+        return range(first, last + 1)
+
+    @property
+    def first_shot(self) -> int:
+        """Number of the first shot, among those of all poses."""
+        return self.pose_numbers.start * self.repeats * self.burst_frames
 
     @property
     def burst_frames(self) -> int:
@@ -224,13 +282,23 @@ class Recipe(Settings):
 
     def time_s(self, view: ExpectedImage) -> float:
         """Exposure time of an expected image, seconds."""
-        if self.exposure is not None:
-            return self.exposure.time_s(view, self.sensor.saturation_e)
+        if self.metering is not None:
+            return self.metering.time_s(view, self.sensor.saturation_e)
         assert self.exposure_s is not None  # _one_way_to_expose
         return self.exposure_s
 
+    def added_noise_dn(self, expected_e: Sequence[RegionImage]) -> float | None:
+        """Standard deviation of the noise that is added to a frame, digital numbers; None where none is.
+
+        expected_e: its regions, electrons.
+        """
+        return None if self.added_noise is None else self.added_noise.sigma_dn(self.sensor, expected_e)
+
     def place_of_frame(self, frame: int) -> tuple[int, int, int]:
-        """Pose, shot and camera of a frame, each counted from 0. The camera varies fastest, the pose slowest."""
+        """Pose, shot and camera of a frame, each counted from 0, and the frame from the first one of all poses.
+
+        The camera varies fastest, the pose slowest.
+        """
         shot, which = divmod(frame, len(self.cameras))
         return shot // (self.repeats * self.burst_frames), shot, which
 
@@ -251,36 +319,12 @@ class Recipe(Settings):
         return start_of_burst_s(self.seed, burst, lasts_s) + self.burst.offset_s(number)
 
 
-@dataclass(frozen=True)
-class Plan:
-    """A resolved recipe with its scene."""
+class RecipeFile(Recipe):
+    """A recipe file: a recipe, or with sweeps one for each cell."""
 
-    recipe: Recipe
-    scene: Scene
-
-
-def load_plan(path: Path, assignments: Iterable[str] = (), scale: int = 1, scale_mode: ScaleMode = "binned") -> Plan:
-    """Read a recipe, insert presets and `key=value` assignments, apply `scaled`, and read the scene.
-
-    Raises InputError that names file, key and value.
-    """
-    assignments = list(assignments)
-    source = f"{path} with --set" if assignments else str(path)
-    tree = read_toml(path)
-    keys = {assignment.partition("=")[0].partition(".")[0].strip() for assignment in assignments}
-    for way, other in (("exposure", "exposure_s"), ("exposure_s", "exposure")):
-        if way in keys and other not in keys:
-            tree.pop(other, None)  # the assigned way to expose replaces the recipe's
-    recipe = check(with_presets(tree, assignments, source), Recipe, source)
-    try:
-        scene_path = find_file("scene", recipe.scene, path.parent)
-    except InputError as error:
-        raise InputError(f"{source}: scene = {error}") from None
-    if not scene_path.is_file():
-        raise InputError(f"{source}: scene = {recipe.scene!r}: no such file, relative to the recipe's folder")
-    plan = Plan(scaled(recipe, scale, scale_mode), load_scene(scene_path))
-    check_light(plan.recipe, plan.scene, source, scale)
-    return plan
+    sweep: tuple[SweepTable, ...] = ()
+    """Sweeps over keys of this file and of the scene file, one `[[sweep]]` each. Their product is made: a dataset for
+    each combination of values."""
 
 
 def scaled(recipe: Recipe, by: int, mode: ScaleMode) -> Recipe:
@@ -305,7 +349,7 @@ def scaled(recipe: Recipe, by: int, mode: ScaleMode) -> Recipe:
             for entry in recipe.rig
         ),
     }
-    if isinstance(recipe.poses, AimedPoses):
+    if isinstance(recipe.poses, Aim):
         changes["poses"] = recipe.poses.model_copy(update={"border_px": recipe.poses.border_px / by})
     if recipe.regions is not None:
         margin_px = recipe.regions.margin_px
@@ -314,16 +358,15 @@ def scaled(recipe: Recipe, by: int, mode: ScaleMode) -> Recipe:
     if mode == "same-photons":
         if recipe.exposure_s is not None:
             changes["exposure_s"] = recipe.exposure_s / by**2
-        else:  # metering counts the electrons of a pixel, so the longest time alone needs scaling
-            changes["exposure"] = recipe.exposure and recipe.exposure.model_copy(
-                update={"max_s": recipe.exposure.max_s / by**2}
-            )
+        elif recipe.exposure is not None:
+            # Metering counts the electrons of a pixel: the longest time alone needs scaling.
+            changes["exposure"] = recipe.exposure.model_copy(update={"max_s": recipe.exposure.max_s / by**2})
     else:
         changes["sensor"] = recipe.sensor.binned(by)
-        # A pixel holds more electrons: a noise level falls; a share of saturation stays.
-        if isinstance(recipe.exposure, NoiseLevelMetering):
-            level_db = recipe.exposure.level_db - 10 * math.log10(by**2)
-            changes["exposure"] = recipe.exposure.model_copy(update={"level_db": level_db})
+        # A pixel holds more electrons, and the mean of more numbers: a noise level falls; a share of saturation stays.
+        for key, level in (("exposure", recipe.exposure), ("added_noise", recipe.added_noise)):
+            if isinstance(level, NoiseLevelMetering | AddedNoise):
+                changes[key] = level.model_copy(update={"level_db": level.level_db - 10 * math.log10(by**2)})
     return check(recipe.model_copy(update=changes).model_dump(mode="json"), Recipe, f"--scale {by}")
 
 

@@ -85,6 +85,8 @@ class FrameRow(Settings):
     """Frames of one device share the errors of a device."""
     file: str
     """Path below the dataset, with `/`."""
+    part: int | None
+    """Number of the frame's first part in that file where it holds several frames; else None."""
     sha256: str
     """Digest of that file, 64 hex digits."""
     camera: str
@@ -138,6 +140,8 @@ class TruthRow(Settings):
     linear_velocity_m_s: Triple | None
     """Velocity of the projection centre, world axes; None at rest."""
     leds: tuple[LedTruth, ...]
+    added_noise_dn: float | None
+    """Standard deviation of the noise that `[added_noise]` adds before rounding, digital numbers; None without."""
     bound_m2: Flat9 | None
     """Cramér-Rao bound of the position; hybrid with a belief."""
     bound_exact_m2: Flat9 | None
@@ -181,6 +185,10 @@ class FrameRecord(Settings):
     def frame(self) -> int:
         """Number of the frame."""
         return self.device.frame
+
+    def with_digest(self, sha256: str) -> "FrameRecord":
+        """The record with the digest of its file."""
+        return self.model_copy(update={"device": self.device.model_copy(update={"sha256": sha256})})
 
 
 _SCALARS = {int: pa.int64(), float: pa.float64(), str: pa.string(), bool: pa.bool_()}

@@ -1,7 +1,7 @@
 """Verification of a dataset on disk: every file present and intact, and the truth consistent with the LED map."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from functools import cache, partial
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cache, lru_cache, partial
 from itertools import pairwise
 from pathlib import Path
 from typing import TypeVar
@@ -14,8 +14,9 @@ from vlcrender.camera.distortion import Distortion
 from vlcrender.camera.intrinsics import Camera, transform
 from vlcrender.camera.roi import Roi
 from vlcrender.config.toml_model import check
-from vlcrender.dataset.exr import read_exr_parts
-from vlcrender.dataset.files import EXPECTED, PREVIEWS, PROCESSED, read_dataset_file, sha256_of
+from vlcrender.dataset.exr import ExrPart, read_exr_parts
+from vlcrender.dataset.file_settings import FileSettings
+from vlcrender.dataset.files import EXPECTED, PREVIEWS, PROCESSED, read_dataset_file, read_sweep_file, sha256_of
 from vlcrender.dataset.schema import (
     CameraEntry,
     DatasetFile,
@@ -26,7 +27,9 @@ from vlcrender.dataset.schema import (
     five,
     flat9,
 )
-from vlcrender.dataset.tables import read_table
+from vlcrender.dataset.shard import parts_of_frame
+from vlcrender.dataset.sweep import SWEEP_FILE, sweep_columns
+from vlcrender.dataset.tables import Constants, read_table
 from vlcrender.errors import InputError
 from vlcrender.modulation.transmission import Transmitter, led_waves
 from vlcrender.modulation.wave import Wave
@@ -47,10 +50,29 @@ LINE_ROUNDS = 200
 
 
 def verify(directory: Path) -> list[str]:
-    """Problems of a dataset, one line each; empty where it is complete and intact.
+    """Problems of a dataset, or of all cells of a sweep, one line each; empty where it is complete and intact.
 
-    Raises InputError where there is no readable dataset.json, or where one of its cameras is impossible.
+    Raises InputError where there is no readable dataset.json or sweep.json, or where a dataset's camera is impossible.
     """
+    if not (directory / SWEEP_FILE).is_file():
+        return _problems(directory)
+    problems = []
+    for cell in read_sweep_file(directory).cells:
+        folder = directory / cell.folder
+        try:
+            found = _problems(folder)
+            values = read_dataset_file(folder).provenance.get("sweep")
+        except InputError as error:
+            problems.append(str(error))
+            continue
+        problems += found
+        if values != cell.values:
+            problems.append(f"{folder / 'dataset.json'}: its values are {values}; {SWEEP_FILE} has {cell.values}")
+    return problems
+
+
+def _problems(directory: Path) -> list[str]:
+    """`verify` of one dataset."""
     dataset = read_dataset_file(directory)
     cameras = {
         name: _camera_of(entry, f"{directory / 'dataset.json'}: camera {name}")
@@ -58,9 +80,11 @@ def verify(directory: Path) -> list[str]:
     }
     problems: list[str] = []
     frames = _read_rows(directory / "frames.parquet", FrameRow, dataset.frame_count, problems)
-    truth = _read_rows(directory / "truth.parquet", TruthRow, dataset.frame_count, problems)
+    columns = sweep_columns(dataset.provenance.get("sweep") or {})
+    truth = _read_rows(directory / "truth.parquet", TruthRow, dataset.frame_count, problems, columns)
+    digest, parts_of = cache(sha256_of), lru_cache(maxsize=1)(read_exr_parts)  # frames of a shard follow each other
     for row in frames:
-        problems += _frame_problems(directory, row, dataset)
+        problems += _frame_problems(directory, row, dataset, digest, parts_of)
     recipe = dataset.provenance.get("recipe", {})
     maps: dict[int, Positions] = {0: {led.id: np.array(led.position_m) for led in dataset.led_map or ()}}
     devices: list[DeviceTruthRow] | None = None
@@ -72,8 +96,9 @@ def verify(directory: Path) -> list[str]:
         maps = {}
         for led in built:
             maps.setdefault(led.map, {})[led.led] = np.array(led.position_m)  # type: ignore[index]
-    folders = extra_folders(bool(recipe.get("expected")), recipe.get("processed") is not None)
-    missing = missing_files(directory, folders, range(dataset.frame_count))
+    files = check(recipe.get("files", {}), FileSettings, "dataset.json: provenance.recipe.files")
+    folders = extra_folders(bool(recipe.get("expected")), recipe.get("processed") is not None, files)
+    missing = missing_files(directory, folders, range(dataset.frame_count), files)
     problems += [f"{path}: is missing" for path in missing.values()]
     problems += _time_problems(frames, dataset)
     waves = cache(partial(_waves_of, dataset))
@@ -96,19 +121,22 @@ def verify(directory: Path) -> list[str]:
     return problems
 
 
-def extra_folders(expected: bool, processed: bool) -> list[str]:
-    """Folders that hold one file for each frame beside `frames`."""
-    return [PREVIEWS, *([EXPECTED] if expected else []), *([PROCESSED] if processed else [])]
+def extra_folders(expected: bool, processed: bool, files: FileSettings) -> list[str]:
+    """Folders that hold one file a frame beside `frames`."""
+    wanted = ((PREVIEWS, files.has_preview(0)), (EXPECTED, expected), (PROCESSED, processed))
+    return [folder for folder, is_wanted in wanted if is_wanted]
 
 
-def missing_files(directory: Path, folders: Iterable[str], frames: Iterable[int]) -> dict[int, Path]:
+def missing_files(
+    directory: Path, folders: Iterable[str], frames: Iterable[int], files: FileSettings
+) -> dict[int, Path]:
     """Frames without a file in one of the folders -> the first file that is missing (path without suffix)."""
     missing: dict[int, Path] = {}
     numbers = list(frames)
     for folder in folders:
         present = {path.stem for path in (directory / folder).glob("*") if path.suffix != ".partial"}
         for frame in numbers:
-            if f"{frame:06d}" not in present:
+            if f"{frame:06d}" not in present and (folder != PREVIEWS or files.has_preview(frame)):
                 missing.setdefault(frame, directory / folder / f"{frame:06d}")
     return missing
 
@@ -150,10 +178,12 @@ def _true_camera_of(entry: CameraEntry, row: TruthRow) -> Camera:
     return _camera_of(entry.model_copy(update=changes), f"truth.parquet: frame {row.frame}")
 
 
-def _read_rows(path: Path, model: type[R], count: int, problems: list[str]) -> list[R]:
+def _read_rows(
+    path: Path, model: type[R], count: int, problems: list[str], constants: Constants | None = None
+) -> list[R]:
     """Rows of a table; none, and a line in `problems`, where the table is damaged."""
     try:
-        rows = read_table(path, model)
+        rows = read_table(path, model, constants)
     except InputError as error:
         problems.append(str(error))
         return []
@@ -163,20 +193,30 @@ def _read_rows(path: Path, model: type[R], count: int, problems: list[str]) -> l
     return rows
 
 
-def _frame_problems(directory: Path, row: FrameRow, dataset: DatasetFile) -> list[str]:
+def _frame_problems(
+    directory: Path,
+    row: FrameRow,
+    dataset: DatasetFile,
+    digest: Callable[[Path], str],
+    parts_of: Callable[[Path], list[ExrPart]],
+) -> list[str]:
     path = directory / row.file
     if row.camera not in dataset.cameras:
         return [f"{directory / 'frames.parquet'}: frame {row.frame}: camera {row.camera!r} is not in dataset.json"]
     if not path.is_file():
         return [f"{path}: is missing"]
-    if sha256_of(path) != row.sha256:
+    if digest(path) != row.sha256:
         return [f"{path}: SHA-256 differs from frames.parquet: the file was changed or truncated"]
     camera = dataset.cameras[row.camera]
     sensor = Roi(0, 0, camera.height_px, camera.width_px)
     try:
-        parts = read_exr_parts(path)
+        parts = parts_of(path)
     except InputError as error:
         return [str(error)]
+    if row.part is not None:
+        parts = parts_of_frame(parts, row.frame, row.part)
+        if not parts:
+            return [f"{path}: part {row.part} is not the first one of frame {row.frame}"]
     regions = [part.roi for part in parts]
     if not parts or any(part.dtype != np.uint32 or part.sensor != sensor for part in parts):
         return [f"{path}: a part is not uint32 of a sensor of {camera.height_px, camera.width_px} pixels"]

@@ -29,6 +29,7 @@ other groups are part of the background.
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -168,6 +169,11 @@ class FrameSlopes:
 
     def exact_bound_m2(self, tilt_sigmas_deg: tuple[float, float]) -> Array | None:
         """Bound of the position, (3, 3), m2, where lens and map are known; None where it is not determined."""
+        return _position_covariance(self._information, np.radians(tilt_sigmas_deg), self.steps, self.lever())
+
+    @cached_property
+    def _information(self) -> Array:
+        """Information of the pose in the pixels, (6, 6), per m and radian, where lens and map are known."""
         information = np.zeros((6, 6))
         for box in self._boxes():
             for common, inside, weight in self._parts(box):
@@ -180,7 +186,7 @@ class FrameSlopes:
                 nuisances = [self._light(common, patch) for patch in inside]
                 nuisances.append(np.ones((common.rows, common.columns)))
                 information += _marginal(slopes, np.stack(nuisances), weight)
-        return _position_covariance(information, np.radians(tilt_sigmas_deg), self.steps, self.lever())
+        return information
 
     def hybrid_bound_m2(
         self, tilt_sigmas_deg: tuple[float, float], leds: Leds, uncertainty: Uncertainty

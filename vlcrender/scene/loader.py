@@ -3,13 +3,14 @@
 World frame: metres, right-handed, z up, origin at a floor corner.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vlcrender.config.toml_model import check, read_toml
+from vlcrender.config.toml_model import check, override, read_toml
 from vlcrender.errors import InputError
 from vlcrender.scene.leds import Leds, leds_of
 from vlcrender.scene.schema import SceneSettings
@@ -42,9 +43,15 @@ class Scene:
         return np.array(self.settings.room.size_m)
 
 
-def load_scene(path: Path) -> Scene:
-    """The scene of a TOML file. Raises InputError that names file, key and value."""
-    return build_scene(check(read_toml(path), SceneSettings, str(path)), str(path), path.parent)
+def load_scene(
+    path: Path, assignments: Iterable[str] = (), source: str | None = None, how: str = "--set scene."
+) -> Scene:
+    """The scene of a TOML file with `key=value` assignments applied. Raises InputError that names file, key and value.
+
+    source: start of the messages, the path where not given. how: as in `toml_model.override`.
+    """
+    tree, source = override(read_toml(path), assignments, how), source or str(path)
+    return build_scene(check(tree, SceneSettings, source), source, path.parent)
 
 
 def build_scene(settings: SceneSettings, source: str, folder: Path = Path()) -> Scene:

@@ -131,6 +131,11 @@ class Sensor(Settings):
         return self
 
     @property
+    def spectral_response(self) -> str:
+        """All that expected images depend on, as the JSON of a sensor: quantum efficiency, mosaic and crosstalk."""
+        return self.model_dump_json(include={"quantum_efficiency", "mosaic", "crosstalk"})
+
+    @property
     def largest_dn(self) -> int:
         """Largest number of the ADC."""
         return int(2**self.bits - 1)

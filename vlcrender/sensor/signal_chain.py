@@ -1,6 +1,7 @@
 """Exposure: expected electrons to digital numbers, through the chain that `sensor` describes step by step."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,11 +13,15 @@ from vlcrender.core.philox import PHILOX, kernel_seed, normals
 from vlcrender.core.random_keys import random_key
 from vlcrender.sensor.pixel_indices import pixel_indices
 from vlcrender.sensor.poisson import MAX_MEAN, draw, poisson_of_regions
-from vlcrender.sensor.sensor import Sensor, clip_full_well
+from vlcrender.sensor.sensor import Electrons, Sensor, clip_full_well
 
 
-def variance_e2(sensor: Sensor, expected_e: NDArray[np.float32], exposure_s: float) -> NDArray[np.float64]:
+def variance_e2(
+    sensor: Sensor, expected_e: NDArray[np.float32], exposure_s: float, added_dn: float = 0.0
+) -> NDArray[np.float64]:
     """Variance of each pixel's digital number in electrons squared, same shape; inf where the pixel is saturated.
+
+    added_dn: standard deviation of noise that `expose` adds, digital numbers.
 
     Fixed patterns count as noise, independent in each pixel: an estimator does not know them. A pixel is saturated
     where its mean is at the full well or the upper limit of the ADC. Rounding adds gain^2 / 12, except where digital
@@ -29,10 +34,29 @@ def variance_e2(sensor: Sensor, expected_e: NDArray[np.float32], exposure_s: flo
     if full:
         added = (sensor.dark_noise_e, sensor.dsnu_e, sensor.row_offset_e, sensor.column_offset_e)
         variance += (sensor.prnu * mean) ** 2 + sum(sigma**2 for sigma in added)
-    if full or gain != 1.0:
+    variance += (added_dn * gain) ** 2
+    if full or gain != 1.0 or added_dn:
         variance += gain**2 / 12
     variance[level >= sensor.saturation_e] = np.inf
     return variance
+
+
+@dataclass(frozen=True)
+class AddedDn:
+    """Normal noise of mean 0, independent in each pixel, that is no part of the sensor."""
+
+    sigma: float
+    """Standard deviation, digital numbers."""
+    key: str
+    """Names its random numbers."""
+
+    def numbers_dn(self, rois: Sequence[Roi]) -> NDArray[np.float64]:
+        """The noise of all pixels of some regions, as `pixel_indices` has them, (pixels,), digital numbers."""
+        with exact_math():
+            noise, _ = normals(kernel_seed(self.key), *pixel_indices(rois))
+            dr.eval(noise)
+        numbers_dn: NDArray[np.float64] = self.sigma * noise.numpy().astype(np.float64)
+        return numbers_dn
 
 
 def expose(
@@ -57,18 +81,31 @@ def expose(
 
 
 def expose_regions(
-    sensor: Sensor, expected_e: Sequence[RegionImage], key: str, *, exposure_s: float, camera: str = "main"
+    sensor: Sensor,
+    expected_e: Sequence[RegionImage],
+    key: str,
+    *,
+    exposure_s: float,
+    camera: str = "main",
+    added: AddedDn | None = None,
 ) -> list[RegionImage]:
-    """`expose` of one or more regions of a frame, by one launch of one kernel."""
+    """`expose` of one or more regions of a frame, by one launch of one kernel.
+
+    added: noise that is added to the digital numbers before rounding.
+    """
     rois = [roi for roi, _ in expected_e]
     images = [image.ravel() for _, image in expected_e]
     flat = np.concatenate(images) if len(images) > 1 else images[0]
     if sensor.noise == "full":
-        dn = _full_chain(sensor, flat, key, random_key(sensor.serial, camera), rois, exposure_s)
-    elif sensor.noise == "shot":
+        dn = _full_chain(sensor, flat, key, random_key(sensor.serial, camera), rois, exposure_s, added)
+    elif sensor.noise == "shot" and added is None:
         dn = _shot_noise(sensor, flat, key, rois)
     else:
-        dn = sensor.quantise(clip_full_well(flat, sensor.full_well_e))
+        electrons: Electrons = poisson_of_regions(flat, key, rois) if sensor.noise == "shot" else flat
+        electrons = clip_full_well(electrons, sensor.full_well_e)
+        if added is not None:  # in electrons, as if read noise
+            electrons = electrons + sensor.gain_at_iso_e_per_dn * added.numbers_dn(rois)
+        dn = sensor.quantise(electrons)
     parts = np.split(dn, np.cumsum([roi.pixels for roi in rois])[:-1])
     return [RegionImage(roi, part.reshape(roi.rows, roi.columns)) for roi, part in zip(rois, parts, strict=True)]
 
@@ -89,6 +126,7 @@ def _full_chain(
     individual: str,
     rois: Sequence[Roi],
     exposure_s: float,
+    added: AddedDn | None,
 ) -> NDArray[np.uint32]:
     """Steps 2 to 9 of the chain in the docstring of `sensor`, in one kernel; means and numbers as `pixel_indices`."""
     low, high = float(expected_e.min()), float(expected_e.max())
@@ -118,7 +156,10 @@ def _full_chain(
         )
         electrons = electrons + number(sensor.dark_noise_e) * noise
         electrons = electrons + number(sensor.row_offset_e) * of_row + number(sensor.column_offset_e) * of_column
-        level = dr.round(electrons / number(sensor.gain_at_iso_e_per_dn)) + number(sensor.black_level_dn)  # 8 and 9
+        level = electrons / number(sensor.gain_at_iso_e_per_dn)
+        if added is not None:
+            level = level + number(added.sigma) * normals(kernel_seed(added.key), column, row)[0]
+        level = dr.round(level) + number(sensor.black_level_dn)  # 8 and 9
         dn: Any = mi.UInt32(dr.clip(level, 0.0, number(sensor.largest_dn)))
         dr.eval(dn)
     image: NDArray[np.uint32] = dn.numpy()
