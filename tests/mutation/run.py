@@ -136,10 +136,11 @@ class Map:
     def tests(self, file: str, line: int, most_s: float) -> tuple[list[str], float]:
         """Tests that execute a line, the quickest first (one of its module counts as NEAR of its time), and their time.
 
-        Those that take `most_s` together; for a line that runs at import, of the tests of the whole file.
+        Those that take `most_s` together; for a line that runs at import, of the tests of the whole file; for a file
+        that only runs at import, of the test files that import it.
         """
         lines = self._rows.get(file, {})
-        near = lines.get(line) or set().union(*lines.values()) if lines else set()
+        near = lines.get(line) or set().union(*lines.values()) if lines else self._importing(file)
         module = Path(file).stem
 
         def cost(test: str) -> float:
@@ -153,6 +154,18 @@ class Map:
                 break
             taken.append(test)
         return taken, min(total, most_s)
+
+    def _importing(self, file: str) -> set[str]:
+        """Tests of the files that import a module."""
+        name = ".".join(Path(file).with_suffix("").parts)
+        importing = {of for of in {test.split("::")[0] for test in self._times} if f"from {name} import" in text_of(of)}
+        return {test for test in self._times if test.split("::")[0] in importing}
+
+
+def text_of(test_file: str) -> str:
+    """Source of a test file; empty if it is no longer there."""
+    path = ROOT / test_file
+    return path.read_text() if path.is_file() else ""
 
 
 def make_map() -> None:
