@@ -193,9 +193,9 @@ def _maximize_honestly(
 ) -> tuple[Maximum | Start, bool]:
     """Maximum with what the device states, and with what the images reveal beside it. Raises EstimationFailure.
 
-    Also whether a camera that states no errors is taken as one as sold. `exact` says whether the spots agree with what the device states. Where the pixels lead nowhere, and place or camera
-    are uncertain, the spots' own fit is the result: it is nearly as good then, since the noise of centroids is small
-    beside that uncertainty.
+    Also whether a camera that states no errors is taken as one as sold. `exact` says whether the spots agree with what
+    the device states. Where the pixels lead nowhere, and place or camera are uncertain, the spots' own fit is the
+    result: it is nearly as good then, since the noise of centroids is small beside that uncertainty.
     """
     priors = wider = Priors.of(frame, tuple(frame.leds.values()))
     found, revealed, camera = None, START_COMPONENTS, None

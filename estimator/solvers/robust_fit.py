@@ -12,8 +12,8 @@ to the spots that it leaves in, from poses that put most spots about right:
   hardly reveal a focal length;
 - errors as stated without gravity, where that is optional and contradicts the spots.
 
-The explanation with the largest restricted likelihood is taken; an outlier lies anywhere in OUTLIER_RADIUS. One that
-takes a camera as exact which its spots contradict (`estimator.solvers.camera_check`) is taken only if there is no other.
+The explanation with the largest restricted likelihood is taken; an outlier lies anywhere in OUTLIER_RADIUS. An
+exact camera that the spots contradict (`estimator.solvers.camera_check`) is no explanation if there is another.
 """
 
 from collections.abc import Callable, Iterable, Sequence
