@@ -13,9 +13,10 @@ from estimator.errors import EstimationFailure
 from estimator.methods.gravity_fit import _from_triples as from_triples
 from estimator.methods.gravity_fit import agreement, ambiguous
 from estimator.solvers import robust_fit
+from estimator.solvers.local_minima import minima
 from estimator.solvers.observations import Observations, observe
 from estimator.solvers.reprojection import Fit
-from estimator.solvers.robust_fit import Consensus, consensus, minima
+from estimator.solvers.robust_fit import Consensus, consensus
 from estimator.solvers.robust_fit import _plausible as plausible
 from estimator.solvers.robust_fit import _snooped as data_snooping
 

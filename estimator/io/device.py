@@ -117,7 +117,7 @@ class Camera(Row):
     """Camera of a device: intrinsics, lens, and mounting on the rig; keys as in dataset.json.
 
     `K` maps normalized image coordinates to continuous pixels with pixel centres at +0.5. `uncertainty` is None where
-    the device does not state how well it knows its camera.
+    the device does not state how well it knows its camera; deviations of 0 state that the camera is exact.
     """
 
     width_px: int = Field(ge=1, le=65536)
@@ -154,6 +154,12 @@ class Camera(Row):
             if (self.uncertainty.device_sigmas() + self.uncertainty.shot_sigmas())[of_distortion].any():
                 raise ValueError('sigmas of k1, p1 and p2 have to be 0 with projection "equidistant"')
         return self
+
+    @property
+    def states_no_errors(self) -> bool:
+        """Whether the device states no error of the intrinsics: that they are exact, or nothing of them."""
+        stated = self.uncertainty
+        return stated is None or not any((*stated.device_sigma, *stated.shot_sigma))
 
     def matrix(self) -> Floats:
         """`K` as a (3, 3) array, pixels."""

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from estimator.camera.pose import Pose
 from estimator.io.device import DeviceFrame
+from estimator.methods.camera_statement import Judged, over_frames
 from estimator.methods.centroid_sigma import with_centroid_sigma
 from estimator.methods.pnp import candidates, in_a_plane
 from estimator.methods.up2p import upright_pairs, upright_pose
@@ -47,8 +48,14 @@ def gravity_fit(frame: DeviceFrame, centroid_sigma_px: float = 0.0) -> Estimate:
 
     `centroid_sigma_px` is the standard deviation of centroids by errors that the device does not state.
     """
+    return judged(frame, centroid_sigma_px).estimate
+
+
+def judged(frame: DeviceFrame, centroid_sigma_px: float = 0.0) -> Judged:
+    """The same, and what the frame says of its camera."""
     observations = observe_once(frame, find_correspondences(frame), centroid_sigma_px)
-    return _estimate(agreement_of(frame, observations, centroid_sigma_px))
+    agreed = agreement_of(frame, observations, centroid_sigma_px)
+    return Judged(_estimate(agreed), agreed.contradicted, agreed.doubt_m2)
 
 
 def fit_correspondences(
@@ -135,9 +142,9 @@ def gravity_fit_with(name: str) -> Variant:
     return with_centroid_sigma(name, gravity_fit)
 
 
-GRAVITY_FIT = Variant(
+GRAVITY_FIT = over_frames(
     "gravity-fit",
     "reprojection fit of position and orientation, gravity as a prior, wrong LEDs left out, with covariance",
-    gravity_fit,
-    needs=Needs(3, optional=("accelerometer", "gyroscope")),
+    judged,
+    Needs(3, optional=("accelerometer", "gyroscope")),
 )

@@ -11,9 +11,9 @@ datum) is estimated with the pose, as nuisances with priors (`estimator.pixels.n
 hybrid bound. What it does not state is taken as exact, unless the images contradict: if LED images are displaced
 against each other by more than their noise explains, or have another size or profile, these become nuisances as well.
 The standard deviation of such a nuisance is that of all LEDs of the frame: a variance component (Foerstner 1979). A
-camera that states nothing is then assumed to be one as sold, and so it is where an error of its intrinsics explains the
-images better than an exact camera does (`estimator.pixels.camera_check`). A camera that the images do not check adds
-to the covariance.
+camera that states nothing, or that it is exact, is then assumed to be one as sold, and so it is where an error of its
+intrinsics explains the images better than an exact camera does (`estimator.pixels.camera_check`). A camera that states
+nothing and that the images do not check adds to the covariance.
 
 With a rolling shutter the velocity of the camera while the frame is read out is estimated with the pose, with the
 gyroscope's reading or a hand's motion as a prior (`estimator.solvers.shutter_motion`); the pose is that at mid-readout.
@@ -36,9 +36,10 @@ from scipy.stats import chi2
 from estimator.camera.pose import POSE_PARAMETERS, Pose
 from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame
+from estimator.methods.camera_statement import Judged, over_frames
 from estimator.methods.gravity_fit import agreement_of, ambiguous
 from estimator.methods.up2p import upright_pose
-from estimator.methods.variant import Estimate, Needs, Variant
+from estimator.methods.variant import Estimate, Needs
 from estimator.pixels.camera_check import SHIFT_TOLERANCE_PX, camera_errors_by_pixels
 from estimator.pixels.initial import START_SIGMA_SHARE, Start, gravity_of, start_at_spots
 from estimator.pixels.led_model import (
@@ -123,7 +124,12 @@ class Maximum:
 
 
 def ml(frame: DeviceFrame) -> Estimate:
-    """The most likely position and its covariance; raises EstimationFailure.
+    """The most likely position and its covariance; raises EstimationFailure."""
+    return judged(frame).estimate
+
+
+def judged(frame: DeviceFrame) -> Judged:
+    """The most likely position, and what the frame says of its camera; raises EstimationFailure.
 
     The initial pose is that of `gravity_fit`, which also decides whether the estimate is ambiguous and whether gravity
     is used. With two spots the initial pose is the fit to them and gravity. LEDs without a size have no model, nor has
@@ -137,7 +143,7 @@ def ml(frame: DeviceFrame) -> Estimate:
     correspondences = find_correspondences(frame)
     observations = observe_once(frame, correspondences)
     inliers, use_gravity, is_ambiguous = np.ones(len(observations.leds_m), dtype=bool), True, False
-    exact, unchecked_m2 = True, np.zeros((3, 3))
+    exact, doubt_m2, contradicted = True, np.zeros((3, 3)), False
     if len(observations.leds_m) < MIN_FOR_CONSENSUS:
         upright = upright_pose(observations)
         if upright is None:
@@ -146,28 +152,33 @@ def ml(frame: DeviceFrame) -> Estimate:
     else:
         agreed = agreement_of(frame, observations)
         pose, inliers = agreed.best.pose, agreed.inliers
-        use_gravity, is_ambiguous, unchecked_m2 = agreed.gravity, ambiguous(agreed), agreed.unchecked_m2
+        use_gravity, is_ambiguous = agreed.gravity, ambiguous(agreed)
+        doubt_m2, contradicted = agreed.doubt_m2, agreed.contradicted
         # The centroids of large LEDs have model errors of their own, which the pixels do not have.
         limit_px = MAX_MODEL_ERROR_PX + START_SIGMA_SHARE * _radius_px(observations, pose).max()
         exact = agreed.model is None or agreed.model.added_sigma_px < limit_px
     gravity = gravity_of(frame) if use_gravity else NO_GRAVITY
     positions = set(map(tuple, observations.leds_m[inliers].tolist()))
     spots = [one for one in correspondences if one.led.position_m in positions]
-    found = _maximize_honestly(frame, gravity, spots, pose, exact)
+    found, is_assumed = _maximize_honestly(frame, gravity, spots, pose, exact)
     covariance_m2 = found.covariance[:3, :3]
     if isinstance(found, Maximum):
-        unchecked_m2 = np.zeros((3, 3)) if found.camera is None else found.camera.unchecked_m2()
-    if not _camera_is_assumed(frame, found.components):
-        covariance_m2 = covariance_m2 + unchecked_m2
+        doubt_m2 = np.zeros((3, 3)) if found.camera is None else found.camera.unchecked_m2()
+    unstated = frame.camera.uncertainty is None
+    if is_assumed:
+        doubt_m2 = np.zeros((3, 3))
+    elif unstated:
+        covariance_m2 = covariance_m2 + doubt_m2
     if observations.motion is not None:
         centre_m = observations.leds_m[inliers].mean(axis=0)
         covariance_m2 = covariance_m2 + second_order.of_pose(found.pose, frame.camera, centre_m, found.covariance)
-    return Estimate(found.pose.position_m, covariance_m2=covariance_m2, ambiguous=is_ambiguous)
+    estimate = Estimate(found.pose.position_m, covariance_m2=covariance_m2, ambiguous=is_ambiguous)
+    return Judged(estimate, contradicted or (is_assumed and not unstated), doubt_m2)
 
 
 def _camera_is_assumed(frame: DeviceFrame, components: Components) -> bool:
-    """Whether a camera that states nothing is taken as one as sold: where the images reveal an inexact place."""
-    return frame.camera.uncertainty is None and components.place_m > 0
+    """Whether a camera that states no errors is taken as one as sold: where the images reveal an inexact place."""
+    return frame.camera.states_no_errors and components.place_m > 0
 
 
 def _radius_px(observations: Observations, pose: Pose) -> Floats:
@@ -179,12 +190,12 @@ def _radius_px(observations: Observations, pose: Pose) -> Floats:
 
 def _maximize_honestly(
     frame: DeviceFrame, gravity: Gravity, spots: Sequence[Correspondence], pose: Pose, exact: bool
-) -> Maximum | Start:
+) -> tuple[Maximum | Start, bool]:
     """Maximum with what the device states, and with what the images reveal beside it. Raises EstimationFailure.
 
-    `exact` says whether the spots agree with what the device states. Where the pixels lead nowhere, and place or camera
-    are uncertain, the spots' own fit is the result: it is nearly as good then, since the noise of centroids is small
-    beside that uncertainty.
+    Also whether a camera that states no errors is taken as one as sold. `exact` says whether the spots agree with what
+    the device states. Where the pixels lead nowhere, and place or camera are uncertain, the spots' own fit is the
+    result: it is nearly as good then, since the noise of centroids is small beside that uncertainty.
     """
     priors = wider = Priors.of(frame, tuple(frame.leds.values()))
     found, revealed, camera = None, START_COMPONENTS, None
@@ -197,11 +208,11 @@ def _maximize_honestly(
             if len(spots) < MIN_FOR_CONSENSUS:
                 raise
             if exact and not priors.exact:
-                return start
+                return start, False
     for _ in range(MAX_ROUNDS):
         contradicted = camera is not None and camera.revealed
         if found is not None and revealed == found.components and not contradicted:
-            return replace(found, camera=camera)
+            return replace(found, camera=camera), wider is not priors
         if contradicted or _camera_is_assumed(frame, revealed):
             wider = replace(priors, camera=assumed_uncertainty(frame.camera).device_sigmas())
         start = start_at_spots(frame, gravity, wider, spots, pose, revealed)
@@ -210,11 +221,11 @@ def _maximize_honestly(
         except EstimationFailure:
             if not np.trace(start.covariance[:3, :3]) < MAX_SIGMA_M**2:
                 raise
-            return start
+            return start, wider is not priors
         revealed, camera = _revealed(frame, gravity, wider, found)
     if found is None:
         raise EstimationFailure("fit", DIVERGED)
-    return replace(found, camera=camera)
+    return replace(found, camera=camera), wider is not priors
 
 
 def _revealed(
@@ -231,7 +242,7 @@ def _revealed(
         return START_COMPONENTS, None
     of_leds = priors.only(pixels.index)
     of_place = priors.camera, priors.datum, priors.luminaires, had.added(priors).leds[:, :3]
-    checks_camera = frame.camera.uncertainty is None and not any(part.any() for part in of_place)
+    checks_camera = frame.camera.states_no_errors and not any(part.any() for part in of_place)
     # A shift of the principal point is one of the image.
     shift, size = list(PRINCIPAL_POINT), [SIZE_PARAMETER]
     profile, photometry = result.nuisances.profile(), result.photometry
@@ -351,9 +362,9 @@ def _model_is_wrong(wrong: int, used: int) -> bool:
     return used < min(wrong + used - 1, MIN_USED_SHARE * (wrong + used))
 
 
-ML = Variant(
+ML = over_frames(
     "ml",
     "maximum likelihood on the pixels: true faces under the pose, Poisson, gravity as a prior, with covariance",
-    ml,
-    needs=Needs(2, sizes=True, sensors=("accelerometer",), optional=("gyroscope",)),
+    judged,
+    Needs(2, sizes=True, sensors=("accelerometer",), optional=("gyroscope",)),
 )

@@ -21,6 +21,7 @@ from estimator.camera.leveling import MIN_ELEVATION_SINE
 from estimator.camera.pose import Pose, rotation
 from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame
+from estimator.methods.camera_statement import Judged, over_frames
 from estimator.methods.centroid_sigma import with_centroid_sigma
 from estimator.methods.variant import Estimate, Needs, Variant
 from estimator.solvers.observations import Observations, observe, observe_once
@@ -51,10 +52,15 @@ def up2p(frame: DeviceFrame, centroid_sigma_px: float = 0.0) -> Estimate:
 
     `centroid_sigma_px` is the standard deviation of centroids by errors that the device does not state.
     """
+    return judged(frame, centroid_sigma_px).estimate
+
+
+def judged(frame: DeviceFrame, centroid_sigma_px: float = 0.0) -> Judged:
+    """The same, and what the frame says of its camera."""
     check_poselib()
     correspondences = find_correspondences(frame)
     _check_gravity(frame)
-    return _estimate(observe_once(frame, correspondences, centroid_sigma_px))
+    return _judged(observe_once(frame, correspondences, centroid_sigma_px))
 
 
 def check_poselib() -> None:
@@ -68,7 +74,7 @@ def fit_correspondences(
 ) -> Estimate:
     """The estimate from identified spots; of the frame, camera, accelerometer and map are used."""
     _check_gravity(frame)
-    return _estimate(observe(frame, correspondences, centroid_sigma_px))
+    return _judged(observe(frame, correspondences, centroid_sigma_px)).estimate
 
 
 def _check_gravity(frame: DeviceFrame) -> None:
@@ -76,12 +82,13 @@ def _check_gravity(frame: DeviceFrame) -> None:
         raise EstimationFailure("leveling", "the device has no accelerometer")
 
 
-def _estimate(observations: Observations) -> Estimate:
+def _judged(observations: Observations) -> Judged:
     starts = pair_poses(observations)
     if determine_orientation(observations.leds_m) and not observations.displaced:
         observations = observations.without_gravity()
     agreed = consensus(observations, starts[:1], lambda: [*starts[1:], *upright_pairs(observations)])
-    return Estimate(agreed.best.pose.position_m, covariance_m2=agreed.covariance_m2)
+    estimate = Estimate(agreed.best.pose.position_m, covariance_m2=agreed.covariance_m2)
+    return Judged(estimate, agreed.contradicted, agreed.doubt_m2)
 
 
 def pair_poses(observations: Observations) -> list[Pose]:
@@ -173,9 +180,9 @@ def up2p_with(name: str) -> Variant:
     return with_centroid_sigma(name, up2p)
 
 
-UP2P = Variant(
+UP2P = over_frames(
     "up2p",
     "PoseLib's upright two-point solver in RANSAC, tilt from gravity, then a fit of the spots that agree",
-    up2p,
-    needs=Needs(3, sensors=("accelerometer",), optional=("gyroscope",)),
+    judged,
+    Needs(3, sensors=("accelerometer",), optional=("gyroscope",)),
 )

@@ -24,8 +24,8 @@ from estimator.methods.gravity_fit import initial_poses
 from estimator.methods.maximum_likelihood import ml
 from estimator.methods.variant import Estimate
 from estimator.photo.led_table import LedTable, Mirror, mirror_signs
+from estimator.solvers.local_minima import minima
 from estimator.solvers.observations import observe
-from estimator.solvers.robust_fit import minima
 from estimator.spots.detect import Spot
 from estimator.spots.identify import Correspondence
 

@@ -1,4 +1,4 @@
-"""Check of a camera that states no errors by the pixels at a maximum of the likelihood."""
+"""Check of a camera that states no errors (`estimator.solvers.camera_check`) by the pixels at a maximum."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,4 +1,10 @@
-"""Check of a camera that states no errors by the residuals of a fit, and what an unchecked one may cost."""
+"""Check of a camera that states no errors by the residuals of a fit, and what an unchecked one may cost.
+
+A camera states no errors if it says that it is exact, or says nothing. Where the residuals contradict it by
+MAX_CAMERA_SIGMA, both are taken as one as sold. They differ where the residuals cannot contradict it: the statement
+is then believed, unless other frames of the device contradict it (`estimator.methods.camera_statement`), and a camera
+without one adds to the covariance.
+"""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -59,7 +65,7 @@ class CameraErrors:
 
 @lru_cache(maxsize=1)  # both checks of a fit
 def camera_errors(observations: Observations, best: Fit) -> CameraErrors:
-    """Errors of the intrinsics by the residuals of spots, as of a camera that states none."""
+    """Errors of the intrinsics by the residuals of spots, of a camera that states none."""
     assumed = observations.with_assumed_camera().uncertainty
     count = len(assumed.intrinsics)
     slopes = observations.from_pixels @ assumed.slopes_px(best.pose)[:, :, :count]
@@ -70,11 +76,19 @@ def camera_errors(observations: Observations, best: Fit) -> CameraErrors:
     return CameraErrors(found, 1 / np.sqrt(size2), assumed.sigmas[:count], moved)
 
 
+def contradicts_camera(observations: Observations, best: Fit) -> bool:
+    """Whether the spots contradict a camera that is taken as exact; see `CameraErrors.revealed`.
+
+    False where the spots have errors of camera or map beside their noise.
+    """
+    return not observations.correlated and camera_errors(observations, best).revealed
+
+
 def unchecked_camera_m2(observations: Observations, best: Fit) -> Floats:
-    """Covariance (3, 3) of the position by a camera that states nothing and is not checked by the spots.
+    """Covariance (3, 3) of the position by a camera that is taken as exact and not checked by the spots.
 
     See `CameraErrors.unchecked_m2`. Zero where the spots have errors of camera or map beside their noise.
     """
-    if observations.correlated or observations.camera.uncertainty is not None:
+    if observations.correlated:
         return np.zeros((3, 3))
     return camera_errors(observations, best).unchecked_m2()

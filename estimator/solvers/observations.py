@@ -133,8 +133,8 @@ class Observations:
         return np.asarray(spread @ spread.transpose(0, 2, 1) + added)
 
     def with_assumed_camera(self) -> "Observations":
-        """The same spots; a camera that states nothing has the errors of one as sold."""
-        if self.camera.uncertainty is not None:
+        """The same spots; a camera that states no errors has those of one as sold."""
+        if not self.camera.states_no_errors:
             return self
         return replace(self, uncertainty=self.uncertainty.with_camera(assumed_camera(self.camera)))
 

@@ -8,11 +8,12 @@ to the spots that it leaves in, from poses that put most spots about right:
 - errors as stated, and outliers;
 - stated errors of camera, map and gravity that are larger or smaller by a common factor, estimated from the residuals;
 - where the map's errors are not stated: a further error of each centroid, of a size estimated from the residuals. A
-  camera that states nothing then has the errors of one as sold (`estimator.solvers.uncertainty`), because the
-  residuals hardly reveal a focal length;
+  camera that states no errors then has those of one as sold (`estimator.solvers.uncertainty`), because the residuals
+  hardly reveal a focal length;
 - errors as stated without gravity, where that is optional and contradicts the spots.
 
-The explanation with the largest restricted likelihood is taken; an outlier lies anywhere in OUTLIER_RADIUS.
+The explanation with the largest restricted likelihood is taken; an outlier lies anywhere in OUTLIER_RADIUS. An
+exact camera that the spots contradict (`estimator.solvers.camera_check`) is no explanation if there is another.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -25,10 +26,11 @@ from estimator.camera.motion import MOTION_PARAMETERS
 from estimator.camera.pose import Pose
 from estimator.camera.projection import projection_of
 from estimator.errors import EstimationFailure
-from estimator.solvers.camera_check import camera_errors, unchecked_camera_m2
+from estimator.solvers.camera_check import contradicts_camera, unchecked_camera_m2
 from estimator.solvers.chi_square import chi2_limit, pair_limit
+from estimator.solvers.local_minima import minima
 from estimator.solvers.observations import Observations, centroid_images, corrected_for_eccentricity
-from estimator.solvers.reprojection import Fit, coarse_fit, fit
+from estimator.solvers.reprojection import Fit, fit
 
 Floats = NDArray[np.float64]
 
@@ -57,17 +59,12 @@ OUTLIER_RADIUS = 0.01
 # Inliers, and their share, from which on a pose that they agree on is no chance: ten degrees of freedom.
 MIN_SURE_INLIERS = 8
 MIN_SURE_SHARE = 2 / 3
-# An exact camera has to be a hundred times as likely as one as sold, where it states nothing and errors are revealed.
+# An exact camera has to be a hundred times as likely as one as sold, where neither explains all spots.
 CAUTION_CHI2 = 2 * np.log(100)
 # Largest error of a centroid that is taken as one of map or camera, 3 cm at 3 m, and largest factor of stated errors:
 # larger ones are no explanation.
 MAX_ADDED_RAD = 0.01
 MAX_SCALE = 20.0
-# Poses closer than both lead to one minimum.
-SAME_MINIMUM_RAD = 0.01
-SAME_MINIMUM_M = 0.1
-# A minimum whose sum of squares is so many times that of another is no candidate, whatever its last digits are.
-HOPELESS_RATIO = 100.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,8 +74,9 @@ class Consensus:
     `best` is the best fit, `others` are fits of other local minima to the same spots, best first; `inliers` (n,) are
     the spots used; `gravity` says whether the accelerometer was used. `model` are the observations with the size of
     errors that explains them, None where all spots are explained as stated; `adapted` says that the residuals gave it.
-    `unchecked_m2` (3, 3) is what a camera that neither the device nor the residuals vouch for adds to the position's
-    covariance.
+    `doubt_m2` (3, 3) is what a camera that the residuals do not vouch for adds to the position's covariance, if the
+    device does not vouch for it either: `unstated`. `contradicted` says that a camera which is stated as exact is taken
+    as one as sold.
     """
 
     best: Fit
@@ -87,7 +85,14 @@ class Consensus:
     gravity: bool
     model: Observations | None = None
     adapted: bool = False
-    unchecked_m2: Floats = field(default_factory=lambda: np.zeros((3, 3)))
+    doubt_m2: Floats = field(default_factory=lambda: np.zeros((3, 3)))
+    unstated: bool = True
+    contradicted: bool = False
+
+    @property
+    def unchecked_m2(self) -> Floats:
+        """What a camera that neither the device nor the residuals vouch for adds to the covariance, (3, 3)."""
+        return self.doubt_m2 if self.unstated else np.zeros((3, 3))
 
     @property
     def covariance_m2(self) -> Floats:
@@ -144,7 +149,7 @@ def _consensus(
     if fits and _explains_all(fits[0], observations):
         agreed = Consensus(fits[0], fits[1:], everything, _uses_gravity(observations))
         if _plausible(agreed, observations):
-            return replace(agreed, unchecked_m2=unchecked_camera_m2(observations, fits[0]))
+            return _with_doubt(agreed, observations)
         rough = [one.pose for one in fits]
     else:
         rough = [*(one.pose for one in fits), *starts, *more_starts()]
@@ -154,11 +159,20 @@ def _consensus(
         found += _explanations(observations.without_gravity(), rough, sizes=(False,))
     if not found:
         raise EstimationFailure("position", "no pose explains gravity and most of the spots")
-    best = min(found, key=lambda one: _score(one, observations))
+    best = min(found, key=lambda one: (_contradicts_camera(one, observations), _score(one, observations)))
     fits = minima(best.of_inliers(), [best.best.pose, *starts])
     if fits:
         best = replace(best, best=fits[0], others=fits[1:])
-    return replace(best, unchecked_m2=unchecked_camera_m2(best.of_inliers(), best.best))
+    return _with_doubt(best, observations)
+
+
+def _with_doubt(agreed: Consensus, observations: Observations) -> Consensus:
+    """A consensus with what it says of a camera that states no errors."""
+    model = observations if agreed.model is None else agreed.of_inliers()
+    unstated = observations.camera.uncertainty is None
+    contradicted = not unstated and model.correlated and not observations.correlated
+    doubt_m2 = unchecked_camera_m2(model, agreed.best)
+    return replace(agreed, doubt_m2=doubt_m2, unstated=unstated, contradicted=contradicted)
 
 
 def _explanations(
@@ -172,12 +186,14 @@ def _explanations(
     ranked, assumed = _ranked(observations, rough), observations.with_assumed_camera()
     models = [observations] if assumed is observations else [observations, assumed]
     attempts = [(model, adapted) for adapted in sizes for model in models]
-    found = []
+    found: list[Consensus] = []
     for model, adapted in attempts:
+        if adapted and model is not assumed and any(_contradicts_camera(one, observations) for one in found):
+            continue
         explained = _snooped_consensus(model, ranked, adapted)
         if explained is None:
             continue
-        # Larger errors than those of centroids are of the map or camera: one that states nothing is then not exact.
+        # Larger errors than those of centroids are of the map or camera: one that states none is then not exact.
         if model is not assumed and explained.model is not None and explained.model.added_sigma_px > MODEL_ERROR_PX:
             continue
         found.append(explained)
@@ -190,12 +206,16 @@ def _explanations(
 
 def _plausible(agreed: Consensus, observations: Observations) -> bool:
     """Whether chi-square of inliers and gravity is as the errors say, and the spots do not contradict the camera."""
-    chosen = observations if agreed.inliers.all() else observations.only(agreed.inliers)
-    best = agreed.best
-    freedom = max(_freedom(chosen), 1)
+    best, freedom = agreed.best, max(_freedom(observations.only(agreed.inliers)), 1)
     if best.tilt_chi2 > chi2_limit(OUTLIER_PROBABILITY, 2) or best.chi2 > chi2_limit(OUTLIER_PROBABILITY, freedom):
         return False
-    return chosen.correlated or chosen.camera.uncertainty is not None or not camera_errors(chosen, best).revealed
+    return not _contradicts_camera(agreed, observations)
+
+
+def _contradicts_camera(agreed: Consensus, observations: Observations) -> bool:
+    """Whether the inliers contradict a camera that is taken as exact."""
+    model = observations if agreed.model is None else agreed.model
+    return contradicts_camera(model if agreed.inliers.all() else model.only(agreed.inliers), agreed.best)
 
 
 def _enough(inliers: NDArray[np.bool_]) -> bool:
@@ -385,49 +405,9 @@ def _score(agreed: Consensus, observations: Observations) -> float:
         if agreed.gravity
         else 2 * np.log(2 * np.pi)
     )
-    # Of two explanations that are about as likely, the one that trusts an unstated camera is the bolder.
-    bold = CAUTION_CHI2 if model.camera.uncertainty is None and not model.correlated else 0.0
+    # Of two explanations that are about as likely, the one that trusts a camera to be exact is the bolder.
+    bold = 0.0 if model.correlated else CAUTION_CHI2
     return bold + float(agreed.best.chi2 + spots + agreed.best.log_determinant + outliers + tilts)
-
-
-def minima(observations: Observations, starts: Iterable[Pose], robust: bool = False) -> tuple[Fit, ...]:
-    """Distinct local minima from the initial poses, best first, with all LEDs in front of the camera and above it.
-
-    A minimum is left out where its sum of squares is HOPELESS_RATIO times that of one before. A robust fit needs most
-    LEDs in front of the camera only: an outlier must not exclude its pose.
-    """
-    fits: list[Fit] = []
-    for start in starts:
-        if any(_same_minimum(start, other.pose) for other in fits):
-            continue
-        try:
-            near = start if robust or not fits else _promising(observations, start, fits)
-            if near is None:
-                continue
-            found = fit(observations, near, "soft_l1" if robust else "linear")
-        except EstimationFailure:
-            continue
-        below = found.pose.position_m[2] < observations.leds_m[:, 2].min()
-        in_front = centroid_images(found.pose, observations.leds_m, observations.lift_m2)[1] > 0
-        possible = below and (2 * in_front.sum() > len(in_front) if robust else in_front.all())
-        distinct = not any(_same_minimum(found.pose, other.pose) for other in fits)
-        if possible and np.isfinite(found.cost) and distinct:
-            fits.append(found)
-    return tuple(sorted(fits, key=lambda one: one.cost))
-
-
-def _promising(observations: Observations, start: Pose, known: Sequence[Fit]) -> Pose | None:
-    """A pose nearer to the minimum from an initial one; None if it is one of those known, or hopeless beside them."""
-    pose, cost = coarse_fit(observations, start)
-    drop = cost > HOPELESS_RATIO * (1 + min(one.cost for one in known))
-    return None if drop or any(_same_minimum(pose, one.pose) for one in known) else pose
-
-
-def _same_minimum(one: Pose, other: Pose) -> bool:
-    """Whether two poses lead to one minimum: 0.6 deg is less than the distance of the two minima of LEDs in a plane."""
-    rotated = np.linalg.norm(one.R_cam_world - other.R_cam_world)
-    moved = np.linalg.norm(one.position_m - other.position_m)
-    return bool(rotated < SAME_MINIMUM_RAD and moved < SAME_MINIMUM_M)
 
 
 def _explains_all(found: Fit, observations: Observations) -> bool:

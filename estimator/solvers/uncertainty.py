@@ -152,12 +152,12 @@ def _of_camera(camera: Camera) -> tuple[list[Parameter], list[float], list[int]]
 
 @lru_cache(maxsize=16)
 def assumed_camera(camera: Camera) -> Camera:
-    """A camera that states no errors with those of `assumed_uncertainty`."""
+    """A camera with the errors of `assumed_uncertainty`."""
     return camera.model_copy(update={"uncertainty": assumed_uncertainty(camera)})
 
 
 def assumed_uncertainty(camera: Camera) -> CameraUncertainty:
-    """Errors of a camera that states none: those of one as sold, by AS_SOLD and the radius of its sensor's corner."""
+    """Errors of a camera as sold, by AS_SOLD and the radius of its sensor's corner."""
     lengths_px = [
         AS_SOLD[name] / camera.pixel_pitch_um for name in ("principal_point_um", "radial_um", "decentering_um")
     ]

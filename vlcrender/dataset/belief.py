@@ -132,6 +132,10 @@ class CameraSigmas:
     """Of its rotation on the rig, about each axis, degrees; 0 for `main`."""
 
 
+EXACT_CAMERA: Final = CameraSigmas(np.zeros(len(CAMERA_PARAMETERS)), np.zeros(len(CAMERA_PARAMETERS)), 0.0, 0.0)
+"""A camera without errors, as a recipe without [belief] has it."""
+
+
 @dataclass(frozen=True)
 class Sigmas:
     """Standard deviations of all errors, in the units of datasets/FORMAT.md. Zero: no error."""

@@ -16,7 +16,7 @@ from vlcrender.camera.distortion import Distortion
 from vlcrender.camera.rig import Mounted
 from vlcrender.camera.shutter import Shutter
 from vlcrender.config.toml_model import Settings
-from vlcrender.dataset.belief import CAMERA_PARAMETERS, CameraSigmas, Sigmas
+from vlcrender.dataset.belief import CAMERA_PARAMETERS, EXACT_CAMERA, CameraSigmas, Sigmas
 from vlcrender.dataset.downlink_entry import DownlinkEntry
 from vlcrender.scene.as_built import Luminaires
 from vlcrender.scene.leds import Leds
@@ -357,19 +357,18 @@ class DatasetFile(Settings):
 
 
 def camera_entry(mounted: Mounted, sigmas: CameraSigmas | None = None) -> CameraEntry:
-    """The entry of a camera on a rig, with the standard deviations that its device is told."""
+    """The entry of a camera on a rig, with the standard deviations that its device is told: 0 without `sigmas`."""
     arrays = {"K": mounted.camera.matrix, "R_cam_rig": mounted.rotation, "offset_m": mounted.offset_m}
     own = {"image_distance_mm": mounted.camera.image_distance_mm, **{key: a.tolist() for key, a in arrays.items()}}
     shared = mounted.camera.model_dump(include=set(CameraEntry.model_fields) - set(own))
-    uncertainty = None
-    if sigmas is not None:
-        uncertainty = CameraUncertainty(
-            parameters=CAMERA_PARAMETERS,
-            device_sigma=_seven(sigmas.device),
-            shot_sigma=_seven(sigmas.shot),
-            offset_sigma_m=sigmas.offset_m,
-            rotation_sigma_deg=sigmas.rotation_deg,
-        )
+    told = EXACT_CAMERA if sigmas is None else sigmas
+    uncertainty = CameraUncertainty(
+        parameters=CAMERA_PARAMETERS,
+        device_sigma=_seven(told.device),
+        shot_sigma=_seven(told.shot),
+        offset_sigma_m=told.offset_m,
+        rotation_sigma_deg=told.rotation_deg,
+    )
     return CameraEntry.model_validate({**shared, **own, "uncertainty": uncertainty})
 
 
