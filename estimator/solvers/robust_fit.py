@@ -74,9 +74,9 @@ class Consensus:
     `best` is the best fit, `others` are fits of other local minima to the same spots, best first; `inliers` (n,) are
     the spots used; `gravity` says whether the accelerometer was used. `model` are the observations with the size of
     errors that explains them, None where all spots are explained as stated; `adapted` says that the residuals gave it.
-    `doubt_m2` (3, 3) is what a camera that the residuals do not vouch for adds to the position's covariance, if the
-    device does not vouch for it either: `unstated`. `contradicted` says that a camera which is stated as exact is taken
-    as one as sold.
+    `unchecked_m2` (3, 3) is what a camera that neither the device nor the residuals vouch for adds to the position's
+    covariance; `doubt_m2` (3, 3) is the same of a camera that the device alone vouches for, and is not added.
+    `contradicted` says that a camera which states no errors is taken as one as sold.
     """
 
     best: Fit
@@ -85,14 +85,9 @@ class Consensus:
     gravity: bool
     model: Observations | None = None
     adapted: bool = False
+    unchecked_m2: Floats = field(default_factory=lambda: np.zeros((3, 3)))
     doubt_m2: Floats = field(default_factory=lambda: np.zeros((3, 3)))
-    unstated: bool = True
     contradicted: bool = False
-
-    @property
-    def unchecked_m2(self) -> Floats:
-        """What a camera that neither the device nor the residuals vouch for adds to the covariance, (3, 3)."""
-        return self.doubt_m2 if self.unstated else np.zeros((3, 3))
 
     @property
     def covariance_m2(self) -> Floats:
@@ -169,10 +164,10 @@ def _consensus(
 def _with_doubt(agreed: Consensus, observations: Observations) -> Consensus:
     """A consensus with what it says of a camera that states no errors."""
     model = observations if agreed.model is None else agreed.of_inliers()
-    unstated = observations.camera.uncertainty is None
-    contradicted = not unstated and model.correlated and not observations.correlated
-    doubt_m2 = unchecked_camera_m2(model, agreed.best)
-    return replace(agreed, doubt_m2=doubt_m2, unstated=unstated, contradicted=contradicted)
+    left_m2, none_m2 = unchecked_camera_m2(model, agreed.best), np.zeros((3, 3))
+    unchecked_m2, doubt_m2 = (left_m2, none_m2) if observations.camera.uncertainty is None else (none_m2, left_m2)
+    contradicted = model.correlated and not observations.correlated
+    return replace(agreed, unchecked_m2=unchecked_m2, doubt_m2=doubt_m2, contradicted=contradicted)
 
 
 def _explanations(
