@@ -37,9 +37,8 @@ figures: $(READY)
 bench: $(READY)
 	$(BIN)/python benchmarks/full_frame.py
 	$(BIN)/python benchmarks/options.py
-	$(BIN)/python benchmarks/regions.py
+	$(BIN)/python benchmarks/workers.py
 	$(BIN)/python benchmarks/errors.py
-	$(BIN)/python benchmarks/sensor.py
 	$(BIN)/python benchmarks/memory.py
 	$(BIN)/python benchmarks/growth.py
 	$(BIN)/python benchmarks/denoise.py

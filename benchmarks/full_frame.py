@@ -27,6 +27,17 @@ from vlcrender.sensor.signal_chain import expose
 
 POSE = Pose((3.15, 3.1, 0.6), tilt_x_deg=6.0, tilt_y_deg=-8.0, yaw_deg=20.0)
 EXPOSURE_S = 160e-6
+FULL = Sensor(
+    noise="full",
+    prnu=0.01,
+    dark_current_e_s=10.0,
+    dsnu_e=1.0,
+    read_noise_e=2.0,
+    adc_noise_dn=0.3,
+    row_offset_e=0.2,
+    column_offset_e=0.2,
+    black_level_dn=64,
+)
 
 
 def render(loaded: "mi.Scene", integrator: "mi.Integrator", samples_per_pixel: int) -> None:
@@ -89,6 +100,11 @@ def main() -> None:
             lambda: expose(sensor, expected, "bench", exposure_s=EXPOSURE_S), lambda: generator.poisson(expected)
         )
         targets.at_most("noise and digital numbers / NumPy's SFC64 Poisson", noise, 0.45)
+        chain = compare(
+            lambda: expose(FULL, expected, "bench", exposure_s=EXPOSURE_S),
+            lambda: expose(sensor, expected, "bench", exposure_s=EXPOSURE_S),
+        )
+        targets.beside("full sensor chain / shot noise alone", chain)
         try:
             import cv2
         except ImportError:

@@ -10,7 +10,7 @@ from test_raycast import room
 
 from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.posed_camera import PosedCamera
-from vlcrender.camera.psf import AIRY_TAIL, defocus_diameter_px, split_for, split_kernel
+from vlcrender.camera.psf import AIRY_TAIL, MIN_DEVIATION, defocus_diameter_px, split_for, split_kernel
 from vlcrender.camera.roi import Roi
 from vlcrender.core.planar_shapes import Disc
 from vlcrender.rendering.led_blur import LedKernel, led_blur
@@ -229,3 +229,22 @@ def test_a_narrower_diffraction_pattern_needs_more_parts_of_a_pixel() -> None:
     ]
     assert parts == sorted(parts, reverse=True)
     assert parts[0] > parts[-1]
+
+
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+def test_kernels_of_parts_differ_where_deviations_say(camera: Camera) -> None:
+    """Blurred by deviations alone, the edges give what the whole kernels of their parts give.
+
+    Each pixel is left without what is below MIN_DEVIATION, of at most all edge pixels' excess.
+    """
+    coverage, roi, edges = sharp_image(camera)
+    parts = split_kernel(camera, OVERHEAD_M)
+    assert parts is not None
+    n, m = parts.split, parts.parts.shape[-1]
+    ours = LedKernel(parts.whole, parts).spread(coverage, roi, [edges], 1.0)
+    expected = LedKernel(parts.whole).spread(coverage, roi, [], 1.0)
+    for row, column, excess in zip(edges.rows - roi.row, edges.columns - roi.column, edges.excess, strict=True):
+        expected[row : row + m, column : column + m] += np.tensordot(excess, parts.parts, 2) / n**2
+    share = np.abs(edges.excess).mean(axis=(1, 2)).sum()
+    assert np.abs(ours - expected).max() < MIN_DEVIATION * share
+    assert parts.deviations.shape[-1] <= m

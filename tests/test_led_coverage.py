@@ -9,7 +9,7 @@ from vlcrender.camera.distortion import Distortion
 from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.core.planar_shapes import Disc, Rectangle, circle_polygon_area, rectangle_polygon_area
-from vlcrender.rendering.led_coverage import LedCoverage, LedFace, coverage_of_led
+from vlcrender.rendering.led_coverage import CoverageBlocks, LedCoverage, LedFace, _coverage_of_band, coverage_of_led
 from vlcrender.scene.bounding_spheres import BoundingSpheres
 
 SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
@@ -303,3 +303,37 @@ def test_candidates_include_every_led_that_lights_a_pixel(camera: Camera, rng: n
         assert set(seen) <= set(candidates.tolist())
         false_candidates += len(candidates) - len(seen)
     assert false_candidates < 8 * 250 / 4
+
+
+@pytest.mark.parametrize("shape", [Disc(0.2), Rectangle((0.5, 0.3))], ids=["disc", "rectangle"])
+def test_coverage_of_a_large_image_is_that_of_its_bands(shape: Disc | Rectangle) -> None:
+    """Blocks that a face covers whole or not at all have no pixels; all others are computed as without blocks."""
+    pose = Pose((1.1, 1.2, 0.5), 2.0, -3.0, 25.0)
+    posed = PosedCamera(Camera(width_px=1200, height_px=900, pixel_pitch_um=4.0), pose)
+    face = LedFace(np.array([1.2, 1.3, 2.5]), shape)
+    image = coverage_of_led(posed, face)
+    assert image is not None
+    assert isinstance(image.pixels, CoverageBlocks)
+    roi = image.roi
+    u = np.arange(roi.column, roi.end_column + 1, dtype=float)
+    v = np.arange(roi.row, roi.end_row + 1, dtype=float)
+    expected, _ = _coverage_of_band(posed, face, u, v)
+    assert image.pixels.whole.any()
+    assert not (image.pixels.whole | image.pixels.mixed).all()
+    # pixels beside the face's edge have rounding errors of their area, 1e-16 of it, where they are not computed
+    assert np.allclose(image.coverage, expected, rtol=0, atol=1e-14)
+    assert image.area_px == pytest.approx(expected.sum(), rel=1e-12)
+
+
+def test_no_pixel_at_a_disc_s_edge_is_left_out() -> None:
+    """The cells that a circle enters between two corners only, at its four extremes, have a coverage of their own."""
+    for center in np.linspace(-0.5, 0.5, 21):
+        x, y = np.meshgrid(np.arange(-12.0, 13.0) + center, np.arange(-12.0, 13.0))
+        disc = Disc(7.005)  # reaches 0.005 beyond lines of corners, with a chord of half a cell
+        whole, mixed = disc.whole_and_mixed(x, y)
+        rest = ~(whole | mixed)
+        row, column = np.nonzero(rest)
+        corners = ((0, 0), (0, 1), (1, 1), (1, 0))
+        quads = np.stack([[x[row + i, column + j], y[row + i, column + j]] for i, j in corners]).transpose(2, 0, 1)
+        assert disc.shared_area(quads).max() < 1e-12
+        assert np.count_nonzero(mixed) < 2 * 8 * 7.005  # a circle of radius r enters at most about 8 r cells

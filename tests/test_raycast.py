@@ -191,7 +191,7 @@ def cast(
     """Value at rates of 2 for LEDs and 3 for ambient light, surface, distance and length of the path of one ray."""
     rays = Room(light.mesh, scene.glazings, scene.surfaces)
     direction = mi.Vector3f(*(np.array(towards) / np.linalg.norm(towards)).tolist())
-    hit = rays.trace(mi.Point3f(*map(float, origin)), direction, rays.values(light, 2.0, 3.0), **spread)
+    hit = rays.trace(mi.Point3f(*map(float, origin)), direction, [rays.values(light, 2.0, 3.0)], **spread)
     return [float(x.numpy()[0]) for x in (hit.value, hit.surface, hit.distance_m, hit.path_m)]
 
 

@@ -270,9 +270,10 @@ class Camera(Settings):
     def sensor_position(self, u: Any, v: Any) -> tuple[Any, Any]:
         """Position on the sensor, K^-1 [u, v, 1]: (x, y) from the axis in units of f_i. Arrays as in `unproject`."""
         inverse = self.inverse_matrix()
-        x = inverse[0][0] * u + inverse[0][1] * v + inverse[0][2]
-        y = inverse[1][1] * v + inverse[1][2]
-        return x, y
+        x = inverse[0][0] * u
+        if self.skew_px != 0:  # without skew an x of columns stays one row
+            x = x + inverse[0][1] * v
+        return x + inverse[0][2], inverse[1][1] * v + inverse[1][2]
 
     def unproject(self, u: Any, v: Any, xp: Any = np) -> tuple[Any, Any, Any]:
         """Direction (x, y, z) in camera axes of pixel positions (u, v), elementwise.

@@ -48,6 +48,11 @@ class Roi:
         return self.column + self.columns
 
     @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.rows, self.columns
+
+    @property
     def pixels(self) -> int:
         """Number of pixels."""
         return self.rows * self.columns

@@ -31,7 +31,7 @@ class Disc:
     def whole_and_mixed(self, x: Array, y: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Masks of cells that are inside whole, and of others that may be in part.
 
-        x, y: of the cells' corners, (rows + 1, columns + 1).
+        x, y: of the cells' corners, (..., rows + 1, columns + 1).
         """
         distance = np.hypot(x, y)
         farthest = _corner_extreme(distance, np.maximum)
@@ -40,7 +40,8 @@ class Disc:
             _corner_extreme(x, np.maximum) - _corner_extreme(x, np.minimum),
             _corner_extreme(y, np.maximum) - _corner_extreme(y, np.minimum),
         )
-        near = _corner_extreme(distance, np.minimum) < self.radius_m + span
+        # A circle that enters a cell between two corners passes one of them within half the side between them.
+        near = _corner_extreme(distance, np.minimum) < np.hypot(self.radius_m, span)
         return whole, near & ~whole & (farthest < BEYOND_HORIZON_M)
 
     def shared_area(self, quads: Array) -> Array:
@@ -76,21 +77,19 @@ class Rectangle:
     def whole_and_mixed(self, x: Array, y: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Masks of cells that are inside whole, and of others that may be in part.
 
-        x, y: of the cells' corners, (rows + 1, columns + 1).
+        x, y: of the cells' corners, (..., rows + 1, columns + 1).
         """
         if self.yaw_deg != 0:
             x, y = np.moveaxis(self._rotated(np.stack([x, y], axis=-1), -1), -1, 0)
-        whole = np.ones((x.shape[0] - 1, x.shape[1] - 1), dtype=bool)
+        whole = np.ones((*x.shape[:-2], x.shape[-2] - 1, x.shape[-1] - 1), dtype=bool)
         mixed = whole.copy()
         for own, size in zip((x, y), self.size_m, strict=True):
             whole &= ~_corner_extreme((own < -size / 2) | (own > size / 2), np.logical_or)
             for beyond in (own <= -size / 2, own >= size / 2):
                 mixed &= ~_corner_extreme(beyond, np.logical_and)
         mixed &= ~whole
-        row, column = np.nonzero(mixed)
         for own in (x, y):  # only a cell with a corner beyond the horizon is as large as that
-            corners = np.stack([own[row + i, column + j] for i in (0, 1) for j in (0, 1)])
-            mixed[row, column] &= np.ptp(corners, axis=0) < BEYOND_HORIZON_M / 2
+            mixed[mixed] = np.ptp(corners_of_cells(own, mixed), axis=-1) < BEYOND_HORIZON_M / 2
         return whole, mixed
 
     def shared_area(self, quads: Array) -> Array:
@@ -243,7 +242,18 @@ def _polygon_area(vertices: Array) -> float:
     return abs(float(np.dot(u, np.roll(v, -1)) - np.dot(v, np.roll(u, -1)))) / 2
 
 
+def corners_of_cells(values: Array, cells: NDArray[np.bool_]) -> Array:
+    """Values at the four corners, in their order about the cell, of the n cells that a mask selects, (n, 4).
+
+    values: at all corners, (..., rows + 1, columns + 1); cells: (..., rows, columns).
+    """
+    around = values[..., :-1, :-1], values[..., :-1, 1:], values[..., 1:, 1:], values[..., 1:, :-1]
+    return np.stack([of_corner[cells] for of_corner in around], axis=-1)
+
+
 def _corner_extreme(values: NDArray[Any], reduce: np.ufunc) -> NDArray[Any]:
-    """Reduce values at cell corners (rows + 1, columns + 1) over the four corners of each cell, (rows, columns)."""
-    extreme: NDArray[Any] = reduce(reduce(values[:-1, :-1], values[:-1, 1:]), reduce(values[1:, :-1], values[1:, 1:]))
+    """Reduce values at cell corners (..., rows + 1, columns + 1) over each cell's, (..., rows, columns)."""
+    extreme: NDArray[Any] = reduce(
+        reduce(values[..., :-1, :-1], values[..., :-1, 1:]), reduce(values[..., 1:, :-1], values[..., 1:, 1:])
+    )
     return extreme

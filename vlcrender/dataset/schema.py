@@ -25,7 +25,7 @@ from vlcrender.sensor.gyroscope import Gyroscope
 
 FORMAT_VERSION: Final = 4
 """`version` of dataset.json."""
-DATA_VERSION = 3
+DATA_VERSION = 4
 """`data_version` of the provenance: raised whenever the same recipe gives other bits."""
 
 Triple = tuple[float, float, float]

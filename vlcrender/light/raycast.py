@@ -10,6 +10,7 @@ mean is exact for a footprint with sides along the image's, of any size; nothing
 reflectance is linear between pixel centres: squares blurred by one pixel, which widens the rectangles.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -67,8 +68,7 @@ class Room:
         parameters["faces"] = all_faces.astype(np.uint32).ravel()
         parameters.update()
         self._scene = mi.load_dict({"type": "scene", "room": shape}, optimize=False)
-        self._vertices = [mi.UInt32(all_faces[:, i].astype(np.uint32)) for i in range(3)]
-        self._owners = mi.UInt32(np.append(np.concatenate(owners), self.nothing).astype(np.uint32))
+        self._faces, self._owners = all_faces, np.append(np.concatenate(owners), self.nothing)
         normals = np.zeros((self.nothing + 1, 3))
         indices = np.ones(self.nothing + 1)
         for number, glazing in enumerate(glazings):
@@ -84,24 +84,36 @@ class Room:
                 self._textured[mesh.faces[mesh.owners == number]] = True
 
     def values(self, light: Lightmap, led_rate: float, ambient_rate: float) -> "mi.Float":
-        """Values of the vertices for `trace`: luminance by LEDs times one rate plus other luminance times another.
+        """Values for `trace`: luminance by LEDs times one rate plus other luminance times another.
 
-        Vertices of textured surfaces have the value of a reflectance of 1.
+        Four numbers for each triangle, which lie together in memory: the value of its first vertex, the differences of
+        the others from that, and the surface's number; and four for no triangle. Vertices of textured surfaces have the
+        value of a reflectance of 1.
         """
         count = len(light.mesh.vertices_m)
         surfaces = led_rate * light.led_cd_m2()[:count] + ambient_rate * light.ambient_cd_m2()[:count]
         lux = led_rate * light.led_lux[:count] + ambient_rate * light.ambient_lux[:count]
         surfaces = np.where(self._textured, lux / np.pi, surfaces)
         glazings = np.repeat([ambient_rate * glazing.luminance_cd_m2 for glazing in self._glazings], 4)
-        return mi.Float(np.concatenate([surfaces, glazings]).astype(np.float32))
+        values = np.concatenate([surfaces, glazings]).astype(np.float32)
+        table = np.zeros((self._triangles + 1, 4), dtype=np.float32)
+        first, second, third = (values[vertices] for vertices in self._faces.T)
+        table[:-1, 0], table[:-1, 1], table[:-1, 2] = first, second - first, third - first
+        table[:, 3] = self._owners
+        return mi.Float(table.ravel())
 
     def trace(
-        self, origin: Any, direction: Any, values: Any, coherent: bool = True, spread: tuple[Any, Any] | None = None
+        self,
+        origin: Any,
+        direction: Any,
+        values: Sequence[Any],
+        coherent: bool = True,
+        spread: tuple[Any, Any] | None = None,
     ) -> Hit:
         """Trace rays from Dr.Jit points along unit directions, world.
 
-        values: by `values`, or a pair of such in one array of two components. spread: change of the direction over one
-        pixel, along rows and along columns; textures need it.
+        values: one or two of those made by `values`; the hits' values are then numbers or pairs. spread: change of the
+        direction over one pixel, along rows and along columns; textures need it.
         """
         value, surface, distance = self._intersect(origin, direction, values, coherent, mi.Bool(True))
         path = distance
@@ -124,16 +136,18 @@ class Room:
             path = dr.select(on_glazing, distance + beyond, distance)
         return Hit(value, surface, distance, path)
 
-    def _intersect(self, origin: Any, direction: Any, values: Any, coherent: bool, active: Any) -> tuple[Any, Any, Any]:
+    def _intersect(
+        self, origin: Any, direction: Any, values: Sequence[Any], coherent: bool, active: Any
+    ) -> tuple[Any, Any, Any]:
         """Value, surface number and distance of the first hit of each ray."""
         hit = self._scene.ray_intersect_preliminary(mi.Ray3f(origin, direction), coherent=coherent, active=active)
         valid = hit.is_valid() & active
         triangle = dr.select(valid, hit.prim_index, self._triangles)
         b1, b2 = hit.prim_uv.x, hit.prim_uv.y
-        corners = [dr.gather(mi.UInt32, c, triangle, valid) for c in self._vertices]
-        at = [dr.gather(type(values), values, corner, valid) for corner in corners]
-        value = dr.fma(b2, at[2] - at[0], dr.fma(b1, at[1] - at[0], at[0]))
-        return dr.select(valid, value, 0.0), dr.gather(mi.UInt32, self._owners, triangle), dr.select(valid, hit.t, 1e9)
+        corners = [dr.gather(mi.Vector4f, table, triangle) for table in values]
+        light = [dr.fma(b2, along_2, dr.fma(b1, along_1, first)) for first, along_1, along_2, _ in corners]
+        value, owner = light[0] if len(light) == 1 else mi.Vector2f(*light), corners[0][3]
+        return dr.select(valid, value, 0.0), mi.UInt32(owner), dr.select(valid, hit.t, 1e9)
 
 
 def _mirrored(vector: Any, normal: Any) -> Any:

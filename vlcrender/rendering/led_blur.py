@@ -65,11 +65,13 @@ class LedKernel:
         result = spread(light, self.whole)
         if self.parts is None:
             return result
-        n, m = self.parts.split, self.parts.parts.shape[-1]
-        kernels = self.parts.parts.reshape(n * n, m * m)
+        # The excess of a pixel's parts adds up to 0, so that what the kernels have in common adds nothing.
+        n, m = self.parts.split, self.parts.deviations.shape[-1]
+        kernels, first = self.parts.deviations.reshape(n * n, m * m), self.radius_px - m // 2
         for edge in edges:
             excess = light_per_excess / n**2 * edge.excess.reshape(-1, n * n)
-            for row, column, of_pixel in zip(edge.rows - roi.row, edge.columns - roi.column, excess, strict=True):
+            rows, columns = edge.rows - roi.row + first, edge.columns - roi.column + first
+            for row, column, of_pixel in zip(rows.tolist(), columns.tolist(), excess, strict=True):
                 # not `@`: the last bits of a matrix product may depend on threads and processor
                 result[row : row + m, column : column + m] += np.einsum("p,pq->q", of_pixel, kernels).reshape(m, m)
         return result

@@ -6,7 +6,8 @@ over the pixel's area except for the change of scale within a pixel: 1e-4 for a 
 less than 1e-3 for one of 400 px; more only where a ray of a fish-eye lens is almost parallel to the LED's plane.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from vlcrender.camera.intrinsics import SENSOR_MARGIN
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.roi import Roi
 from vlcrender.core.face_profile import FaceProfile
-from vlcrender.core.planar_shapes import BEYOND_HORIZON_M, Disc, Rectangle, quadrilateral_area
+from vlcrender.core.planar_shapes import BEYOND_HORIZON_M, Disc, Rectangle, corners_of_cells, quadrilateral_area
 
 Array = NDArray[np.float64]
 
@@ -23,6 +24,10 @@ RIM_POINTS = 720
 """Points of a face's outline: their bounding box misses a disc's edge by at most 1e-5 of its radius."""
 CELLS_AT_ONCE = 500_000
 """Pixels that are computed together: bounds the memory for an LED as large as the image."""
+BLOCK_PX = 16
+"""Rows and columns of a block of a large image: those that the face covers whole or not at all have no pixels."""
+MIN_BLOCKS = 16
+"""Blocks across and down from which on an image is computed in blocks."""
 
 
 @dataclass(frozen=True)
@@ -35,15 +40,72 @@ class LedFace:
 
 
 @dataclass(frozen=True)
+class CoverageBlocks:
+    """Coverage of a region in blocks of BLOCK_PX x BLOCK_PX pixels from its first; the last may extend beyond it."""
+
+    whole: NDArray[np.bool_]
+    """(m, n), blocks that the face covers whole."""
+    mixed: NDArray[np.bool_]
+    """(m, n), other blocks of which the face may cover a part."""
+    parts: Array
+    """Coverage of the pixels of those, (k, BLOCK_PX, BLOCK_PX)."""
+
+    def area_px(self, roi: Roi) -> float:
+        """Sum of the coverage of the region's pixels; `parts` have none beyond it."""
+        rows, columns = (
+            np.minimum(BLOCK_PX, size - BLOCK_PX * np.arange(count))
+            for size, count in zip(roi.shape, self.whole.shape, strict=True)
+        )
+        return float((rows[:, None] * columns * self.whole).sum() + self.parts.sum())
+
+    def reduce(self, light: NDArray[Any]) -> None:
+        """Multiply the light of pixels covered whole, (rows, columns), by their coverage."""
+        for number, lit in enumerate(self.whole | self.mixed):
+            if not lit.all():
+                light[number * BLOCK_PX : (number + 1) * BLOCK_PX] *= lit.repeat(BLOCK_PX)[: light.shape[1]]
+        first_row, first_column = np.nonzero(self.mixed)
+        rows, columns = np.broadcast_arrays(
+            (first_row * BLOCK_PX)[:, None, None] + np.arange(BLOCK_PX)[:, None],
+            (first_column * BLOCK_PX)[:, None, None] + np.arange(BLOCK_PX),
+        )
+        inside = (rows < light.shape[0]) & (columns < light.shape[1])
+        light[rows[inside], columns[inside]] *= self.parts[inside]
+
+
+@dataclass(frozen=True)
 class LedCoverage:
-    """Coverage (rows, columns) of the pixels of a region around one LED image."""
+    """Coverage of the pixels of a region around one LED image."""
 
     roi: Roi
-    coverage: Array
+    pixels: Array | CoverageBlocks
+    """Coverage of each pixel, (rows, columns), or that of a large image in blocks."""
     visible_fraction: float
     """Share of the area of the LED's whole image that is on the sensor."""
     profile: Array | float = 1.0
     """Luminance over the face's mean, averaged over the covered part of each pixel."""
+
+    @property
+    def coverage(self) -> Array:
+        """Coverage of each pixel, (rows, columns); made anew for an image in blocks."""
+        if isinstance(self.pixels, np.ndarray):
+            return self.pixels
+        coverage = np.ones(self.roi.shape)
+        self.reduce(coverage)
+        return coverage
+
+    @property
+    def area_px(self) -> float:
+        """Sum of the coverage of all pixels."""
+        if isinstance(self.pixels, CoverageBlocks):
+            return self.pixels.area_px(self.roi)
+        return float(self.pixels.sum())
+
+    def reduce(self, light: NDArray[Any]) -> None:
+        """Multiply the light of pixels covered whole, (rows, columns), by their coverage."""
+        if isinstance(self.pixels, CoverageBlocks):
+            self.pixels.reduce(light)
+        else:
+            light *= self.pixels
 
 
 def coverage_of_led(posed: PosedCamera, face: LedFace, margin_px: int = 0) -> LedCoverage | None:
@@ -68,17 +130,20 @@ def coverage_of_led(posed: PosedCamera, face: LedFace, margin_px: int = 0) -> Le
     first, last = np.maximum(low, -margin), np.minimum(high, size + margin)
     if (last <= first).any():
         return None
-    coverage, profile = _coverage(posed, face, first, last)
-    if not coverage.any():
+    column, row, end_column, end_row = (int(edge) for edge in (*first, *last))
+    pixels, profile = _coverage(posed, face, first, last)
+    image = LedCoverage(Roi(row, column, end_row - row, end_column - column), pixels, 1.0, profile)
+    if image.area_px == 0:
         return None
-    column, row = (int(edge) for edge in first)
-    fraction = 1.0
     if (low < 0).any() or (high > size).any():
-        on_sensor = coverage[
-            max(0, -row) : max(0, camera.height_px - row), max(0, -column) : max(0, camera.width_px - column)
-        ]
-        fraction = float(min(on_sensor.sum() / face.shape.image_area_px(outline), 1.0))
-    return LedCoverage(Roi(row, column, *coverage.shape), coverage, fraction, profile)
+        sensor = Roi.of_sensor(camera)
+        on_sensor_px = image.area_px
+        if not sensor.contains(image.roi):
+            both = image.roi.intersection(sensor) if sensor.overlaps(image.roi) else Roi(row, column, 0, 0)
+            on_sensor_px = float(image.coverage[image.roi.slices(both)].sum())
+        fraction = min(on_sensor_px / face.shape.image_area_px(outline), 1.0)
+        return replace(image, visible_fraction=fraction)
+    return image
 
 
 def outline_roi(posed: PosedCamera, face: LedFace) -> Roi | None:
@@ -105,9 +170,15 @@ def _outline_px(posed: PosedCamera, face: LedFace) -> Array | None:
     return pixels if np.isfinite(pixels).all() else None
 
 
-def _coverage(posed: PosedCamera, face: LedFace, first: Array, last: Array) -> tuple[Array, Array | float]:
-    """Coverage and profile of the pixels from `first` to before `last`, both (column, row), in bands of rows."""
+def _coverage(
+    posed: PosedCamera, face: LedFace, first: Array, last: Array
+) -> tuple[Array | CoverageBlocks, Array | float]:
+    """Coverage and profile of the pixels from `first` to before `last`, both (column, row), in blocks or bands."""
     columns, rows = last - first
+    if face.profile is None and min(columns, rows) > MIN_BLOCKS * BLOCK_PX:
+        blocks = _coverage_in_blocks(posed, face, first, last)
+        if blocks is not None:
+            return blocks, 1.0
     band = max(1, CELLS_AT_ONCE // int(columns))
     parts = []
     for start in range(0, int(rows), band):
@@ -123,9 +194,8 @@ def _coverage(posed: PosedCamera, face: LedFace, first: Array, last: Array) -> t
 def _coverage_of_band(posed: PosedCamera, face: LedFace, u: Array, v: Array) -> tuple[Array, Array | float]:
     x, y = intersections_with_plane(posed, face.center_m, u[None, :], v[:, None])
     whole, mixed = face.shape.whole_and_mixed(x, y)
-    coverage = whole.astype(float)
     quads = _quads(x, y, mixed)
-    coverage[mixed] = np.clip(face.shape.shared_area(quads) / quadrilateral_area(quads), 0.0, 1.0)
+    coverage = _coverage_of_cells(face, whole, mixed, quads)
     if face.profile is None:
         return coverage, 1.0
     profile = np.ones(coverage.shape)
@@ -134,12 +204,42 @@ def _coverage_of_band(posed: PosedCamera, face: LedFace, u: Array, v: Array) -> 
     return coverage, profile
 
 
+def _coverage_in_blocks(posed: PosedCamera, face: LedFace, first: Array, last: Array) -> CoverageBlocks | None:
+    """Coverage of the pixels from `first` to before `last`, both (column, row).
+
+    Where images of straight lines are straight, a block is a quadrilateral in the face's plane, as a pixel is: it is
+    inside the face, which is convex, if its corners are. None for other lenses, and where a block meets the horizon.
+    """
+    if not posed.camera.lens_projection.keeps_lines_straight:
+        return None
+    u, v = (np.arange(start, end + BLOCK_PX, BLOCK_PX, dtype=float) for start, end in zip(first, last, strict=True))
+    x, y = intersections_with_plane(posed, face.center_m, u[None, :], v[:, None])
+    if max(np.abs(x).max(), np.abs(y).max()) >= BEYOND_HORIZON_M:
+        return None
+    whole, mixed = face.shape.whole_and_mixed(x, y)
+    row, column = np.nonzero(mixed)
+    corners = np.arange(BLOCK_PX + 1)
+    x, y = intersections_with_plane(
+        posed, face.center_m, u[column, None, None] + corners[None, :], v[row, None, None] + corners[:, None]
+    )
+    whole_pixels, mixed_pixels = face.shape.whole_and_mixed(x, y)
+    beyond = v[row, None] + corners[:-1] >= last[1], u[column, None] + corners[:-1] >= last[0]
+    for pixels in (whole_pixels, mixed_pixels):
+        pixels[beyond[0][:, :, None] | beyond[1][:, None, :]] = False
+    parts = _coverage_of_cells(face, whole_pixels, mixed_pixels, _quads(x, y, mixed_pixels))
+    return CoverageBlocks(whole, mixed, parts)
+
+
+def _coverage_of_cells(face: LedFace, whole: NDArray[np.bool_], mixed: NDArray[np.bool_], quads: Array) -> Array:
+    """Coverage of cells: masks of `whole_and_mixed`, and the quadrilaterals of mixed cells in the face's plane."""
+    coverage = whole.astype(float)
+    coverage[mixed] = np.clip(face.shape.shared_area(quads) / quadrilateral_area(quads), 0.0, 1.0)
+    return coverage
+
+
 def _quads(x: Array, y: Array, cells: NDArray[np.bool_]) -> Array:
-    """Corners (n, 4, 2) of the cells that a mask (rows, columns) selects; x, y: (rows + 1, columns + 1)."""
-    row, column = np.nonzero(cells)
-    rows = np.stack([row, row, row + 1, row + 1], axis=1)
-    columns = np.stack([column, column + 1, column + 1, column], axis=1)
-    return np.stack([x[rows, columns], y[rows, columns]], axis=-1)
+    """Corners (n, 4, 2) of the cells that a mask (..., rows, columns) selects; x, y: (..., rows + 1, columns + 1)."""
+    return np.stack([corners_of_cells(x, cells), corners_of_cells(y, cells)], axis=-1)
 
 
 def intersections_with_plane(posed: PosedCamera, center_m: Array, u: Array, v: Array) -> tuple[Array, Array]:

@@ -6,7 +6,7 @@ it lights.
 """
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -17,9 +17,12 @@ from vlcrender.camera.intrinsics import Camera
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.roi import LedRegions, Roi
 from vlcrender.camera.vignetting import relative_illumination
+from vlcrender.core.backend import dr, exact_math
 from vlcrender.core.planar_shapes import Disc, Rectangle
+from vlcrender.rendering.diffuser_light import light_of_diffuser
 from vlcrender.rendering.led_blur import LedBlur
 from vlcrender.rendering.led_coverage import (
+    LedCoverage,
     LedFace,
     coverage_of_led,
     intersections_with_plane,
@@ -27,6 +30,7 @@ from vlcrender.rendering.led_coverage import (
 )
 from vlcrender.rendering.led_edges import LedEdges, edges_of_led
 from vlcrender.rendering.occlusion import LitRegion, Occlusion
+from vlcrender.scene.diffuser import Diffuser
 from vlcrender.scene.leds import Leds
 
 OVERSCAN_DEG = 75.0
@@ -45,34 +49,82 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class LedImage:
-    """Image of one LED at one pose, before blur: `coverage`, and relative illumination `weight`, in each pixel.
+    """Image of one LED at one pose, before blur.
 
-    `coverage` is the share of a pixel that the LED covers and nothing occludes, `clear` the share of that of the LED
-    alone. The luminance in each pixel over the LED's mean along its normal is `beam`, by direction, times `profile`, by
-    place on the face or diffuser. `edges`, for narrow blurs, are the parts of edge pixels times weight and luminance;
-    the occluded share of a pixel is the same in all its parts.
+    `clear` is the share of what the face covers of a pixel that nothing occludes. `edges`, for narrow blurs, are the
+    parts of edge pixels times weight and luminance; the occluded share of a pixel is the same in all its parts. Arrays
+    of pixels are made when they are asked for: those of diffusers are as large as the sensor, and many.
     """
 
-    roi: Roi
-    coverage: Array
+    leds: Leds
+    index: int
+    posed: PosedCamera
+    face: LedCoverage
     clear: Array | float
-    weight: Array
-    beam: Array | float
-    profile: Array | float
     visible_fraction: float
     imaged_fraction: float
     edges: LedEdges | None
 
     @property
-    def pattern(self) -> Array | float:
-        """Luminance in each pixel over the LED's mean along its normal."""
-        return self.beam * self.profile
+    def roi(self) -> Roi:
+        """The pixels of the image."""
+        return self.face.roi
+
+    @property
+    def coverage(self) -> Array:
+        """Share of each pixel that the LED covers and nothing occludes."""
+        return self.face.coverage if isinstance(self.clear, float) else self.face.coverage * self.clear
+
+    @property
+    def weight(self) -> Array:
+        """Relative illumination of each pixel."""
+        return _weight(self.posed, self.roi)
+
+    @property
+    def beam(self) -> Array | float:
+        """Luminance in each pixel over that along the normal, by direction."""
+        diffuse = self.leds.diffusers[self.index] is not None
+        return 1.0 if diffuse else luminance_pattern(self.leds, self.index, self.posed, self.roi)
 
     @property
     def full(self) -> Array:
-        """Light of a pixel that the face covers whole, over that of the LED's luminance and `profile`."""
+        """Light of a pixel that the face covers whole, over that of the LED's luminance and its profile."""
         full: Array = self.clear * self.weight * self.beam
         return full
+
+    def light(self, unit: float, precision: type[np.floating] = np.float64) -> NDArray[np.floating]:
+        """Light of each pixel, (rows, columns): `unit` in one that the LED fills at its mean luminance on the axis."""
+        if self.leds.diffusers[self.index] is not None:
+            return next(light_of_diffusers([self], [unit], precision))
+        camera, coverage, profile = self.posed.camera, self.coverage, self.face.profile
+        pattern = _pattern(self.leds, self.index, self.posed, self.roi)
+        u, v = self.roi.centers_px()
+        light = np.empty(self.roi.shape, dtype=precision)
+        for band in _bands(self.roi):
+            luminance = 1.0 if pattern is None else pattern(u, v[band])
+            luminance = luminance * (profile if isinstance(profile, float) else profile[band])
+            light[band] = unit * coverage[band] * relative_illumination(camera, u, v[band]) * luminance
+        return light
+
+
+def light_of_diffusers(
+    images: Sequence[LedImage], units: Sequence[float], precision: type[np.floating]
+) -> Iterator[NDArray[np.floating]]:
+    """`LedImage.light` of LEDs behind diffusers; all kernels run together."""
+    of_whole = []
+    for image, unit in zip(images, units, strict=True):
+        diffuser, height_m = image.leds.diffusers[image.index], float(image.leds.centers_m[image.index, 2])
+        assert diffuser is not None
+        nodes = _pixel_nodes(image.posed, image.roi, height_m, diffuser)
+        of_whole.append(light_of_diffuser(image.posed, diffuser, height_m, nodes, unit, precision, image.roi))
+    with exact_math():
+        dr.eval(of_whole)
+    for image, light in zip(images, of_whole, strict=True):
+        pixels: NDArray[np.floating] = light.numpy().reshape(image.roi.shape)
+        image.face.reduce(pixels)
+        if not isinstance(image.clear, float):
+            pixels *= image.clear
+        yield pixels
 
 
 def led_images(
@@ -108,26 +160,25 @@ def led_images(
         clear = occlusion.clear_shares(posed, lit)
     images = {}
     for (i, image), share in zip(imaged, clear, strict=True):
-        coverage, clear_fraction = image.coverage, 1.0
+        clear_fraction = 1.0
         split = blurs.kernel(i).split
         edges = edges_of_led(posed, face_of_led(leds, i), image, split) if split > 1 else None
         if not isinstance(share, float):
-            coverage = image.coverage * share
-            clear_fraction = float(coverage.sum() / image.coverage.sum())
+            clear_fraction = float((image.coverage * share).sum() / image.coverage.sum())
             edges = edges and edges.times(share, image.roi)
         if clear_fraction > 0:
-            weight = _in_bands(image.roi, partial(relative_illumination, camera))
-            pattern = luminance_pattern(leds, i, posed, image.roi)
+            if edges is not None:
+                pattern = luminance_pattern(leds, i, posed, image.roi)
+                edges = edges.times(_weight(posed, image.roi) * pattern, image.roi)
             images[i] = LedImage(
-                roi=image.roi,
-                coverage=coverage,
+                leds=leds,
+                index=i,
+                posed=posed,
+                face=image,
                 clear=share,
-                weight=weight,
-                beam=pattern if leds.diffusers[i] is None else 1.0,
-                profile=image.profile if leds.diffusers[i] is None else pattern,
                 visible_fraction=clear_fraction * image.visible_fraction,
                 imaged_fraction=clear_fraction * (1.0 if overscan else image.visible_fraction),
-                edges=edges and edges.times(weight * pattern, image.roi),
+                edges=edges,
             )
     return images
 
@@ -150,21 +201,24 @@ def luminance_pattern(leds: Leds, i: int, posed: PosedCamera, roi: Roi) -> Array
     over the pixel, of 2 x 2 points (Gauss and Legendre) where the pixel is wider on the diffuser than MAX_UNIFORM_SHARE
     of the LED's distance behind it.
     """
+    pattern = _pattern(leds, i, posed, roi)
+    return 1.0 if pattern is None else _in_bands(roi, pattern)
+
+
+def _pattern(leds: Leds, i: int, posed: PosedCamera, roi: Roi) -> Callable[[Array, Array], Array] | None:
+    """`luminance_pattern` as a function of pixel centres u and v in the region; None for 1 in all pixels."""
     diffuser, order = leds.diffusers[i], float(leds.orders[i])
     if diffuser is not None:
-        on_diffuser = partial(intersections_with_plane, posed, np.array([0.0, 0.0, leds.centers_m[i, 2]]))
-        if _max_pixel_width_m(roi, on_diffuser) < MAX_UNIFORM_SHARE * diffuser.distance_m:
-            return _in_bands(roi, lambda u, v: diffuser.at(*on_diffuser(u, v)))
-        nodes = list(itertools.product((-GAUSS_PX, GAUSS_PX), repeat=2))
+        height_m = float(leds.centers_m[i, 2])
+        on_diffuser = partial(intersections_with_plane, posed, np.array([0.0, 0.0, height_m]))
+        nodes = _pixel_nodes(posed, roi, height_m, diffuser)
 
         def mean(u: Array, v: Array) -> Array:
             total: Array = sum((diffuser.at(*on_diffuser(u + a, v + b)) for a, b in nodes), np.zeros(()))
             return total / len(nodes)
 
-        return _in_bands(roi, mean)
-    if abs(order - 1.0) < 1e-12:
-        return 1.0
-    return beam(posed, order, *roi.centers_px())
+        return mean
+    return None if abs(order - 1.0) < 1e-12 else partial(beam, posed, order)
 
 
 def beam(posed: PosedCamera, order: float, u: Array, v: Array) -> Array:
@@ -175,6 +229,14 @@ def beam(posed: PosedCamera, order: float, u: Array, v: Array) -> Array:
     return luminance
 
 
+def _pixel_nodes(posed: PosedCamera, roi: Roi, height_m: float, diffuser: Diffuser) -> list[tuple[float, float]]:
+    """Positions in a pixel, from its centre, whose mean is that over the pixel of a diffuser's luminance."""
+    on_plane = partial(intersections_with_plane, posed, np.array([0.0, 0.0, height_m]))
+    if _max_pixel_width_m(roi, on_plane) < MAX_UNIFORM_SHARE * diffuser.distance_m:
+        return [(0.0, 0.0)]
+    return list(itertools.product((-GAUSS_PX, GAUSS_PX), repeat=2))
+
+
 def _max_pixel_width_m(roi: Roi, on_plane: Callable[[Array, Array], tuple[Array, Array]]) -> float:
     """Greatest extent along x or y of a pixel on a plane, on a grid of the region, since it varies slowly."""
     u = np.linspace(roi.column + 0.5, roi.end_column - 0.5, GRID_POINTS)[None, :]
@@ -183,18 +245,25 @@ def _max_pixel_width_m(roi: Roi, on_plane: Callable[[Array, Array], tuple[Array,
     return max(float(np.abs(b - a).max()) for before, after in sides for a, b in zip(before, after, strict=True))
 
 
-def _in_bands(roi: Roi, function: Callable[[Array, Array], Array]) -> Array:
-    """A function of the pixel centres u (1, columns) and v (rows, 1), (rows, columns).
+def _weight(posed: PosedCamera, roi: Roi) -> Array:
+    """Relative illumination of each pixel of a region."""
+    return _in_bands(roi, partial(relative_illumination, posed.camera))
 
-    In bands of rows, whose temporary arrays stay in the processor's cache.
-    """
+
+def _in_bands(roi: Roi, function: Callable[[Array, Array], Array]) -> Array:
+    """A function of the pixel centres u (1, columns) and v (rows, 1), (rows, columns), by `_bands`."""
     u, v = roi.centers_px()
     image = np.empty((roi.rows, roi.columns))
-    rows = max(1, PIXELS_AT_ONCE // roi.columns)
-    for start in range(0, roi.rows, rows):
-        band = slice(start, start + rows)
+    for band in _bands(roi):
         image[band] = function(u, v[band])
     return image
+
+
+def _bands(roi: Roi) -> Iterator[slice]:
+    """Bands of the region's rows, so narrow that arrays of their pixels stay in the processor's cache."""
+    rows = max(1, PIXELS_AT_ONCE // roi.columns)
+    for start in range(0, roi.rows, rows):
+        yield slice(start, start + rows)
 
 
 def _overscan_px(camera: Camera) -> int:

@@ -78,6 +78,7 @@ def _slopes_of_led(
     if light is not None:
         x, y = intersections_with_plane(posed, _origin_m(leds, i), u + roi.column, v + roi.row)
         swept = swept * light.at(x, y)
+    full = image.full
     column, row = ((at * split).astype(np.int64) for at in (u, v))
     cells = row // split * roi.columns + column // split
     of_rim = [np.bincount(cells, by_piece, roi.pixels).reshape(roi.rows, roi.columns) for by_piece in swept]
@@ -89,9 +90,9 @@ def _slopes_of_led(
         for k, (by_piece, mean) in enumerate(zip(swept, of_rim, strict=True)):
             of_parts = np.bincount(parts, by_piece, len(pixels) * split**2).reshape(-1, split, split) * split**2
             excess = of_parts - mean[rows, columns][:, None, None]
-            edges[k] = LedEdges(rows + roi.row, columns + roi.column, excess).times(image.full, roi)
+            edges[k] = LedEdges(rows + roi.row, columns + roi.column, excess).times(full, roi)
     return [
-        LedSlope(image.full * by_rim + inside, of_edges)
+        LedSlope(full * by_rim + inside, of_edges)
         for by_rim, inside, of_edges in zip(of_rim, _within(posed, changes, leds, i, image), edges, strict=True)
     ]
 
@@ -181,13 +182,13 @@ def _within(
         x, y = intersections_with_plane(camera, origin_m, u_nodes[None, :], v_nodes[:, None])
         return np.stack([x, y, beam(camera, order, u_nodes[None, :], v_nodes[:, None])])
 
-    found = []
+    found, lit, by_direction = [], image.coverage * image.weight, image.beam
     for after, before in changes:
         # not `@`: the last bits of a matrix product may depend on threads and processor
         across = np.einsum("cij,uj->ciu", at_nodes(after) - at_nodes(before), of_u)
         dx, dy, dbeam = np.einsum("vi,ciu->cvu", of_v, across)
         of_light = slope_x * dx + slope_y * dy
-        found.append(image.coverage * image.weight * (image.beam * of_light + value * dbeam))
+        found.append(lit * (by_direction * of_light + value * dbeam))
     return found
 
 

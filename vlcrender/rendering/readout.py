@@ -8,6 +8,7 @@ standard deviation of d / 2 at most. Each line's exposure is a mean over poses, 
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +26,7 @@ MAX_LINE_ROUNDS = 200
 
 @dataclass(frozen=True)
 class LinePoses:
-    """A pose for each line of a sensor, in the order of its rows or columns."""
+    """A pose for each line of a sensor, in the order of its rows or columns, or one pose for all lines."""
 
     positions_m: Array
     """Projection centres, world, (lines, 3)."""
@@ -33,6 +34,19 @@ class LinePoses:
     """R_cam_world, (lines, 3, 3)."""
     along_rows: bool
     """Whether lines are rows."""
+
+    @classmethod
+    def of(cls, pose: Pose) -> Self:
+        """The one pose of all lines."""
+        return cls(np.array([pose.position_m]), pose.rotation[None], along_rows=True)
+
+
+def mean_poses(during: Sequence[LinePoses]) -> LinePoses:
+    """Means of the poses of each line at several times, next to each other: rays then have the mean directions."""
+    positions_m, rotations = (
+        np.mean([getattr(poses, name) for poses in during], axis=0) for name in ("positions_m", "rotations")
+    )
+    return LinePoses(positions_m, rotations, during[0].along_rows)
 
 
 @dataclass(frozen=True)

@@ -30,11 +30,11 @@ from vlcrender.rendering.electron_rates import ElectronRates
 from vlcrender.rendering.expected_image import ExpectedImage, ExpectedRegion, Image, LedPatch, SpecularReflection
 from vlcrender.rendering.halo import GlareHalo, glare_halo, halo_of_sources
 from vlcrender.rendering.led_blur import LedBlur, led_blur
-from vlcrender.rendering.led_radiance import LedImage, led_images
+from vlcrender.rendering.led_radiance import LedImage, led_images, light_of_diffusers
 from vlcrender.rendering.led_slopes import Cameras, led_slopes
 from vlcrender.rendering.led_view import During, LedBand, LedView, cut, patch_rois, read_out, union_of
 from vlcrender.rendering.occlusion import Occlusion
-from vlcrender.rendering.readout import Knot, RollingPoses, image_at_own_line
+from vlcrender.rendering.readout import Knot, LinePoses, RollingPoses, image_at_own_line
 from vlcrender.rendering.specular_reflection import blurred, specular_reflections
 from vlcrender.scene.leds import Leds
 from vlcrender.scene.loader import Scene
@@ -248,13 +248,20 @@ class Renderer:
         sensor = Roi.of_sensor(camera)
         padded = [roi.padded(blurs.radius_px) for roi in rois]
         wide = [p.intersection(sensor) if sensor.contains(roi) else p for roi, p in zip(rois, padded, strict=True)]
-        steps = len(view.bands[0].poses)
+        poses = view.bands[0].poses
+        rolling = () if view.rolling is None else view.rolling.steps
+        during = rolling or tuple(LinePoses.of(each.pose) for each in poses)
+        reach_px = self._background.reach_px(view.posed, during)
+        steps = len(during)
         totals: list[tuple[Image, ...]] | None = None
         reflections: list[SpecularReflection] = []
-        for step in range(steps):
-            lines = None if view.rolling is None else view.rolling.steps[step]
-            rooms = self._background.regions(view.bands[0].poses[step], wide, *rates, lines=lines)
-            self._cover_with_faces(rooms, view.bands, step, rates)
+        for group in [range(steps)] if reach_px is not None else [range(step, step + 1) for step in range(steps)]:
+            if len(group) > 1:
+                rooms = self._background.regions(view.posed, wide, *rates, during=during, reach_px=reach_px or 0)
+            else:
+                first = group.start
+                rooms = self._background.regions(poses[first], wide, *rates, during=rolling[first : first + 1])
+            self._cover_with_faces(rooms, view.bands, group, rates)
             if totals is None:
                 totals = [room.images for room in rooms]
             else:
@@ -264,11 +271,12 @@ class Renderer:
             for number in range(len(self.scene.glazings)):
                 label = self._background.room.first_glazing + number
                 if any((room.surfaces == label).any() for room in rooms):
-                    reflections += self._reflections(view, step, number, wide, rois, rates[0].led / steps)
+                    for step in group:
+                        reflections += self._reflections(view, step, number, wide, rois, rates[0].led / steps)
         assert totals is not None  # there is at least one pose
 
         def mean(total: Image, outer: Roi, roi: Roi) -> Image:
-            sharp = total if steps == 1 else total / np.float32(steps)
+            sharp = total if reach_px is not None else total / np.float32(steps)
             return np.ascontiguousarray(blur(sharp, blurs.typical, "edge")[outer.slices(roi)])
 
         means = [
@@ -299,11 +307,11 @@ class Renderer:
         return found
 
     def _cover_with_faces(
-        self, rooms: Sequence[BackgroundRegion], bands: Sequence[LedBand], step: int, rates: Sequence[ElectronRates]
+        self, rooms: Sequence[BackgroundRegion], bands: Sequence[LedBand], steps: range, rates: Sequence[ElectronRates]
     ) -> None:
         """Put the LEDs' faces, which reflect the room's light, before the room; changes its images.
 
-        step: the number of the pose of each band.
+        steps: the numbers of the poses of each band, over which the faces' images are means.
         """
         places = slice(len(self._light.mesh.vertices_m), None)  # the lightmap has the faces after the mesh
         by_leds, other = self._light.led_cd_m2(places), self._light.ambient_cd_m2(places)
@@ -311,31 +319,39 @@ class Renderer:
         several = len(bands) > 1
         sharp = [tuple(image.copy() if several else image for image in room.images) for room in rooms]
         for band in bands:
-            for i, led in band.images[step].items():
+            for i in sorted({i for step in steps for i in band.images[step]}):
                 if self.scene.leds.diffusers[i] is not None:
                     continue  # a diffuser is one of the room's surfaces
+                of_led = [band.images[step][i] for step in steps if i in band.images[step]]
+                led_roi = union_of(of_led)
+                covered, lights = np.zeros(led_roi.shape), [np.zeros(led_roi.shape) for _ in faces]
+                for led in of_led:
+                    inside, coverage = led_roi.slices(led.roi), led.coverage
+                    covered[inside] += coverage
+                    for light, face in zip(lights, faces, strict=True):
+                        light[inside] += face[i] * coverage * led.weight
                 for room, before in zip(rooms, sharp, strict=True):
-                    shared = band.share(led.roi)
+                    shared = band.share(led_roi)
                     if shared is not None and room.roi.overlaps(shared[0]):
                         both = room.roi.intersection(shared[0])
-                        here, there = room.roi.slices(both), led.roi.slices(both)
-                        coverage, weight = led.coverage[there], led.weight[there]
-                        for image, sharp_image, face in zip(room.images, before, faces, strict=True):
+                        here, there = room.roi.slices(both), led_roi.slices(both)
+                        share = covered[there] / len(steps)
+                        for image, sharp_image, light in zip(room.images, before, lights, strict=True):
+                            of_face = light[there] / len(steps)
                             if band.knot is None:
-                                uncovered = image[here] * (1 - coverage)
-                                image[here] = uncovered + face[i] * coverage * weight
+                                image[here] = image[here] * (1 - share) + of_face
                             else:
-                                share = coverage * band.knot.weights_in(both)
-                                image[here] += share * (face[i] * weight - sharp_image[here])
+                                image[here] += band.knot.weights_in(both) * (of_face - share * sharp_image[here])
 
     def _patches(self, view: LedView, precision: type[np.floating] = np.float32) -> tuple[LedPatch, ...]:
         """Patches of the LEDs: means over the images at several poses, blurred."""
         leds, posed = self.scene.leds, view.posed
         led_rate = self._rates(posed.camera).led
         centers_px = posed.project(leds.centers_m[list(view.patch_rois)]).tolist()
+        of_diffusers = self._light_of_diffusers(view, led_rate, precision)
         patches = []
         for (i, roi), (u, v) in zip(view.patch_rois.items(), centers_px, strict=True):
-            light = np.zeros((roi.rows, roi.columns)) if view.rolling else None
+            light: NDArray[np.floating] | None = np.zeros((roi.rows, roi.columns)) if view.rolling else None
             shares: list[tuple[float, float, float]] = []
             for band in view.bands:
                 of_led = [of_pose[i] for of_pose in band.images if i in of_pose]
@@ -343,7 +359,9 @@ class Renderer:
                 if not of_led or shared is None:
                     continue
                 here = roi if light is None else shared[0]
-                of_band = self._light_of(view, i, of_led, len(band.poses), here, led_rate)
+                of_band = of_diffusers.pop(i, None)
+                if of_band is None:
+                    of_band = self._light_of(view, i, of_led, len(band.poses), here, led_rate, precision)
                 visible, imaged = (
                     sum(getattr(image, name) for image in of_led) / len(band.poses)
                     for name in ("visible_fraction", "imaged_fraction")
@@ -372,15 +390,38 @@ class Renderer:
             )
         return tuple(patches)
 
+    def _light_of_diffusers(
+        self, view: LedView, led_rate: float, precision: type[np.floating]
+    ) -> dict[int, NDArray[np.floating]]:
+        """`_light_of` of the LEDs behind diffusers that are at rest and not blurred, whose kernels run together."""
+        images, leds = view.bands[0].images[0], self.scene.leds
+        at_rest = view.rolling is None and len(view.bands[0].poses) == 1
+        behind = [
+            i
+            for i, roi in view.patch_rois.items()
+            if at_rest and leds.diffusers[i] is not None and view.blurs.kernel(i).whole is None and images[i].roi == roi
+        ]
+        units = [led_rate * float(leds.luminances_cd_m2[i]) for i in behind]
+        return dict(zip(behind, light_of_diffusers([images[i] for i in behind], units, precision), strict=True))
+
     def _light_of(
-        self, view: LedView, i: int, of_led: Sequence[LedImage], poses: int, roi: Roi, led_rate: float
-    ) -> Array:
+        self,
+        view: LedView,
+        i: int,
+        of_led: Sequence[LedImage],
+        poses: int,
+        roi: Roi,
+        led_rate: float,
+        precision: type[np.floating],
+    ) -> NDArray[np.floating]:
         """Light of LED number i in a region: the mean over its images at this number of poses, blurred."""
         luminance, kernel = self.scene.leds.luminances_cd_m2[i], view.blurs.kernel(i)
         union = union_of(of_led)
+        if poses == 1 and kernel.whole is None and union == roi:
+            return of_led[0].light(led_rate * luminance, precision)
         light = np.zeros((union.rows, union.columns))
         for image in of_led:
-            light[union.slices(image.roi)] += led_rate * luminance * image.coverage * image.weight * image.pattern
+            light[union.slices(image.roi)] += image.light(led_rate * luminance)
         edges = [image.edges for image in of_led if image.edges is not None]
         light_per_excess = led_rate * float(luminance) / poses
         result = kernel.blurred(light / poses, union, edges, light_per_excess)

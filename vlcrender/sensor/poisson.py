@@ -19,6 +19,7 @@ from vlcrender.sensor.pixel_indices import pixel_indices
 
 MAX_TURNS = 1000
 """Bound of the loop. A turn accepts with a probability of 0.7 or more, so no draw reaches it."""
+INFINITY_BITS = np.float32(np.inf).view(np.uint32)
 MAX_MEAN = 2.0**22
 """Beyond it the rounding of float32 in the kernel would bias the draws."""
 
@@ -30,17 +31,25 @@ def poisson(means: NDArray[np.float32], key: str, row: int = 0, column: int = 0)
     that `key` names. Raises ValueError for other means.
     """
     rows, columns = means.shape
+    if means.max() > MAX_MEAN:
+        raise ValueError(f"means up to {means.max()} electrons; 0 to {MAX_MEAN:.0f} are allowed")
     return poisson_of_regions(means.ravel(), key, [Roi(row, column, rows, columns)]).reshape(means.shape)
 
 
-def poisson_of_regions(means: NDArray[np.float32], key: str, rois: Sequence[Roi]) -> NDArray[np.uint32]:
-    """`poisson` of all pixels of all regions, region by region, row by row, (pixels,): one launch of one kernel."""
-    low, high = float(means.min()), float(means.max())
-    if not 0 <= low <= high <= MAX_MEAN:
-        raise ValueError(f"means from {low} to {high} electrons; 0 to {MAX_MEAN:.0f} are allowed")
+def poisson_of_regions(
+    means: NDArray[np.float32], key: str, rois: Sequence[Roi], most: int = 2**32 - 1
+) -> NDArray[np.uint32]:
+    """`poisson` of all pixels of all regions, region by region, row by row, (pixels,): one launch of one kernel.
+
+    Means beyond MAX_MEAN count as that, counts beyond `most` as `most`. Raises ValueError for negative means and NaN.
+    """
+    flat = np.ascontiguousarray(means, dtype=np.float32)
+    # The bits of negative numbers and of most NaN are larger than those of infinity: one pass over memory finds them.
+    if flat.view(np.uint32).max() > INFINITY_BITS and not flat.min() >= 0:
+        raise ValueError(f"means from {flat.min()} electrons; 0 and more are allowed")
     with exact_math():
-        flat = np.ascontiguousarray(means, dtype=np.float32)
-        count: Any = mi.UInt32(draw(mi.Float(flat), kernel_seed(key), *pixel_indices(rois)))
+        drawn = draw(dr.minimum(mi.Float(flat), MAX_MEAN), kernel_seed(key), *pixel_indices(rois))
+        count: Any = dr.minimum(mi.UInt32(drawn), dr.opaque(mi.UInt32, most))
         dr.eval(count)
     counts: NDArray[np.uint32] = count.numpy()
     return counts

@@ -191,9 +191,6 @@ class Sensor(Settings):
     def quantise(self, electrons: Electrons) -> NDArray[np.uint32]:
         """Digital numbers: round(e / gain) + black level, clipped to 0 and the largest number of the ADC."""
         gain = self.gain_at_iso_e_per_dn
-        if gain == 1.0 and electrons.dtype == np.uint32:  # electrons are the digital numbers
-            counts = _at_most(electrons.astype(np.uint32, copy=False), self.largest_dn - self.black_level_dn)
-            return counts + np.uint32(self.black_level_dn) if self.black_level_dn else counts
         dn = np.rint(electrons / np.float64(gain)) + self.black_level_dn
         clipped: NDArray[np.uint32] = np.clip(dn, 0, self.largest_dn).astype(np.uint32)
         return clipped
@@ -218,11 +215,4 @@ class Sensor(Settings):
 
 def clip_full_well(electrons: Electrons, full_well_e: float) -> Electrons:
     """Clip electrons at the full well."""
-    if electrons.dtype == np.uint32:
-        return _at_most(electrons.astype(np.uint32, copy=False), int(min(full_well_e, 2**32 - 1)))
     return np.minimum(electrons, full_well_e)
-
-
-def _at_most(counts: NDArray[np.uint32], limit: int) -> NDArray[np.uint32]:
-    """Counts clipped at a limit; the same array where none is above it: a pass over memory is a tenth of a draw."""
-    return counts if counts.max(initial=0) <= limit else np.minimum(counts, np.uint32(limit))

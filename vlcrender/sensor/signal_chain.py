@@ -12,7 +12,7 @@ from vlcrender.core.philox import PHILOX, kernel_seed, normals
 from vlcrender.core.random_keys import random_key
 from vlcrender.sensor.pixel_indices import pixel_indices
 from vlcrender.sensor.poisson import MAX_MEAN, draw, poisson_of_regions
-from vlcrender.sensor.sensor import Electrons, Sensor, clip_full_well
+from vlcrender.sensor.sensor import Sensor, clip_full_well
 
 
 def variance_e2(sensor: Sensor, expected_e: NDArray[np.float32], exposure_s: float) -> NDArray[np.float64]:
@@ -63,15 +63,23 @@ def expose_regions(
     rois = [roi for roi, _ in expected_e]
     images = [image.ravel() for _, image in expected_e]
     flat = np.concatenate(images) if len(images) > 1 else images[0]
-    if flat.max() > MAX_MEAN:
-        flat = np.minimum(flat, np.float32(MAX_MEAN))
     if sensor.noise == "full":
         dn = _full_chain(sensor, flat, key, random_key(sensor.serial, camera), rois, exposure_s)
+    elif sensor.noise == "shot":
+        dn = _shot_noise(sensor, flat, key, rois)
     else:
-        electrons: Electrons = poisson_of_regions(flat, key, rois) if sensor.noise == "shot" else flat
-        dn = sensor.quantise(clip_full_well(electrons, sensor.full_well_e))
+        dn = sensor.quantise(clip_full_well(flat, sensor.full_well_e))
     parts = np.split(dn, np.cumsum([roi.pixels for roi in rois])[:-1])
     return [RegionImage(roi, part.reshape(roi.rows, roi.columns)) for roi, part in zip(rois, parts, strict=True)]
+
+
+def _shot_noise(sensor: Sensor, expected_e: NDArray[np.float32], key: str, rois: Sequence[Roi]) -> NDArray[np.uint32]:
+    """Steps 4, 6, 8 and 9 of the chain; where counts are digital numbers, in one kernel."""
+    most = int(min(sensor.full_well_e, 2**32 - 1))
+    if sensor.gain_at_iso_e_per_dn != 1.0:
+        return sensor.quantise(poisson_of_regions(expected_e, key, rois, most))
+    counts = poisson_of_regions(expected_e, key, rois, min(most, sensor.largest_dn - sensor.black_level_dn))
+    return counts + np.uint32(sensor.black_level_dn) if sensor.black_level_dn else counts
 
 
 def _full_chain(
@@ -93,7 +101,7 @@ def _full_chain(
     with exact_math():
         column, row = pixel_indices(rois)
         response, offset = normals(kernel_seed(individual, "pixels"), column, row)
-        mean = mi.Float(expected_e)
+        mean = dr.minimum(mi.Float(expected_e), MAX_MEAN)
         mean = mean * dr.maximum(1.0 + number(sensor.prnu) * response, 0.0)  # 2
         mean = mean + number(sensor.dark_electrons(exposure_s))  # 3
         if sensor.hot_pixel_share > 0:
