@@ -4,9 +4,9 @@
 
 Sections: `stated` (the three levels), `wide` (the same with a phone's wide lens), `wrong_identities` (a tenth of the
 identities exchanged), `stated_wrongly` (standard deviations stated three times too large and too small), `unstated` (a
-map that is wrong and states nothing, a camera that is wrong and stated as exact), `hall` (luminaires of 60 cm), `effects` (a halo, uneven faces,
-small spots), `levels` (the plot of error against level). Datasets that are complete are kept, interrupted ones
-continued; estimates are made anew, but for `levels`, which takes those that are there.
+map that is wrong and states nothing, a camera that is wrong and stated as exact), `hall` (luminaires of 60 cm),
+`effects` (a halo, uneven faces, small spots), `levels` (the plot of error against level). Datasets that are complete are
+kept, interrupted ones continued; estimates are made anew, but for `levels`, which takes those that are there.
 """
 
 import argparse
@@ -44,7 +44,7 @@ AS_SOLD_CAMERA = {
 }
 """The camera of the preset `as-sold`."""
 WRONG_SHARE = 0.1
-WRONG: Sequence[dict[str, float]] = (
+WRONG: Sequence[Mapping[str, float]] = (
     {},
     {"map_mm": 0.3},
     {"map_mm": 1.0},
@@ -54,7 +54,7 @@ WRONG: Sequence[dict[str, float]] = (
     {"center_px": 5.0},
     {"k1": 0.01},
 )
-"""Errors of the told map and camera, by the keywords of `_wrong`."""
+"""Errors of the told map and camera: standard deviation, mm; relative; pixels along u and against v; coefficient."""
 SMALL_SPOT_SCALES = (2, 4, 8, 20, 25)
 """LED images of office200 are some 58 px high at full size, 29 to 2.3 px here."""
 UNCHECKED_SCALES = (20, 25)
@@ -193,24 +193,21 @@ def unstated(chosen: Chosen) -> None:
             text = ", ".join(f"{key} {value:g}" for key, value in wrong.items()) or "nothing"
             figure("scale; wrong", f"{scale}; {text}")
             name = "-".join(["wrong", *(f"{key}={value:g}" for key, value in wrong.items()), exact.name])
-            chosen.print_scores(told(exact, name, partial(_wrong, **wrong)))
+            chosen.print_scores(told(exact, name, partial(_wrong, wrong=wrong)))
 
 
-def _wrong(
-    device: dict[str, Any], map_mm: float = 0.0, focal: float = 0.0, center_px: float = 0.0, k1: float = 0.0
-) -> dict[str, Any]:
-    """dataset.json with errors of the map (standard deviation) and of the camera; stated is what was."""
-    generator = np.random.default_rng(1)
+def _wrong(device: dict[str, Any], wrong: Mapping[str, float]) -> dict[str, Any]:
+    """dataset.json with errors of the map (standard deviation) and of the camera, as in WRONG; stated is what was."""
+    generator, center_px = np.random.default_rng(1), wrong.get("center_px", 0.0)
     for led in device["led_map"]:
-        led["position_m"] = (led["position_m"] + generator.normal(0, map_mm / 1000, 3)).tolist()
+        led["position_m"] = (led["position_m"] + generator.normal(0, wrong.get("map_mm", 0.0) / 1000, 3)).tolist()
     for camera in device["cameras"].values():
-        camera["image_distance_mm"] *= 1 + focal
-        camera["K"][0][0] *= 1 + focal
-        camera["K"][1][1] *= 1 + focal
-        camera["K"][0][2] += center_px
-        camera["K"][1][2] -= center_px
-        if k1:
-            camera["distortion"] = {"k1": k1, "k2": 0.0, "k3": 0.0, "p1": 0.0, "p2": 0.0}
+        camera["image_distance_mm"] *= 1 + wrong.get("focal", 0.0)
+        for axis, shift_px in enumerate((center_px, -center_px)):
+            camera["K"][axis][axis] *= 1 + wrong.get("focal", 0.0)
+            camera["K"][axis][2] += shift_px
+        if "k1" in wrong:
+            camera["distortion"] = {"k1": wrong["k1"], "k2": 0.0, "k3": 0.0, "p1": 0.0, "p2": 0.0}
     return device
 
 

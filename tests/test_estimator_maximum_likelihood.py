@@ -217,8 +217,8 @@ def test_gravity_and_two_leds_fix_a_position_and_one_does_not() -> None:
 
 @pytest.mark.slow
 def test_exact_gravity_is_exact() -> None:
-    """Said to be without error, as the camera is to 1e-9 of its focal length, a reading that is off by 0.1 deg moves the
-    answer by 3 m times that, 5 mm. A camera without any error would be contradicted, and not the reading.
+    """Said to be without error, as the camera is but for 1e-9 of its focal length, a reading that is off by 0.1 deg
+    moves the answer by 3 m times that, 5 mm. A camera without any error would be contradicted, and not the reading.
     """
     view = view_of(TARGET, 3.0, 10.0, 5.0, 30.0)
     frame = exact(view, SIX)
