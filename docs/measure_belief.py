@@ -5,8 +5,8 @@
 Sections: `stated` (the three levels), `wide` (the same with a phone's wide lens), `wrong_identities` (a tenth of the
 identities exchanged), `stated_wrongly` (standard deviations stated three times too large and too small), `unstated` (a
 map that is wrong and states nothing, a camera that is wrong and stated as exact), `hall` (luminaires of 60 cm),
-`effects` (a halo, uneven faces, small spots), `levels` (the plot of error against level). Datasets that are complete are
-kept, interrupted ones continued; estimates are made anew, but for `levels`, which takes those that are there.
+`effects` (a halo, uneven faces, small spots), `levels` (the plot of error against level). Datasets that are complete
+are kept, interrupted ones continued; estimates are made anew, but for `levels`, which takes those that are there.
 """
 
 import argparse
