@@ -78,9 +78,14 @@ def test_poses_are_those_of_the_recipe_without_belief_and_images_are_not(made: P
     assert {(row.device, truth.map) for row, truth in zip(as_today, without, strict=True)} == {(0, 0)}
 
 
-def test_an_exact_set_states_nothing(exact: Path) -> None:
+def test_a_set_without_belief_states_an_exact_camera_and_nothing_else(exact: Path) -> None:
     content = read_dataset_file(exact)
-    assert content.cameras["main"].uncertainty is None
+    stated = content.cameras["main"].uncertainty
+    assert stated is not None
+    assert stated.parameters == ("focal", "aspect", "cx_px", "cy_px", "k1", "p1", "p2")
+    assert stated.device_sigma == stated.shot_sigma == (0.0,) * 7
+    assert (stated.offset_sigma_m, stated.rotation_sigma_deg) == (0.0, 0.0)
+    assert all(led.sigma_m is None for led in content.led_map or ())
     assert (content.luminaires, content.map_datum) == ((), None)
     assert (content.accelerometer.device_error_deg, content.accelerometer.shot_error_deg) == (None, None)
     assert not (exact / "truth_devices.parquet").exists()

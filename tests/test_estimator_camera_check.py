@@ -1,16 +1,18 @@
-"""Check of a camera that states nothing: by pixels, and what its errors then say."""
+"""Check of a camera that states no errors: by pixels, and what its errors then say."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from estimator_correspondences import EXACT
 from estimator_synthetic import grid, poisson, render, view_of
 from scipy.stats import chi2
 from test_estimator_maximum_likelihood import SAMPLES, TARGET, frame_of, most_likely
 
 from estimator.camera.pose import Pose
-from estimator.io.device import DeviceFrame
-from estimator.methods.maximum_likelihood import ml
+from estimator.io.device import CameraUncertainty, DeviceFrame
+from estimator.methods.camera_statement import Judged
+from estimator.methods.maximum_likelihood import judged
 from estimator.pixels.camera_check import camera_errors_by_pixels
 from estimator.pixels.initial import gravity_of
 from estimator.pixels.led_model import SIZE_PARAMETER
@@ -24,14 +26,17 @@ POSE = Pose(np.array(VIEW.position_m), VIEW.R_cam_world)
 DRAWS = 3
 
 
-def frames(focal: float) -> list[DeviceFrame]:
-    """Draws of noise; the device is told a focal length that is too short by `focal`, relative, and nothing else."""
+def frames(focal: float, pp_px: float = 0.0, stated: CameraUncertainty | None = None) -> list[DeviceFrame]:
+    """Draws of noise; the device is told a focal length that is too short by `focal`, relative, a principal point that
+    is off by `pp_px` along u and v, and what it is told to think of them.
+    """
     expected, found = render(VIEW, LEDS_M, 0.01, samples=SAMPLES), []
     for seed in range(DRAWS):
         frame = frame_of(VIEW, LEDS_M, poisson(expected, seed))
         (fx, skew, cx), (_, fy, cy), last = frame.camera.K
-        K = (fx / (1 + focal), skew, cx), (0.0, fy / (1 + focal), cy), last
-        found.append(replace(frame, camera=frame.camera.model_copy(update={"K": K})))
+        K = (fx / (1 + focal), skew, cx + pp_px), (0.0, fy / (1 + focal), cy - pp_px), last
+        told = frame.camera.model_copy(update={"K": K, "uncertainty": stated})
+        found.append(replace(frame, camera=told))
     return found
 
 
@@ -58,16 +63,36 @@ def test_the_pixels_tell_the_focal_length_s_error_and_its_standard_deviation(foc
 
 
 @pytest.mark.slow
-def test_a_focal_length_that_displaces_no_image_much_is_revealed_by_all_together() -> None:
+@pytest.mark.parametrize("stated", [None, EXACT])
+def test_a_focal_length_that_displaces_no_image_much_is_revealed_by_all_together(
+    stated: CameraUncertainty | None,
+) -> None:
     """0.1 % is 3 mm of range, hundreds of standard deviations, and some hundredths of a pixel that a pose leaves open:
-    each LED's image agrees with the exact camera, and all together contradict it by ten standard deviations.
+    each LED's image agrees with the exact camera, and all together contradict it by ten standard deviations. Whether
+    the device says that its camera is exact, or nothing, is all the same.
     """
-    nees = []
-    for frame in frames(1e-3):
-        estimate = ml(frame)
-        error = estimate.position_m - VIEW.position_m
-        nees.append(float(error @ np.linalg.solve(estimate.covariance_m2, error)))  # type: ignore[arg-type]
-    assert sum(nees) < chi2.isf(1e-4, 3 * DRAWS)
+    assert sum(nees_of(judged(frame)) for frame in frames(1e-3, stated=stated)) < chi2.isf(1e-4, 3 * DRAWS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("focal", "pp_px"), [(1e-3, 0.0), (0.0, 5.0)])
+def test_the_pixels_contradict_a_camera_that_is_stated_as_exact_and_is_not(focal: float, pp_px: float) -> None:
+    """With the exact camera's own covariance the NEES would be above a thousand for the focal length."""
+    found = [judged(frame) for frame in frames(focal, pp_px, EXACT)]
+    assert all(one.contradicts for one in found)
+    assert sum(map(nees_of, found)) < 20 * DRAWS
+
+
+@pytest.mark.slow
+def test_the_pixels_do_not_contradict_an_exact_camera() -> None:
+    found = [judged(frame) for frame in frames(0.0, stated=EXACT)]
+    assert not any(one.contradicts for one in found)
+    assert sum(map(nees_of, found)) < chi2.isf(1e-4, 3 * DRAWS)
+
+
+def nees_of(one: Judged) -> float:
+    error = one.estimate.position_m - VIEW.position_m
+    return float(error @ np.linalg.solve(one.estimate.covariance_m2, error))  # type: ignore[arg-type]
 
 
 def test_errors_that_cannot_be_seen_reveal_nothing() -> None:

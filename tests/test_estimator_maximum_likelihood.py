@@ -217,11 +217,13 @@ def test_gravity_and_two_leds_fix_a_position_and_one_does_not() -> None:
 
 @pytest.mark.slow
 def test_exact_gravity_is_exact() -> None:
-    """Said to be without error, as is the camera, a reading that is off by 0.1 deg moves the answer by 3 m times that,
-    5 mm.
+    """Said to be without error, as the camera is but for 1e-9 of its focal length, a reading that is off by 0.1 deg
+    moves the answer by 3 m times that, 5 mm. A camera without any error would be contradicted, and not the reading.
     """
     view = view_of(TARGET, 3.0, 10.0, 5.0, 30.0)
-    frame = with_exact_camera(exact(view, SIX))
+    frame = exact(view, SIX)
+    stated = EXACT.model_copy(update={"parameters": ("focal",), "device_sigma": (1e-9,), "shot_sigma": (0.0,)})
+    frame = replace(frame, camera=frame.camera.model_copy(update={"uncertainty": stated}))
     off = rotation(np.radians(10.1), np.radians(5.0)) @ [0.0, 0.0, 9.80665]
     wrong = replace(
         frame, accelerometer_m_s2=tuple(off.tolist()), accelerometer=Accelerometer(kind="tilt-error", error_deg=0.0)

@@ -1,11 +1,11 @@
-"""Statement of a device that its camera is exact: believed until the device's own frames contradict it.
+"""Statement of a device that its camera is exact: trusted until the device's own frames contradict it.
 
 A frame contradicts it if an error of an intrinsic explains the frame better than an exact camera does, by four standard
 deviations (`estimator.solvers.camera_check`); its own estimate then takes the camera as one as sold. But some frames
 cannot show a wrong focal length: in a level view of LEDs at one height, focal length and range are one number. The
-camera is the same in all frames of a device. Where some of them contradict the statement, the others count the camera's
-errors that they cannot show, as those of a camera that states nothing. Estimates use other frames of the same device,
-never the truth. A frame by itself believes the statement unless it contradicts it.
+camera is the same in all frames of a device. Where some of them contradict the statement, the others count all
+errors of the camera that they leave open. Estimates use other frames of the same device,
+never the truth. A frame by itself trusts the statement unless it contradicts it.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,10 +25,10 @@ MIN_CONTRADICTING_SHARE = 0.01
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """A frame's own estimate and what the frame says of a camera that is stated as exact.
+    """A frame's own estimate and what the frame says of a camera that states no errors.
 
-    `contradicts` says that the frame contradicts the statement. `doubt_m2` (3, 3) is what the covariance lacks if the
-    statement is not believed.
+    `contradicts` says that the frame contradicts an exact camera. `doubt_m2` (3, 3) is what the covariance lacks if the
+    camera is stated as exact and the statement is not trusted.
     """
 
     estimate: Estimate
@@ -38,10 +38,14 @@ class Judged:
 
 def judged_by_device(frames: Sequence[Judged]) -> list[Estimate | EstimationFailure]:
     """Estimates of the frames of a device, in their order."""
+    doubted = contradicted_by(frames)
+    return [_doubted(frame) if doubted else frame.estimate for frame in frames]
+
+
+def contradicted_by(frames: Sequence[Judged]) -> bool:
+    """Whether so many frames of a device contradict an exact camera that it is no chance."""
     contradicting = sum(frame.contradicts for frame in frames)
-    if contradicting < max(MIN_CONTRADICTING, MIN_CONTRADICTING_SHARE * len(frames)):
-        return [frame.estimate for frame in frames]
-    return [_doubted(frame) for frame in frames]
+    return contradicting >= max(MIN_CONTRADICTING, MIN_CONTRADICTING_SHARE * len(frames))
 
 
 def _doubted(frame: Judged) -> Estimate:

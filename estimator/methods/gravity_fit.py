@@ -55,18 +55,20 @@ def judged(frame: DeviceFrame, centroid_sigma_px: float = 0.0) -> Judged:
     """The same, and what the frame says of its camera."""
     observations = observe_once(frame, find_correspondences(frame), centroid_sigma_px)
     agreed = agreement_of(frame, observations, centroid_sigma_px)
-    return Judged(_estimate(agreed), agreed.contradicted, agreed.doubt_m2)
+    return judged_by(agreed)
 
 
 def fit_correspondences(
     frame: DeviceFrame, correspondences: Sequence[Correspondence], centroid_sigma_px: float = 0.0
 ) -> Estimate:
     """The estimate from identified spots; of the frame, camera, accelerometer and map are used."""
-    return _estimate(agreement(observe(frame, correspondences, centroid_sigma_px)))
+    return judged_by(agreement(observe(frame, correspondences, centroid_sigma_px))).estimate
 
 
-def _estimate(agreed: Consensus) -> Estimate:
-    return Estimate(agreed.best.pose.position_m, covariance_m2=agreed.covariance_m2, ambiguous=ambiguous(agreed))
+def judged_by(agreed: Consensus) -> Judged:
+    """The estimate of a consensus, and what it says of the camera."""
+    estimate = Estimate(agreed.best.pose.position_m, covariance_m2=agreed.covariance_m2, ambiguous=ambiguous(agreed))
+    return Judged(estimate, agreed.contradicted, agreed.doubt_m2)
 
 
 def agreement(observations: Observations) -> Consensus:

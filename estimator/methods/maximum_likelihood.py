@@ -143,7 +143,7 @@ def judged(frame: DeviceFrame) -> Judged:
     correspondences = find_correspondences(frame)
     observations = observe_once(frame, correspondences)
     inliers, use_gravity, is_ambiguous = np.ones(len(observations.leds_m), dtype=bool), True, False
-    exact, doubt_m2, contradicted = True, np.zeros((3, 3)), False
+    exact, contradicted, unchecked_m2, doubt_m2 = True, False, np.zeros((3, 3)), np.zeros((3, 3))
     if len(observations.leds_m) < MIN_FOR_CONSENSUS:
         upright = upright_pose(observations)
         if upright is None:
@@ -153,7 +153,7 @@ def judged(frame: DeviceFrame) -> Judged:
         agreed = agreement_of(frame, observations)
         pose, inliers = agreed.best.pose, agreed.inliers
         use_gravity, is_ambiguous = agreed.gravity, ambiguous(agreed)
-        doubt_m2, contradicted = agreed.doubt_m2, agreed.contradicted
+        unchecked_m2, doubt_m2, contradicted = agreed.unchecked_m2, agreed.doubt_m2, agreed.contradicted
         # The centroids of large LEDs have model errors of their own, which the pixels do not have.
         limit_px = MAX_MODEL_ERROR_PX + START_SIGMA_SHARE * _radius_px(observations, pose).max()
         exact = agreed.model is None or agreed.model.added_sigma_px < limit_px
@@ -163,17 +163,19 @@ def judged(frame: DeviceFrame) -> Judged:
     found, is_assumed = _maximize_honestly(frame, gravity, spots, pose, exact)
     covariance_m2 = found.covariance[:3, :3]
     if isinstance(found, Maximum):
-        doubt_m2 = np.zeros((3, 3)) if found.camera is None else found.camera.unchecked_m2()
-    unstated = frame.camera.uncertainty is None
+        unchecked_m2 = doubt_m2 = np.zeros((3, 3))
+        if found.camera is not None and frame.camera.uncertainty is None:
+            unchecked_m2 = found.camera.unchecked_m2()
+        elif found.camera is not None:
+            doubt_m2 = found.camera.left_open_m2()
     if is_assumed:
-        doubt_m2 = np.zeros((3, 3))
-    elif unstated:
-        covariance_m2 = covariance_m2 + doubt_m2
+        unchecked_m2 = doubt_m2 = np.zeros((3, 3))
+    covariance_m2 = covariance_m2 + unchecked_m2
     if observations.motion is not None:
         centre_m = observations.leds_m[inliers].mean(axis=0)
         covariance_m2 = covariance_m2 + second_order.of_pose(found.pose, frame.camera, centre_m, found.covariance)
     estimate = Estimate(found.pose.position_m, covariance_m2=covariance_m2, ambiguous=is_ambiguous)
-    return Judged(estimate, contradicted or (is_assumed and not unstated), doubt_m2)
+    return Judged(estimate, contradicted or is_assumed, doubt_m2)
 
 
 def _camera_is_assumed(frame: DeviceFrame, components: Components) -> bool:

@@ -5,8 +5,9 @@ frames of the device are then fitted together (`estimator.solvers.self_calibrati
 standard deviation for is corrected. Estimates use other frames of the same device, never the truth.
 
 A frame keeps its own estimate where the others cannot improve it: its errors are not those stated (the map's are not
-stated, and its spots show some), its camera has a rolling shutter, whose motion the common fit does not know, or too
-few of its spots agree with the device's other frames; the last is reported as ambiguous.
+stated, and its spots show some), the device's frames contradict a camera that states no errors, its camera has a
+rolling shutter, whose motion the common fit does not know, or too few of its spots agree with the device's other
+frames; the last is reported as ambiguous.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,7 +20,8 @@ from estimator.camera.leveling import MIN_TILT_SIGMA_DEG, tilt_from_gravity, til
 from estimator.camera.undistort import has_pinhole_image
 from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame
-from estimator.methods.gravity_fit import agreement, agreement_of, ambiguous
+from estimator.methods.camera_statement import Judged, contradicted_by, judged_by_device
+from estimator.methods.gravity_fit import agreement, agreement_of, judged_by
 from estimator.methods.variant import DeviceMethod, Estimate, Needs, Variant
 from estimator.solvers.device_equations import DeviceView
 from estimator.solvers.observations import MIN_CENTROID_SIGMA_PX, Observations, observe
@@ -31,15 +33,20 @@ from estimator.spots.identify import Correspondence
 
 @dataclass(frozen=True, eq=False)
 class FittedFrame:
-    """A frame fitted by itself: its `estimate`, and its `view` for the common fit.
+    """A frame fitted by itself: its own estimate, `judged`, and its `view` for the common fit.
 
     `scale` is the factor of the stated standard deviations that its spots show; `view` is None where they show errors
     that the device does not state, and with a rolling shutter.
     """
 
-    estimate: Estimate
+    judged: Judged
     view: DeviceView | None
     scale: float
+
+    @property
+    def estimate(self) -> Estimate:
+        """The frame's own estimate."""
+        return self.judged.estimate
 
 
 def fit_frame(frame: DeviceFrame) -> FittedFrame:
@@ -58,13 +65,12 @@ def fit_correspondences(
         correspondences = [one for one, use in zip(correspondences, usable, strict=True) if use]
     observations = observe(frame, correspondences)
     agreed = agree(observations)
-    estimate = Estimate(agreed.best.pose.position_m, covariance_m2=agreed.covariance_m2, ambiguous=ambiguous(agreed))
-    model = agreed.model
-    # The second: a focal length that nothing vouches for counts in the covariance of the frame alone.
-    unshared = observations.motion is not None or agreed.unchecked_m2.any()
+    alone, model = judged_by(agreed), agreed.model
+    # The last two: a camera that is not exact, or that nothing vouches for, counts in the covariance of a frame alone.
+    unshared = observations.motion is not None or agreed.contradicted or agreed.unchecked_m2.any()
     if (model is not None and model.added_sigma_px > 0) or unshared:
-        return FittedFrame(estimate, None, 1.0)
-    return FittedFrame(estimate, _view(frame, correspondences, agreed), 1.0 if model is None else float(model.scale))
+        return FittedFrame(alone, None, 1.0)
+    return FittedFrame(alone, _view(frame, correspondences, agreed), 1.0 if model is None else float(model.scale))
 
 
 def _view(frame: DeviceFrame, correspondences: Sequence[Correspondence], agreed: Consensus) -> DeviceView:
@@ -96,8 +102,9 @@ def _view(frame: DeviceFrame, correspondences: Sequence[Correspondence], agreed:
 def fit_device(frames: Sequence[FittedFrame]) -> list[Estimate | EstimationFailure]:
     """Estimates of all frames of a device together, in the order of the frames."""
     views = [frame.view for frame in frames if frame.view is not None]
-    if not views:
-        return [frame.estimate for frame in frames]
+    own = [frame.judged for frame in frames]
+    if not views or contradicted_by(own):
+        return judged_by_device(own)
     scale = float(np.median([frame.scale for frame in frames if frame.view is not None]))
     adjusted = iter(adjust(views, scale).frames)
     results: list[Estimate | EstimationFailure] = []

@@ -2,7 +2,7 @@
 
 A camera states no errors if it says that it is exact, or says nothing. Where the residuals contradict it by
 MAX_CAMERA_SIGMA, both are taken as one as sold. They differ where the residuals cannot contradict it: the statement
-is then believed, unless other frames of the device contradict it (`estimator.methods.camera_statement`), and a camera
+is then trusted, unless other frames of the device contradict it (`estimator.methods.camera_statement`), and a camera
 without one adds to the covariance.
 """
 
@@ -58,6 +58,13 @@ class CameraErrors:
             return np.zeros((3, 3))
         counts = MAX_CAMERA_SIGMA * self.sigmas > self.assumed
         counts[0] = True
+        return self._left_open_m2(counts)
+
+    def left_open_m2(self) -> Floats:
+        """Covariance (3, 3) of the position by all that the residuals leave open of a camera that is not exact."""
+        return self._left_open_m2(np.ones(len(self.sigmas), dtype=bool))
+
+    def _left_open_m2(self, counts: NDArray[np.bool_]) -> Floats:
         weight = self.assumed**2 / (self.assumed**2 + self.sigmas**2)
         mean_square = weight * self.sigmas**2 + (weight * self.found) ** 2
         return np.asarray((self.moved * (mean_square * counts)) @ self.moved.T)
@@ -82,13 +89,3 @@ def contradicts_camera(observations: Observations, best: Fit) -> bool:
     False where the spots have errors of camera or map beside their noise.
     """
     return not observations.correlated and camera_errors(observations, best).revealed
-
-
-def unchecked_camera_m2(observations: Observations, best: Fit) -> Floats:
-    """Covariance (3, 3) of the position by a camera that is taken as exact and not checked by the spots.
-
-    See `CameraErrors.unchecked_m2`. Zero where the spots have errors of camera or map beside their noise.
-    """
-    if observations.correlated:
-        return np.zeros((3, 3))
-    return camera_errors(observations, best).unchecked_m2()

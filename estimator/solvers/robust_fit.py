@@ -26,7 +26,7 @@ from estimator.camera.motion import MOTION_PARAMETERS
 from estimator.camera.pose import Pose
 from estimator.camera.projection import projection_of
 from estimator.errors import EstimationFailure
-from estimator.solvers.camera_check import contradicts_camera, unchecked_camera_m2
+from estimator.solvers.camera_check import camera_errors, contradicts_camera
 from estimator.solvers.chi_square import chi2_limit, pair_limit
 from estimator.solvers.local_minima import minima
 from estimator.solvers.observations import Observations, centroid_images, corrected_for_eccentricity
@@ -74,9 +74,9 @@ class Consensus:
     `best` is the best fit, `others` are fits of other local minima to the same spots, best first; `inliers` (n,) are
     the spots used; `gravity` says whether the accelerometer was used. `model` are the observations with the size of
     errors that explains them, None where all spots are explained as stated; `adapted` says that the residuals gave it.
-    `doubt_m2` (3, 3) is what a camera that the residuals do not vouch for adds to the position's covariance, if the
-    device does not vouch for it either: `unstated`. `contradicted` says that a camera which is stated as exact is taken
-    as one as sold.
+    `unchecked_m2` (3, 3) is what a camera that neither the device nor the residuals vouch for adds to the position's
+    covariance; `doubt_m2` (3, 3) is what a camera that the device alone vouches for would add, were it not exact.
+    `contradicted` says that a camera which states no errors is taken as one as sold.
     """
 
     best: Fit
@@ -85,14 +85,9 @@ class Consensus:
     gravity: bool
     model: Observations | None = None
     adapted: bool = False
+    unchecked_m2: Floats = field(default_factory=lambda: np.zeros((3, 3)))
     doubt_m2: Floats = field(default_factory=lambda: np.zeros((3, 3)))
-    unstated: bool = True
     contradicted: bool = False
-
-    @property
-    def unchecked_m2(self) -> Floats:
-        """What a camera that neither the device nor the residuals vouch for adds to the covariance, (3, 3)."""
-        return self.doubt_m2 if self.unstated else np.zeros((3, 3))
 
     @property
     def covariance_m2(self) -> Floats:
@@ -169,10 +164,12 @@ def _consensus(
 def _with_doubt(agreed: Consensus, observations: Observations) -> Consensus:
     """A consensus with what it says of a camera that states no errors."""
     model = observations if agreed.model is None else agreed.of_inliers()
-    unstated = observations.camera.uncertainty is None
-    contradicted = not unstated and model.correlated and not observations.correlated
-    doubt_m2 = unchecked_camera_m2(model, agreed.best)
-    return replace(agreed, doubt_m2=doubt_m2, unstated=unstated, contradicted=contradicted)
+    if model.correlated:
+        return replace(agreed, contradicted=not observations.correlated)
+    errors = camera_errors(model, agreed.best)
+    if observations.camera.uncertainty is None:
+        return replace(agreed, unchecked_m2=errors.unchecked_m2())
+    return replace(agreed, doubt_m2=errors.left_open_m2())
 
 
 def _explanations(
