@@ -345,8 +345,12 @@ def test_the_grids_of_the_plots_fill_their_frames(full: Datasheet) -> None:
         curve = np.array(
             [place.split(",") for path in re.findall(r'd="M([^"]*)"', plot) for place in path.split()], float
         )
-        assert curve[:, 0].min() >= LEFT
-        assert curve[:, 0].max() <= WIDTH - RIGHT
+        dots = np.array(re.findall(r'cx="([-0-9.]+)" cy="([-0-9.]+)"', plot), float)
+        for places in (curve, dots):
+            assert places[:, 0].min() >= LEFT
+            assert places[:, 0].max() <= WIDTH - RIGHT
+            assert places[:, 1].min() >= TOP
+            assert places[:, 1].max() <= HEIGHT - BOTTOM
 
 
 def test_the_text_of_the_page_is_the_data_sheet(full: Datasheet) -> None:

@@ -7,6 +7,9 @@ import pytest
 from estimator_correspondences import device, simulated
 from estimator_synthetic import grid, view_of
 
+from estimator.errors import EstimationFailure
+from estimator.photo.solve import MAX_HYPOTHESES, Centre
+from estimator.photo.solve import _assignments as assignments
 from estimator.photo.solve import _sigma_px as sigma_px_of
 
 TARGET = (3.0, 2.0, 3.0)
@@ -35,3 +38,18 @@ def test_what_the_noise_of_the_centroids_explains_is_no_error_of_the_lamps() -> 
     spots = simulated(VIEW, grid(4, 3, 0.3, TARGET)[[0, 3, 8]])
     noisy = [replace(one, spot=replace(one.spot, covariance_px2=0.5**2 * np.eye(2))) for one in spots]
     assert sigma_px_of(device(VIEW, 0.5), noisy) == pytest.approx(np.sqrt(1.5 - 0.5**2), rel=1e-4)
+
+
+def lamps_with_two_candidates(count: int) -> list[Centre]:
+    """Lamps that may each be one of two LEDs, which no other lamp may be."""
+    return [Centre(0.0, 0.0, (1.0, 0.0, 0.0, 1.0), (2 * number, 2 * number + 1)) for number in range(count)]
+
+
+def test_lamps_with_too_many_hypotheses_are_refused_before_the_first_fit() -> None:
+    """Twelve lamps that may be one of two LEDs have 2^12 = 4096 hypotheses, and each takes a fit. Every further lamp
+    doubles the time, so that a picture of twenty would take 256 times as long and seem to hang.
+    """
+    assert MAX_HYPOTHESES == 2**12
+    assert len(list(assignments(lamps_with_two_candidates(12)))) == 2**12
+    with pytest.raises(EstimationFailure, match="too many lamps of one frequency; give --spots"):
+        next(assignments(lamps_with_two_candidates(13)))

@@ -94,6 +94,22 @@ def test_an_uncertain_size_leaves_the_centroid_as_it_is() -> None:
     np.testing.assert_allclose(found.variance_px2, 2 * sampling_variance_px2(np.full(2, 3.0), False), rtol=0.05)
 
 
+@pytest.mark.parametrize("half_px", [20.0, 40.0])
+def test_a_size_is_uncertain_by_3_in_1000_without_noise(half_px: float) -> None:
+    """s = 0.003 a makes the phase of the k-th harmonic uncertain by 2 pi k s. Its share 1 - exp(-(2 pi k s)^2) of the
+    envelope's mean square, 4 / (pi x^3) / (pi k)^2 with x = 2 pi k a, is variance.
+
+    The second moment changes by a / 2 with the half extent, and harmonics add to that up to 8 U(k), relative, with
+    U(k) <= sqrt(8 / (pi x^3)): twice this in a squared size.
+    """
+    k = np.arange(1.0, 9.0)
+    x = 2 * np.pi * k * half_px
+    shares = 1 - np.exp(-((2 * np.pi * k * 0.003 * half_px) ** 2))
+    expected = (4 / (np.pi * x**3) / (np.pi * k) ** 2 * shares).sum()
+    found = sampling_error(*sampled(half_px, 20.2), NO_NOISE).variance_px2
+    np.testing.assert_allclose(found, expected, rtol=16 * np.sqrt(8 / (np.pi * x**3)).sum())
+
+
 @pytest.mark.parametrize(("half_px", "centre_px"), [(0.3, 20.5), (0.5, 20.5), (0.8, 20.85), (0.9, 20.95)])
 def test_light_in_a_pixel_or_two_is_not_corrected(half_px: float, centre_px: float) -> None:
     """Two columns tell one number, the share of one of them: not both position and half extent."""
