@@ -419,6 +419,9 @@ def test_the_command_prints_a_table_or_json_and_writes_the_page(
     [
         (["blind.toml", "--wavelength-nm", "800"], "--wavelength-nm 800: quantum efficiency is 0 there"),
         (["ideal", "--wavelength-nm", "nan"], "--wavelength-nm nan"),
+        # Below, air and lenses absorb; beyond, silicon has no efficiency: its band gap of 1.12 eV is at 1107 nm.
+        (["ideal", "--wavelength-nm", "199.9"], "--wavelength-nm 199.9: has to be from 200 to 1200"),
+        (["ideal", "--wavelength-nm", "1200.1"], "--wavelength-nm 1200.1: has to be from 200 to 1200"),
         (["ideal", "--side-px", "1"], "--side-px 1"),
         (["unknown"], "unknown"),
         (["ideal", "--out", "no/such/x.html"], "no/such"),
