@@ -345,8 +345,12 @@ def test_the_grids_of_the_plots_fill_their_frames(full: Datasheet) -> None:
         curve = np.array(
             [place.split(",") for path in re.findall(r'd="M([^"]*)"', plot) for place in path.split()], float
         )
-        assert curve[:, 0].min() >= LEFT
-        assert curve[:, 0].max() <= WIDTH - RIGHT
+        dots = np.array(re.findall(r'cx="([-0-9.]+)" cy="([-0-9.]+)"', plot), float)
+        for places in (curve, dots):
+            assert places[:, 0].min() >= LEFT
+            assert places[:, 0].max() <= WIDTH - RIGHT
+            assert places[:, 1].min() >= TOP
+            assert places[:, 1].max() <= HEIGHT - BOTTOM
 
 
 def test_the_text_of_the_page_is_the_data_sheet(full: Datasheet) -> None:
@@ -415,6 +419,9 @@ def test_the_command_prints_a_table_or_json_and_writes_the_page(
     [
         (["blind.toml", "--wavelength-nm", "800"], "--wavelength-nm 800: quantum efficiency is 0 there"),
         (["ideal", "--wavelength-nm", "nan"], "--wavelength-nm nan"),
+        # Below, air and lenses absorb; beyond, silicon has no efficiency: its band gap of 1.12 eV is at 1107 nm.
+        (["ideal", "--wavelength-nm", "199.9"], "--wavelength-nm 199.9: has to be from 200 to 1200"),
+        (["ideal", "--wavelength-nm", "1200.1"], "--wavelength-nm 1200.1: has to be from 200 to 1200"),
         (["ideal", "--side-px", "1"], "--side-px 1"),
         (["unknown"], "unknown"),
         (["ideal", "--out", "no/such/x.html"], "no/such"),

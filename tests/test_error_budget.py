@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 import vlcrender as vr
 from vlcrender.dataset.budget_plot import draw_budget
+from vlcrender.dataset.error_budget import _parts
 
 RECIPE = str(ROOT / "datasets/quickstart.toml")
 OVERRIDES = [*SMALL, "poses.count=3", "belief.preset=calibrated"]
@@ -66,6 +67,17 @@ def test_device_and_shot_share_an_unknown_by_their_variances(calibrated: vr.Erro
     for name, ratio in (("focal", 0.1 / 0.03), ("accelerometer", 0.3 / 0.05), ("principal_point", 6.0 / 3.6)):
         device, shot = rows[f"{name}_device"].share, rows[f"{name}_shot"].share
         assert device.total_mm / shot.total_mm == pytest.approx(ratio, rel=1e-9)
+
+
+@pytest.mark.parametrize("belief", [["belief.preset=calibrated"], []])
+def test_the_parts_of_an_effect_are_the_whole_of_it(belief: list[str]) -> None:
+    """Rows share the variance of an effect, between device and shot if both have an error; noise is one row."""
+    recipe = vr.load_recipe(RECIPE, [*SMALL, *belief]).recipe
+    shares: dict[str, float] = {}
+    for part in _parts(recipe, recipe.cameras[0]):
+        shares[part.effect] = shares.get(part.effect, 0.0) + part.share
+    assert {"noise", "accelerometer"} <= shares.keys()
+    assert list(shares.values()) == pytest.approx([1.0] * len(shares), rel=1e-12)
 
 
 def test_an_estimator_that_trusts_lens_and_map_is_right_where_they_are_exact() -> None:

@@ -21,6 +21,7 @@ from estimator.spots.denoise import (
     unbiased_inverse,
     variance_stabilised,
 )
+from estimator.spots.led_light import Light
 
 
 def test_each_pixel_becomes_the_mean_of_its_120_neighbours() -> None:
@@ -87,6 +88,28 @@ def test_the_printed_lines_leave_only_the_edges_of_an_led_image() -> None:
     assert result[30, 30] == result[3, 3] == 0
     assert neighbourhood_mean(image)[30, 30] == 3000
     assert result.max() > 1e6
+
+
+def test_the_covariance_of_a_centroid_of_box_means_by_each_raw_pixel() -> None:
+    """A raw pixel adds 1 / 25 of an electron to the means of the 5 x 5 pixels around it, and moves the centroid by
+    (du, dv) / flux for each of these that is in the support: an outer product with its variance.
+
+    The support touches a border, and pixels beyond the rectangle are neither read nor in the support.
+    """
+    rng, shape = np.random.default_rng(8), (9, 12)
+    support, variance_e2 = rng.random(shape) < 0.6, rng.uniform(1.0, 9.0, shape)
+    u_px, v_px = np.arange(20.0, 32.0)[None, :] + 0.5, np.arange(30.0, 39.0)[:, None] + 0.5
+    signal_e = np.where(support, 100.0, 0.0)
+    light = Light(np.s_[30:39, 20:32], u_px, v_px, signal_e, support, signal_e, variance_e2)
+    centre, expected = np.array([25.7, 34.2]), np.zeros((2, 2))
+    for row in range(9):
+        for column in range(12):
+            of_pixel = np.zeros(2)
+            for i in range(max(row - 2, 0), min(row + 3, 9)):
+                for j in range(max(column - 2, 0), min(column + 3, 12)):
+                    of_pixel += support[i, j] * (np.array([20.5 + j, 30.5 + i]) - centre) / 25 / signal_e.sum()
+            expected += variance_e2[row, column] * np.outer(of_pixel, of_pixel)
+    np.testing.assert_allclose(light.covariance_px2(centre, 2), expected, rtol=1e-10)
 
 
 def test_the_box_mean_counts_the_pixel_too() -> None:

@@ -104,6 +104,18 @@ def test_one_full_pixel_in_30_000_passes_as_measured(rng: np.random.Generator) -
     assert abs(missed - expected) < 4 * np.sqrt(expected)
 
 
+@pytest.mark.parametrize("black_level_dn", [0.0, 1.0, 2.0])
+@pytest.mark.parametrize("gain_e_per_dn", [1.0, 2.0])
+def test_electrons_are_counted_from_the_black_level(black_level_dn: float, gain_e_per_dn: float) -> None:
+    """Also from a level of 1 DN and at 1 e/DN, where a step may be skipped only if it changes nothing."""
+    sensor = SENSOR.model_copy(update={"black_level_dn": black_level_dn, "gain_e_per_dn": gain_e_per_dn})
+    frame = DeviceFrame((), CAMERA, sensor, (0.0, 0.0, 9.8), ACCELEROMETER, 1e-3, (), {})
+    image_dn = np.array([[0, 1, 7, 4095]], dtype=np.uint32)
+    np.testing.assert_array_equal(
+        frame.electrons(Part(0, 0, image_dn)), gain_e_per_dn * (image_dn.astype(float) - black_level_dn)
+    )
+
+
 def test_mean_square_extents_by_integration() -> None:
     """Of a disc of radius r r^2 / 4, of a square of side a a^2 / 12, on midpoints of equal areas.
 

@@ -1,6 +1,7 @@
 """Likelihood: information and gradient by the full information matrix, and amplitudes of simulated frames."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -113,6 +114,25 @@ def test_amplitudes_are_those_drawn_also_near_to_full(full_well_e: float) -> Non
     assert (np.abs(off) < 5 * sigma).all()
     assert abs((off / sigma**2).sum()) < 4 * np.sqrt((1 / sigma**2).sum())
     assert len(pixels.leds) == 6
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-3])
+@pytest.mark.parametrize(("spread", "determined"), [(1e-4, True), (1e-5, False)])
+def test_light_that_is_even_over_its_pixels_has_no_amplitude(spread: float, determined: bool, scale: float) -> None:
+    """Light that differs by a relative e from pixel to pixel differs from background by e^2 of its square: 1e-9 is the
+    limit, whatever the unit of light; double precision sums a hundred squares to 1e-14.
+    """
+    sign = np.where(np.arange(100) % 2 == 0, 1.0, -1.0)
+    waves = np.arange(100)[:, None] * [0.1, 0.2, 0.3] * np.pi
+    light, n = scale * (1 + spread * sign), np.ones(100)
+    pixels = SimpleNamespace(
+        **{"pixel_counts": n, "electrons": 500 + sign, "group": np.zeros(100, dtype=np.int64), "gains": None},
+        **{"led": np.zeros(1, dtype=np.int64), "starts": np.array([0, 100]), "light": lambda _: light},
+        background=np.column_stack([n, np.sin(waves)]),
+    )
+    frame = frame_of(VIEW, SIX, np.zeros((1, 1), dtype=np.uint32))
+    fitted = fit_photometry(pixels, None, np.ones(1, dtype=bool), Noise.of(frame))  # type: ignore[arg-type]
+    assert (fitted.amplitude[0] != 0) == determined
 
 
 def test_a_true_led_is_explained_and_a_shifted_one_is_not() -> None:

@@ -9,6 +9,7 @@ from scipy.stats import chi2
 from test_estimator_maximum_likelihood import SIX, TARGET, most_likely, nearly_exact
 
 from estimator.camera.pose import Pose
+from estimator.methods.maximum_likelihood import _determines_position as determines_position
 from estimator.methods.maximum_likelihood import _differ as differ
 from estimator.methods.maximum_likelihood import _of_places as of_places
 from estimator.methods.maximum_likelihood import _revealed as revealed
@@ -71,3 +72,14 @@ def test_images_off_along_one_axis_reveal_a_wrong_map(axis: int) -> None:
 
     assert place_m(0.0) == 0.0
     assert place_m(8e-5) > 0.0
+
+
+@pytest.mark.parametrize("size", [6, 12])
+def test_a_position_is_determined_below_a_standard_deviation_of_1_m(size: int) -> None:
+    """Beyond, it may be anywhere between the walls of a room of 3.5 m. Three axes together, 0.48^2 + 0.6^2 + 0.64^2 =
+    1, whatever the angles and the velocity are known to.
+    """
+    variances = np.full(size, 1e6)
+    for scale, expected in ((0.999, True), (1.001, False), (np.nan, False)):
+        variances[:3] = (scale * np.array([0.48, 0.6, 0.64])) ** 2
+        assert determines_position(np.diag(variances)) == expected

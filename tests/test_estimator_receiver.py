@@ -22,6 +22,7 @@ from estimator.io.device import Camera
 from estimator.receiver.bits import NOT_SEEN, bit_error_rates, bits_seen, chip_levels
 from estimator.receiver.codes import MIN_CORRELATION, PHASES, code_books, match_code, match_code_of_frames, match_phase
 from estimator.receiver.packets import MAX_ERASED, PacketFormat, crc, decode_packet, solved_mod_2
+from estimator.receiver.panels import _laid as laid
 from estimator.receiver.panels import find_groups, same_images
 from estimator.receiver.signal import ChipWave, LedImage, PulseWave, Signal, WaveGains, folded, overlaps
 
@@ -441,6 +442,19 @@ def test_two_panels_are_two_groups_and_a_lamp_beside_them_a_third() -> None:
     assert sorted(len(group.members) for group in groups) == [1, 4, 4]
     # A square of four has 16 places in a square of 25, each turned four ways.
     assert [len(group.hypotheses) for group in groups if len(group.members) == 4] == [64, 64]
+
+
+@pytest.mark.parametrize("doubled", [0, 1, 2])
+def test_no_led_has_two_images(doubled: int) -> None:
+    """Three LEDs in a row, and beside the image of one of them a second one: the LED of index 0 is one like the others.
+
+    The first two images are known; the third, and the fourth beside one of the three, are laid.
+    """
+    offsets = np.array([[0.0, 0.0], [0.2, 0.0], [0.4, 0.0]])
+    once = laid(offsets, offsets, (1, 2), (1, 2), 0.05)
+    assert once is not None
+    assert once.tolist() == [0, 1, 2]
+    assert laid(np.vstack([offsets, offsets[doubled] + [0.0, 0.01]]), offsets, (1, 2), (1, 2), 0.05) is None
 
 
 def test_images_of_a_burst_are_followed_as_they_move() -> None:

@@ -18,6 +18,7 @@ from estimator.solvers.observations import Observations, observe
 from estimator.solvers.reprojection import Fit
 from estimator.solvers.robust_fit import Consensus, consensus
 from estimator.solvers.robust_fit import _plausible as plausible
+from estimator.solvers.robust_fit import _score as score
 from estimator.solvers.robust_fit import _snooped as data_snooping
 
 LEDS = grid(3, 3, 0.3, (3, 2, 3.0))
@@ -146,6 +147,16 @@ def test_a_reading_of_gravity_is_plausible_up_to_one_in_a_million(share: float, 
     best = fitted(share * LIMIT, np.zeros(9), share * LIMIT)
     found = Consensus(best, (), np.ones(9, dtype=bool), gravity=True)
     assert plausible(found, observed(np.zeros((9, 2)), np.ones(9)).with_assumed_camera()) == expected
+
+
+def test_an_outlier_costs_the_area_where_it_may_be() -> None:
+    """Two explanations that differ in one spot alone: its normal density of sigma 1 px at 0 is 1 / (2 pi), the
+    uniform one of an outlier 1 / (pi r^2), with r a hundredth of the 4000 px of the width, as far as a decoded pixel
+    may be off. The score is minus twice the logarithm. A variance has (1e-4 px)^2 beside: 2e-8 of the score.
+    """
+    seen, eight = observed(np.zeros((9, 2)), np.ones(9)), np.arange(9) != 4
+    nine, out = (score(Consensus(fitted(0.0, np.zeros(9)), (), one, True), seen) for one in (eight | True, eight))
+    assert out - nine == pytest.approx(2 * np.log(np.pi * 40**2) - 2 * np.log(2 * np.pi), abs=1e-7)
 
 
 def sure_of(found: Consensus) -> float:

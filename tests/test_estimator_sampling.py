@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 from estimator_synthetic import Array
+from scipy.optimize import brentq
 from test_estimator_device import CAMERA
 
 from estimator.spots.detect import detect
@@ -92,6 +93,47 @@ def test_an_uncertain_size_leaves_the_centroid_as_it_is() -> None:
     assert np.abs(found.error_px).max() < 1e-6
     np.testing.assert_allclose(found.slope, 1.0, atol=1e-6)
     np.testing.assert_allclose(found.variance_px2, 2 * sampling_variance_px2(np.full(2, 3.0), False), rtol=0.05)
+
+
+@pytest.mark.parametrize("half_px", [20.0, 40.0])
+def test_a_size_is_uncertain_by_3_in_1000_without_noise(half_px: float) -> None:
+    """s = 0.003 a makes the phase of the k-th harmonic uncertain by 2 pi k s. Its share 1 - exp(-(2 pi k s)^2) of the
+    envelope's mean square, 4 / (pi x^3) / (pi k)^2 with x = 2 pi k a, is variance.
+
+    The second moment changes by a / 2 with the half extent, and harmonics add to that up to 8 U(k), relative, with
+    U(k) <= sqrt(8 / (pi x^3)): twice this in a squared size.
+    """
+    k = np.arange(1.0, 9.0)
+    x = 2 * np.pi * k * half_px
+    shares = 1 - np.exp(-((2 * np.pi * k * 0.003 * half_px) ** 2))
+    expected = (4 / (np.pi * x**3) / (np.pi * k) ** 2 * shares).sum()
+    found = sampling_error(*sampled(half_px, 20.2), NO_NOISE).variance_px2
+    np.testing.assert_allclose(found, expected, rtol=16 * np.sqrt(8 / (np.pi * x**3)).sum())
+
+
+@pytest.mark.parametrize("half_px", [0.9, 1.0])
+def test_noise_of_a_moment_makes_a_size_uncertain_at_a_known_centroid(half_px: float) -> None:
+    """The half extent changes with the moment as for images of one sampled centroid, whose true ones differ: for a
+    disc of 1 px, which pixels sample coarsely, that is a tenth of it. By differences of images in closed form.
+
+    The model has eight harmonics. The derivative's terms are 4 a U(k) at most, with U(k) <= sqrt(8 / (pi x^3)), and
+    have both signs: what is left out is below the ninth of them, and twice as much in a variance.
+    """
+    step_px, centre_px, sigma_px2 = 1e-3, 20.25, 1e-3
+    centroid, moments = sampled(half_px, centre_px)
+
+    def moment_px2(half: float) -> float:
+        same = brentq(lambda at: sampled(half, at)[0][0] - centroid[0], centre_px - 0.1, centre_px + 0.1, xtol=1e-12)
+        return float(sampled(half, same)[1][0])
+
+    slope = (moment_px2(half_px + step_px) - moment_px2(half_px - step_px)) / (2 * step_px)
+    sigma_px = np.hypot(sigma_px2, 0.003 * half_px**2 / 2) / slope
+    k = np.arange(1.0, 9.0)
+    x = 2 * np.pi * k * half_px
+    expected = (4 / (np.pi * x**3) / (np.pi * k) ** 2 * (1 - np.exp(-((2 * np.pi * k * sigma_px) ** 2)))).sum()
+    found = sampling_error(centroid, moments, np.full(2, sigma_px2)).variance_px2
+    ninth = np.sqrt(8 / (np.pi * (2 * np.pi * 9 * half_px) ** 3))
+    np.testing.assert_allclose(found, expected, rtol=2 * 4 * half_px * ninth / slope)
 
 
 @pytest.mark.parametrize(("half_px", "centre_px"), [(0.3, 20.5), (0.5, 20.5), (0.8, 20.85), (0.9, 20.95)])

@@ -3,9 +3,15 @@
 import numpy as np
 import pytest
 from estimator_synthetic import Array
+from test_estimator_likelihood import drawn, gathered, true_pose
 
-from estimator.pixels.nuisances import Nuisances, Solution
-from estimator.pixels.search import ScoringResult, step_factor, unexplained
+from estimator.pixels import search
+from estimator.pixels.initial import gravity_of
+from estimator.pixels.led_model import RenderedLeds
+from estimator.pixels.led_pixels import LedPixels
+from estimator.pixels.likelihood import Noise, PhotometricFit, fit_photometry, score
+from estimator.pixels.nuisances import NO_COMPONENTS, Nuisances, Priors, Solution
+from estimator.pixels.search import ScoringResult, Search, step_factor, unexplained
 
 
 def step_of(length: float) -> Solution:
@@ -35,6 +41,35 @@ def test_a_step_that_takes_back_less_than_half_is_a_full_one() -> None:
     assert step_factor(step_of(-0.51), step_of(1.0), 1.0) == 0.5
     assert step_factor(step_of(-0.24), step_of(1.0), 0.5) == 1.0  # of half a step before
     assert step_factor(step_of(-0.26), step_of(1.0), 0.5) == 0.5
+
+
+@pytest.mark.parametrize("angle_rad", [0.0, 2e-4])
+def test_a_step_is_by_amplitudes_and_background_at_its_own_pose(
+    monkeypatch: pytest.MonkeyPatch, angle_rad: float
+) -> None:
+    """A search may start where its pixels were gathered, whose light is fitted already, or 0.3 px beside (a second one,
+    without a wrong LED): the light of the first pose would bend the first step.
+    """
+    frame = drawn(4000.0, 3)
+    pose = true_pose(frame)
+    pixels, priors = gathered(frame, pose), Priors.of(frame, tuple(frame.leds.values()))
+    used, steps = np.ones(len(pixels.leds), dtype=bool), list[tuple[RenderedLeds, PhotometricFit]]()
+
+    def noted(
+        of: LedPixels, rendered: RenderedLeds, photometry: PhotometricFit, profile: Array | None
+    ) -> tuple[Array, Array]:
+        steps.append((rendered, photometry))
+        return score(of, rendered, photometry, profile)
+
+    monkeypatch.setattr(search, "score", noted)
+    start = pose.moved(np.array([0, 0, 0, angle_rad, 0, 0]), frame.camera) if angle_rad else pose
+    made = Search(frame, pixels, gravity_of(frame), priors, np.eye(6), 0.0)
+    assert made.run(used, start, Nuisances.zero(priors), NO_COMPONENTS).converged
+    rendered, photometry = steps[0]
+    assert (rendered is pixels.rendered) == (angle_rad == 0)
+    expected = fit_photometry(pixels, rendered, used, Noise.of(frame))
+    np.testing.assert_array_equal(photometry.amplitude, expected.amplitude)
+    np.testing.assert_array_equal(photometry.background, expected.background)
 
 
 def result_of(excess: Array, used: Array, faint: Array) -> ScoringResult:

@@ -9,6 +9,7 @@ from estimator.spots.glow import _isophote
 from estimator.spots.led_light import Readout
 from estimator.spots.line_edges import LineEdges
 from estimator.spots.outlines import EdgeEllipse, EdgeParallelogram
+from estimator.spots.parallelogram_fit import _Ends, _TurnedModel
 from estimator.spots.striped import Lamp, find_lamps
 
 ROW_US, EXPOSURE_US, CHIP_US = 10.0, 40.0, 25.0
@@ -233,3 +234,14 @@ def test_an_isophote_is_the_ellipse_of_its_pixels() -> None:
     found = _isophote(((x - 24.3) / 14.0) ** 2 + ((y - 30.6) / 21.0) ** 2 < 1)
     assert found is not None
     assert (found.x0, found.y0, found.half_chord, found.half_extent) == pytest.approx((24.3, 30.6, 14.0, 21.0), abs=0.5)
+
+
+def test_turned_squares_are_first_tried_in_the_middle_of_their_edges() -> None:
+    """A square whose diagonal lies along the readout: the mean of all edges is its centre, and the line (10 + 30) / 2
+    its middle. A start elsewhere may end in another minimum.
+    """
+    lines = np.arange(10.0, 30.0)
+    half = 10 - np.abs(lines + 0.5 - 20)
+    edges = LineEdges(lines, 57.0 - half, 57.0 + half, np.full(20, 0.01), np.full(20, 1000.0), 0.0)
+    starts = _TurnedModel.starts(edges, _Ends(10.0, 30.0, 2.0))
+    assert [one.start[:2].tolist() for one in starts] == [pytest.approx([57.0, 20.0], abs=1e-9)] * 2

@@ -101,6 +101,20 @@ def position_by_hand(errors: Array, leds_m: Array) -> Array:
     return built + errors[:3]
 
 
+def test_a_luminaire_moves_and_turns_its_leds_as_the_format_says(renderer: Renderer) -> None:
+    """LEDs at different heights, so that turns about x and y move them sideways too. Positions are linear in each
+    error, so that a difference by two sigmas is exact but for rounding: 2^-52 of some 3 m, over a sigma of 2e-3.
+    """
+    heights_m = np.outer([0.0, 0.05, -0.03, 0.08], [0.0, 0.0, 1.0])
+    leds = replace(renderer.scene.leds, centers_m=renderer.scene.leds.centers_m + heights_m)
+    levers = MapLevers(calibrated(), leds, np.arange(4)).of_luminaires
+    for unknown, sigma in enumerate(calibrated().luminaires[0]):
+        errors = np.zeros(16)
+        errors[[4 + unknown, 10 + unknown]] = sigma
+        moved_m = (position_by_hand(errors, leds.centers_m) - position_by_hand(-errors, leds.centers_m)) / 2
+        np.testing.assert_allclose(levers[:, :, unknown], moved_m, rtol=0, atol=4 * 2**-52 * 3)
+
+
 def spots_by_hand(pose: Array, lens: Array, positions_m: Array) -> Array:
     """Images (8,) of points, px, with the lens's errors (7,) as FORMAT.md has them; pose: x, y, z, m, angles, rad."""
     p = (positions_m - pose[:3]) @ rotation_cam_world(*np.degrees(pose[3:])).T

@@ -13,6 +13,9 @@ from vlcrender.camera.roi import LedRegions
 from vlcrender.light.lightmap import bake
 from vlcrender.rendering.bayer import MosaicRenderer
 from vlcrender.rendering.crlb import moved
+from vlcrender.rendering.led_coverage import coverage_of_led
+from vlcrender.rendering.led_radiance import LedImage, face_of_led
+from vlcrender.rendering.led_slopes import led_slopes
 from vlcrender.rendering.renderer import Renderer
 from vlcrender.scene.loader import Scene
 from vlcrender.sensor.radiometry import Silicon
@@ -84,6 +87,26 @@ def test_slopes_of_one_led(led: dict[str, Any]) -> None:
 def test_slopes_through_a_lens(lens: dict[str, Any]) -> None:
     led = {**LED, "face_gradient": [0.1, 0.0]}
     agree(Renderer(scene_of(led=[led], bake=COARSE)), Camera(**CAMERA, **lens), LedRegions(kind="leds"))
+
+
+@pytest.mark.parametrize("split", [2, 4])
+def test_a_part_changes_as_its_quarters_together(split: int) -> None:
+    """Light of parts is their mean over the part: that of 2 x 2 quarters. To the rounding of sums of positions of 1e3
+    px, 2^-52 of them, over displacements of STEP_PX in pieces of 0.1 px.
+    """
+    leds, posed = scene_of(led=[LED]).leds, PosedCamera(Camera(**CAMERA), POSE)
+    face = coverage_of_led(posed, face_of_led(leds, 0))
+    assert face is not None
+    images = {0: LedImage(leds, 0, posed, face, 1.0, 1.0, 1.0, None)}
+    step_m = 2.0 * STEP_PX / 1500
+    changes = [(posed.at(moved(POSE, 0, step_m)), posed.at(moved(POSE, 0, -step_m)))]
+    coarse, fine = (next(led_slopes(leds, posed, changes, images, {0: n}))[1][0].edges for n in (split, 2 * split))
+    assert coarse is not None
+    assert fine is not None
+    np.testing.assert_array_equal([coarse.rows, coarse.columns], [fine.rows, fine.columns])
+    quarters = fine.excess.reshape(-1, split, 2, split, 2).mean(axis=(2, 4))
+    assert np.abs(coarse.excess).max() > 0.1 * STEP_PX
+    np.testing.assert_allclose(coarse.excess, quarters, rtol=0, atol=1e-6 * STEP_PX)
 
 
 def test_slopes_of_diffusers() -> None:

@@ -259,11 +259,15 @@ def test_a_bake_is_another_one_with_another_mitsuba_or_cache_version(
 
 
 def test_bare_leds_and_leds_behind_a_diffuser_keep_their_own_intensities(tmp_path: Path) -> None:
-    """I = L A of the bare LED whose id comes after the panel's, and the transmitted light of each of the panel's."""
-    scene = lit_room(tmp_path, "led.0.id", 99)
+    """I = L A of the bare LED whose id comes after the panel's, and the transmitted light of each of the panel's.
+
+    Half the intensity at 45 deg is the order ln 2 / ln sqrt(2) = 2; a diffuser is Lambertian, of order 1.
+    """
+    scene = lit_room(tmp_path, "led.0", lamp(id=99, half_power_deg=45.0))
     sources = point_sources(scene.leds)
     assert scene.leds.ids.tolist() == [10, 11, 12, 13, 99]
     assert sources.centers_m[0].tolist() == [3.5, 3.5, 3.5]
     assert sources.intensities_cd[0] == pytest.approx(10000 * np.pi * 0.01**2, rel=1e-12)
+    assert sources.orders == pytest.approx([2.0] + 16 * [1.0], rel=1e-12)
     behind = sources.intensities_cd[1:].reshape(4, 4).sum(axis=1) / scene.leds.luminances_cd_m2[:4]
     assert behind == pytest.approx(np.full(4, behind[0]), rel=1e-9)  # the panel is symmetric

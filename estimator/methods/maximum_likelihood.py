@@ -221,7 +221,7 @@ def _maximize_honestly(
         try:
             found = maximize(frame, gravity, wider, start)
         except EstimationFailure:
-            if not np.trace(start.covariance[:3, :3]) < MAX_SIGMA_M**2:
+            if not _determines_position(start.covariance):
                 raise
             return start, wider is not priors
         revealed, camera = _revealed(frame, gravity, wider, found)
@@ -331,7 +331,7 @@ def maximize(frame: DeviceFrame, gravity: Gravity, priors: Priors, start: Start)
         # nothing.
         if result.converged and (result.moved_px < max_settled_px or settled):
             covariance = result.solution.covariance
-            if not np.trace(covariance[:3, :3]) < MAX_SIGMA_M**2:
+            if not _determines_position(covariance):
                 raise EstimationFailure("fit", "the LEDs in view do not determine a position")
             # The better known pose may determine the images of more LEDs.
             if not pixels.more or np.array_equal(pixels.index, in_view().index):
@@ -341,6 +341,11 @@ def maximize(frame: DeviceFrame, gravity: Gravity, priors: Priors, start: Start)
                 )
         settled = result.converged
     raise EstimationFailure("fit", DIVERGED)
+
+
+def _determines_position(covariance: Floats) -> bool:
+    """Whether a covariance of the pose, its first three parameters the position, is below MAX_SIGMA_M; NaN is not."""
+    return bool(np.trace(covariance[:3, :3]) < MAX_SIGMA_M**2)
 
 
 def _shape_sigma_px(frame: DeviceFrame, priors: Priors, start: Start) -> float:

@@ -57,11 +57,6 @@ class LedTable:
         """Metres of one unit."""
         return UNITS_M[self.unit]
 
-    @property
-    def has_sizes(self) -> bool:
-        """Whether the table says how large every LED is."""
-        return all(entry.radius is not None or entry.side is not None for entry in self.entries)
-
     def frequencies_hz(self) -> dict[int, float]:
         """Frequencies by id, of the LEDs that have one."""
         return {entry.id: entry.frequency_hz for entry in self.entries if entry.frequency_hz is not None}

@@ -14,7 +14,7 @@ from estimator.io.downlink import Downlink, Tones
 from estimator.io.shutter import GLOBAL, Shutter
 from estimator.photo.attitude import Attitude
 from estimator.photo.calibration import Calibration, calibration_of_film, simple_calibration
-from estimator.photo.decode import MIN_AXIS_RATIO, FoundLamp, find, readout_ratio
+from estimator.photo.decode import FLOOR, MIN_AXIS_RATIO, FoundLamp, find, readout_ratio
 from estimator.photo.led_table import LedTable, Mirror
 from estimator.photo.overlay import Mark
 from estimator.photo.pictures import Orientation, Picture, Tone, read_picture
@@ -199,7 +199,7 @@ def _centres_by_hand(picture: Picture, lamps: Sequence[FoundLamp], options: Opti
         spots = [replace(one.lamp.spot(), touches_border=not one.lamp.measured) for one in lamps]
     else:
         coded = picture.coded
-        readout = Readout(0, 0, coded, coded, picture.clipped, 2.0)
+        readout = Readout(0, 0, coded, coded, picture.clipped, FLOOR)
         near = np.array([(u, v) for _, u, v in options.spots])
         spots = list(detect([readout], coded.size, 0, near, near_px=gate_px(picture.width_px)))
     gate = gate_px(picture.width_px)
