@@ -1,4 +1,4 @@
-"""Reproduce Huynh & Yoo, Sensors 2016, and write docs/paper.md and docs/paper.html: python docs/make_paper.py [ITEM ...]
+"""Reproduce Huynh & Yoo, Sensors 2016, for docs/paper.md and docs/paper.html: python docs/make_paper.py [ITEM ...]
 
 Each item makes its sets from the recipes of docs/paper/, runs the variants and keeps tables, plots and errors in
 docs/paper/. Sets and estimates that are finished are kept in the folder `--out`; interrupted ones are continued. The
@@ -13,7 +13,8 @@ import sys
 import time
 from pathlib import Path
 
-from paper_items import ITEMS, Item, Tables
+from paper_figures import Tables
+from paper_items import ITEMS, Item
 from paper_page import write_pages
 from paper_sets import (
     PAGE,

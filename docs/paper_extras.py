@@ -8,6 +8,7 @@ import numpy as np
 import pyarrow.parquet as pq
 from measure import length, predictions
 from numpy.typing import NDArray
+from paper_sets import PAGE, Measured, rounded
 
 import estimator as est
 import vlcrender as vr
@@ -15,7 +16,6 @@ from estimator.evaluate.table import Key, Statistic, Table, TableRow
 from estimator.io.estimates import estimates_path, read_estimates
 from estimator.io.sweep import dataset_folders
 from estimator.report.plot import plot
-from paper_sets import PAGE, Measured, rounded
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.scene.visibility import leds_in_view, level_visibility
 
@@ -90,7 +90,9 @@ def tilt_coverage(_: Mapping[str, Measured]) -> Found:
             if scene_name == "office" and tilt_x == 60:
                 found["share_60"] = shares[-1]
     head = ["scene", "tilt_x, deg", *(f"tilt_y = {tilt:g} deg" for tilt in tilts)]
-    title = f"Coverage: positions of a {TILT_POSITIONS} x {TILT_POSITIONS} grid with four whole LEDs in view, yaw 0, not aimed"
+    title = (
+        f"Coverage: {TILT_POSITIONS} x {TILT_POSITIONS} positions, share with four whole LEDs in view, yaw 0, not aimed"
+    )
     return [{"title": title, "head": head, "rows": rows}], found
 
 

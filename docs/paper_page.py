@@ -1,4 +1,4 @@
-"""docs/paper.md and docs/paper.html: claims with their verdicts, then each item, from the kept tables of docs/paper/."""
+"""docs/paper.md and docs/paper.html: claims with their verdicts, then each item, from what docs/paper/ keeps."""
 
 import json
 import math
@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from paper_items import BARE, BARE_CENTROID, CENTROID, ITEMS, PAPER, Item
+from paper_figures import BARE, BARE_CENTROID, CENTROID, PAPER, REDUCED, REDUCED_CENTROID
+from paper_items import ITEMS, Item
 from paper_sets import PAGE, ROOT
 
 from estimator.evaluate.table_text import value_text
@@ -15,7 +16,9 @@ from estimator.evaluate.table_text import value_text
 NAMES = {
     PAPER: "paper: reduction, brightest pixel",
     BARE: "no reduction, brightest pixel",
+    REDUCED: "paper: reduction, brightest pixel",
     CENTROID: "reduction, centroid",
+    REDUCED_CENTROID: "reduction, centroid",
     BARE_CENTROID: "no reduction, centroid",
 }
 """Short names of the variants of the paper's stages, for the heads of tables."""
@@ -182,12 +185,13 @@ CLAIMS = (
 
 
 class Figure(float):
-    """A number in a sentence: the format `m` is a length, `%` a share with one digit."""
+    """A number in a sentence: the format `m` is a length, `%` a share with one digit, `.3%` with three."""
 
     def __format__(self, spec: str) -> str:
+        """The number in a format; `m` and `%` are this class's own."""
         if spec == "m":
             return value_text("_m", float(self))
-        return f"{100 * self:.1f} %" if spec == "%" else format(float(self), spec)
+        return f"{100 * self:{spec[:-1] or '.1'}f} %" if spec.endswith("%") else format(float(self), spec)
 
 
 def kept(name: str) -> dict[str, Any] | None:
@@ -269,13 +273,17 @@ def failures(view: Mapping[str, Any]) -> list[str]:
 
 def sentence(item: Item, figures: Mapping[str, float | None]) -> str:
     """The finding of an item with its figures."""
-    return item.finding.format_map({key: Figure(math.nan if one is None else one) for key, one in figures.items()})
+    return (
+        item.text["finding"]
+        .strip()
+        .format_map({key: Figure(math.nan if one is None else one) for key, one in figures.items()})
+    )
 
 
 def section(item: Item) -> dict[str, Any]:
     """What the templates show of an item."""
     record = kept(item.name)
-    base = {"name": item.name, "title": item.title, "paper": item.paper, "run": record is not None}
+    base = {"name": item.name, "title": item.text["title"], "paper": item.text["paper"], "run": record is not None}
     if record is None:
         return base
     inside, means = (sum(view["seeds"][index] for view in record["views"]) for index in (0, 1))

@@ -34,7 +34,7 @@ BOUND = "bound (RMS)"
 DIGITS = 6
 
 
-class OutOfTime(Exception):  # noqa: N818 - no error
+class OutOfTime(Exception):
     """The minutes of `--minutes` are over."""
 
 
