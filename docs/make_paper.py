@@ -2,7 +2,8 @@
 
 Each item makes its sets from the recipes of docs/paper/, runs the variants and keeps tables, plots and errors in
 docs/paper/. Sets and estimates that are finished are kept in the folder `--out`; interrupted ones are continued. The
-pages are written from what docs/paper/ keeps: items without it are listed as not run.
+pages are written from what docs/paper/ keeps: items without it are listed as not run. With `--full` the sets have the
+paper's sizes, or a thousand poses a setting; their tables go to docs/paper/full/, and the pages stay as they are.
 """
 
 import argparse
@@ -33,11 +34,16 @@ from paper_sets import (
 def make(item: Item, chosen: argparse.Namespace, clock: Clock) -> None:
     """Measure an item and write what docs/paper/ keeps of it. Raises OutOfTime."""
     sets = {one.name: measure(one, chosen.out, chosen.seeds, chosen.full, chosen.workers, clock) for one in item.sets}
-    views = [keep_view(item.name, view, sets[view.set].folder) for view in item.views]
+    kept_in = PAGE / "full" if chosen.full else PAGE
+    kept_in.mkdir(exist_ok=True)
+    views = [keep_view(item.name, view, sets[view.set].folder, kept_in) for view in item.views]
     for one in item.sets:
         if one.variants and not chosen.full:
             keep_scores(one, sets[one.name].folder)
     grids, extra = item.extra(sets) if item.extra else ([], {})
+    for grid in grids:
+        if "svg" in grid:
+            (kept_in / grid["plot"]).write_text(grid.pop("svg"))
     figures = item.figures(Tables({view["name"]: view for view in views}, extra))
     kept = {
         "item": item.name,
@@ -60,7 +66,8 @@ def make(item: Item, chosen: argparse.Namespace, clock: Clock) -> None:
         "views": views,
         "grids": grids,
     }
-    (PAGE / f"{item.name}.json").write_text(json.dumps(kept, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    text = json.dumps(kept, indent=1, ensure_ascii=False) + "\n"
+    (kept_in / f"{item.name}.json").write_text(text, encoding="utf-8")
 
 
 def _commit() -> str:

@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow.parquet as pq
 from measure import length, predictions
 from numpy.typing import NDArray
-from paper_sets import PAGE, Measured, rounded
+from paper_sets import Measured
 
 import estimator as est
 import vlcrender as vr
@@ -96,15 +96,14 @@ def tilt_coverage(_: Mapping[str, Measured]) -> Found:
     return [{"title": title, "head": head, "rows": rows}], found
 
 
-def curves(name: str, metric: str, x: str, groups: Mapping[str, tuple[Floats, Floats]]) -> str:
-    """A plot of curves in docs/paper/ by the plot of tables; returns its name."""
+def curves(metric: str, x: str, groups: Mapping[str, tuple[Floats, Floats]]) -> str:
+    """A plot of curves, SVG, by the plot of tables."""
     rows = tuple(
         TableRow((Key(float(at)),), (group,), 1, 1, (Statistic(float(value), np.nan, np.nan),), {})
         for group, (places, values) in groups.items()
         for at, value in zip(places, values, strict=True)
     )
-    (PAGE / f"{name}.svg").write_text(plot(Table(metric, (x,), ("variant",), ("mean",), rows), ()))
-    return f"{name}.svg"
+    return plot(Table(metric, (x,), ("variant",), ("mean",), rows), ())
 
 
 def _images(folder: Path) -> list[tuple[Any, dict[str, Any]]]:
@@ -141,10 +140,10 @@ def profile(sets: Mapping[str, Measured]) -> Found:
         rows.append(
             [f"LED {led['led']}", f"{peak:.0f}", str(int((image >= 0.5 * peak).sum())), f"{100 * flats[-1]:.1f} %"]
         )
-    name = curves("fig5-profile", "electrons", "pixel", groups)
     head = ["LED", "largest, electrons", "pixels above half", "of them within 5 % of the largest"]
     bell = np.log(1 / 0.95) / np.log(2)
-    grid = {"title": "Rows through the centres of two LED images, no noise", "head": head, "rows": rows, "plot": name}
+    grid = {"title": "Rows through the centres of two LED images, no noise", "head": head, "rows": rows}
+    grid |= {"plot": "fig5-profile.svg", "svg": curves("electrons", "pixel", groups)}
     return [grid], {"flat": min(flats), "bell": float(bell)}
 
 
@@ -188,7 +187,6 @@ def noise_histogram(sets: Mapping[str, Measured]) -> Found:
         "sigma of the 120 differences",
         "variance over Skellam's",
     ]
-    name = curves("fig8-histogram", "density", "difference over Skellam's sigma", groups)
-    return [{"title": "120 differences in an area of 11 x 11 pixels", "head": head, "rows": rows, "plot": name}], {
-        key: rounded(value) or 0.0 for key, value in figures.items()
-    }
+    grid = {"title": "120 differences in an area of 11 x 11 pixels", "head": head, "rows": rows}
+    grid |= {"plot": "fig8-histogram.svg", "svg": curves("density", "difference over Skellam's sigma", groups)}
+    return [grid], figures

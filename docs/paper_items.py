@@ -145,7 +145,7 @@ ITEMS = {
         ),
         Item(
             "fig9",
-            (PaperSet("fig9_photon", FIG9, PIXELS | ROOMY), PaperSet("fig9_added", FIG9, LIGHT)),
+            (PaperSet("fig9_photon", FIG9, ROOMY), PaperSet("fig9_added", FIG9, ROOMY)),
             _fig9_views(),
             figures.fig9,
         ),

@@ -195,10 +195,10 @@ def kept_row(row: TableRow) -> dict[str, Any]:
     }
 
 
-def keep_view(item: str, view: View, folder: Path) -> dict[str, Any]:
-    """Table and plot of a view, written to docs/paper/; returns the kept table."""
+def keep_view(item: str, view: View, folder: Path, kept_in: Path) -> dict[str, Any]:
+    """Table and plot of a view, written to the folder `kept_in`; returns the kept table."""
     table = table_of(view, folder)
-    stem = PAGE / f"{item}-{view.name}"
+    stem = kept_in / f"{item}-{view.name}"
     drawn = with_statistic(table, view.shown)
     stem.with_suffix(".svg").write_text(plot(drawn, view.log, view.lines if len(view.x) == 1 else ()))
     stem.with_suffix(".csv").write_text(table_csv(table))
@@ -253,4 +253,4 @@ def _cell(value: object) -> str:
 
 
 Extra = Callable[[Mapping[str, Measured]], tuple[list[dict[str, Any]], dict[str, float]]]
-"""Further measurement of an item: grids (`title`, `head`, `rows`, and `plot`, an SVG's name) and single figures."""
+"""Further measurement of an item: grids (`title`, `head`, `rows`; `plot` and `svg`, name and text of a plot) and figures."""
