@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow.parquet as pq
 from measure import length, predictions
 from numpy.typing import NDArray
-from paper_sets import Measured
+from paper_sets import Measured, key_text
 
 import estimator as est
 import vlcrender as vr
@@ -46,7 +46,9 @@ def tilt_theory(sets: Mapping[str, Measured]) -> Found:
             continue
         theory, real = (float(np.sqrt(np.mean(one))) for one in (squares, measured[tilt, error_deg]))
         worst = max(worst, abs(real / theory - 1))
-        rows.append([tilt, f"{error_deg:g}", str(len(squares)), length(theory), length(real), f"{real / theory:.4f}"])
+        rows.append(
+            [key_text(tilt), f"{error_deg:g}", str(len(squares)), length(theory), length(real), f"{real / theory:.4f}"]
+        )
     head = [
         "tilt on both axes, deg",
         "error, deg",

@@ -2,6 +2,7 @@
 
 import json
 import math
+import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from paper_figures import BARE, BARE_CENTROID, CENTROID, PAPER, REDUCED, REDUCED_CENTROID
 from paper_items import ITEMS, Item
-from paper_sets import PAGE, ROOT
+from paper_sets import PAGE, ROOT, key_text
 
 from estimator.evaluate.table_text import value_text
 
@@ -234,9 +235,9 @@ def view_table(view: Mapping[str, Any]) -> dict[str, Any]:
     cells = []
     for line in lines:
         of_line = [by_key[line].get(one) if along else by_key[one].get(line) for one in columns]
-        first = [_key(one) for one in line] if along else [NAMES.get(line, line)]
+        first = [key_text(one) for one in line] if along else [NAMES.get(line, line)]
         cells.append([*first, *(_statistic(view, row) for row in of_line)])
-    heads = [NAMES.get(one, one) if along else ", ".join(map(_key, one)) for one in columns]
+    heads = [NAMES.get(one, one) if along else ", ".join(map(key_text, one)) for one in columns]
     frames = sorted({row["frames"] for row in view["rows"]})
     return {
         "head": [*(view["x"] if along else ["variant"]), *heads],
@@ -244,10 +245,6 @@ def view_table(view: Mapping[str, Any]) -> dict[str, Any]:
         "frames": " to ".join(str(one) for one in dict.fromkeys((frames[0], frames[-1]))),
         "failures": failures(view),
     }
-
-
-def _key(value: float | str) -> str:
-    return value if isinstance(value, str) else f"{value:g}"
 
 
 def _statistic(view: Mapping[str, Any], row: Mapping[str, Any] | None) -> str:
@@ -314,6 +311,7 @@ def pages() -> dict[str, str]:
         "open": next(one for one in sections if one["name"] == "open"),
         "sections": [one for one in sections if one["name"] != "open"],
         "not_run": [one["title"] for one in sections if not one["run"]],
+        "prose": tomllib.loads((PAGE / "templates" / "text.toml").read_text())["page"],
         "cpu_min": sum(one["cpu_s"] for one in sections if one["run"]) / 60,
     }
     texts = {}

@@ -173,6 +173,14 @@ def with_statistic(table: Table, name: str) -> Table:
     )
 
 
+def key_text(value: float | str) -> str:
+    """A key's value; a range such as "[20.0, 40.0]" as `20 to 40`, and as `0` where both ends are the same."""
+    if isinstance(value, str):
+        ends = [f"{float(end):g}" for end in value.strip("[]").split(",")] if value.startswith("[") else [value]
+        return " to ".join(dict.fromkeys(ends))
+    return f"{value:g}"
+
+
 def rounded(value: float) -> float | None:
     """A number to six digits; None where there is none or no limit."""
     return float(f"{value:.{DIGITS}g}") if math.isfinite(value) else None
@@ -253,4 +261,7 @@ def _cell(value: object) -> str:
 
 
 Extra = Callable[[Mapping[str, Measured]], tuple[list[dict[str, Any]], dict[str, float]]]
-"""Further measurement of an item: grids (`title`, `head`, `rows`; `plot` and `svg`, name and text of a plot) and figures."""
+"""Further measurement of an item: grids and single figures.
+
+A grid has `title`, `head` and `rows`, and may have `plot` and `svg`, the name and the text of a plot.
+"""
