@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: check demo test lint docs figures bench mutants clean
+.PHONY: check demo test lint docs figures paper paper-full bench mutants clean
 
 demo: $(READY)
 	$(BIN)/vlcrender generate datasets/quickstart.toml --out out/quickstart
@@ -33,6 +33,13 @@ figures: $(READY)
 	$(BIN)/python docs/measure_belief.py
 	$(BIN)/python docs/measure_budget.py
 	$(BIN)/python docs/measure_downlink.py
+
+# docs/paper.md: sets of minutes, or with the paper's sizes (hours; a run with --minutes goes on where it stopped).
+paper: $(READY)
+	$(BIN)/python docs/make_paper.py
+
+paper-full: $(READY)
+	$(BIN)/python docs/make_paper.py --full
 
 bench: $(READY)
 	$(BIN)/python benchmarks/full_frame.py
