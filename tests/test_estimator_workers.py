@@ -48,10 +48,10 @@ def test_frames_of_a_device_are_solved_in_order_and_counted(folder: Path, monkey
     """Workers are threads here, and their work is to hand over numbers: what is held is how results are collected."""
     solved: list[list[int]] = []
 
-    def work(records: tuple[FrameRecord, ...]) -> ShotResult:
+    def work(_: Path, records: tuple[FrameRecord, ...]) -> ShotResult:
         return ShotResult({}, {"all": [Observed(one.frame, one.device, None, 0.0) for one in records]})
 
-    def solve(observed: dict[str, list[Observed]]) -> Rows:
+    def solve(_: Path, observed: dict[str, list[Observed]]) -> Rows:
         solved.append([one.frame for one in observed["all"]])
         return {}
 
@@ -59,7 +59,8 @@ def test_frames_of_a_device_are_solved_in_order_and_counted(folder: Path, monkey
     monkeypatch.setattr(workers, "_work", work)
     monkeypatch.setattr(workers, "_solve", solve)
     done: list[None] = []
-    assert estimate_with_workers(read_dataset(folder), [], 2, on_frame=lambda: done.append(None)) == {}
+    (rows,) = estimate_with_workers([read_dataset(folder)], [], 2, on_frame=lambda: done.append(None))
+    assert rows == {}
     assert solved == [[0, 1, 2]]
     assert len(done) == 2 * 3
 
