@@ -26,6 +26,7 @@ from measure import Measurement, figure, heading, length, number, row
 import estimator as est
 from estimator.evaluate.levels import level_cells, levels_of
 from estimator.evaluate.score import VariantScore
+from estimator.methods import gravity_fit
 from estimator.report.levels import level_picture
 
 LEVELS = ("laboratory", "calibrated", "as_sold")
@@ -193,7 +194,25 @@ def unstated(chosen: Chosen) -> None:
             text = ", ".join(f"{key} {value:g}" for key, value in wrong.items()) or "nothing"
             figure("scale; wrong", f"{scale}; {text}")
             name = "-".join(["wrong", *(f"{key}={value:g}" for key, value in wrong.items()), exact.name])
-            chosen.print_scores(told(exact, name, partial(_wrong, wrong=wrong)))
+            folder = told(exact, name, partial(_wrong, wrong=wrong))
+            chosen.print_scores(folder)
+            if "map_mm" not in wrong:
+                _print_frames_alone(folder)
+
+
+def _print_frames_alone(folder: Path) -> None:
+    """Print what the frames say of the camera by `gravity-fit`, each by itself, and their NEES then."""
+    dataset, nees, contradicting = est.read_dataset(folder), [], 0
+    for record, true_m in zip(
+        dataset.frames, pq.read_table(folder / "truth.parquet")["position_m"].to_pylist(), strict=True
+    ):
+        judged = gravity_fit.judged(est.read_frame(dataset, record))
+        error_m, covariance_m2 = judged.estimate.position_m - np.array(true_m), judged.estimate.covariance_m2
+        assert covariance_m2 is not None
+        nees.append(float(error_m @ np.linalg.solve(covariance_m2, error_m)))
+        contradicting += judged.contradicts
+    figure("frames that contradict the camera", f"{contradicting} of {len(nees)}")
+    figure("NEES of `gravity-fit`, each frame by itself", f"{np.mean(nees):.2f}")
 
 
 def _wrong(device: dict[str, Any], wrong: Mapping[str, float]) -> dict[str, Any]:

@@ -97,8 +97,8 @@ def variants() -> list[Variant]:
 def estimate(frame: DeviceFrame, variant: str | Variant = "ml") -> Estimate:
     """Estimate the position of a frame's camera.
 
-    A variant that uses all frames of a device (`self-calibrated`) uses this one alone; give it more by
-    `estimate_device`.
+    A variant that uses all frames of a device uses this one alone; give it more by `estimate_device`. `self-calibrated`
+    does, and `gravity-fit`, `up2p` and `ml`, to find out whether a camera is as exact as the device states.
 
     Parameters
     ----------

@@ -6,7 +6,7 @@ is then trusted, unless other frames of the device contradict it (`estimator.met
 without one adds to the covariance.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
@@ -30,13 +30,16 @@ class CameraErrors:
     """Errors of the intrinsics (k,), the focal length's first, that each by itself explain the residuals of a fit best.
 
     `sigmas` (k,) are their standard deviations by the residuals, `assumed` (k,) those of a camera as sold; `moved`
-    (3, k) are the derivatives of the fitted position by the errors.
+    (3, k) are the derivatives of the fitted position by the errors. `excess` (k,) are the residuals that each error
+    leaves, over their noise, root mean square, at least 1: where all centroids err by more than they state, their
+    sigmas are as much larger.
     """
 
     found: Floats
     sigmas: Floats
     assumed: Floats
     moved: Floats
+    excess: Floats = field(default_factory=lambda: np.ones(1))
 
     @property
     def revealed(self) -> bool:
@@ -45,7 +48,7 @@ class CameraErrors:
         Errors that the residuals cannot show, larger than those of a camera as sold, do not count.
         """
         visible = self.sigmas < self.assumed
-        return bool((np.abs(self.found) > MAX_CAMERA_SIGMA * self.sigmas)[visible].any())
+        return bool((np.abs(self.found) > MAX_CAMERA_SIGMA * self.excess * self.sigmas)[visible].any())
 
     def unchecked_m2(self) -> Floats:
         """Covariance (3, 3) of the position by intrinsics that the residuals do not check.
@@ -80,7 +83,10 @@ def camera_errors(observations: Observations, best: Fit) -> CameraErrors:
     left_open, moved = best.response(slopes)
     size2 = np.maximum((left_open**2).sum(axis=0), np.finfo(float).tiny)
     found = -(left_open.T @ best.residuals) / size2
-    return CameraErrors(found, 1 / np.sqrt(size2), assumed.sigmas[:count], moved)
+    freedom = max(int(best.slopes.any(axis=1).sum()) - best.slopes.shape[1] - 1, 1)
+    rest = float(best.residuals @ best.residuals) - found**2 * size2
+    excess = np.sqrt(np.maximum(rest / freedom, 1.0))
+    return CameraErrors(found, 1 / np.sqrt(size2), assumed.sigmas[:count], moved, excess)
 
 
 def contradicts_camera(observations: Observations, best: Fit) -> bool:
