@@ -122,6 +122,12 @@ def test_the_image_of_a_diffuser_has_the_luminance_and_the_flux_of_the_model() -
         assert patch.visible_fraction == pytest.approx(1.0)
 
 
+def test_a_rim_has_the_width_of_the_frame_on_all_sides() -> None:
+    """A frame of 2 cm around 0.5 x 0.4 m: its hole is 0.46 m along x, b, and 0.36 m along y, a."""
+    (rim,) = (one for one in panelled(diffuser=False, frame=True).surfaces if one.name.endswith("rim"))
+    assert rim.holes == (pytest.approx((0.02 / 0.4, 0.02 / 0.5, 0.38 / 0.4, 0.48 / 0.5), rel=1e-12),)
+
+
 @pytest.mark.parametrize(("slope", "share"), [(1.75, 1.0), (2.0, 0.5), (2.25, 0.0)])
 def test_a_rim_hides_leds_from_the_side(slope: float, share: float) -> None:
     """LED 1 is 8 cm from the rim's inside, which stands 4 cm down: half of it is visible at a slope of 2.

@@ -88,9 +88,10 @@ def test_an_estimator_that_trusts_lens_and_map_is_right_where_they_are_exact() -
         assert row.trusting.total_mm == pytest.approx(row.share.total_mm, rel=1e-9)
 
 
-def test_bars_of_the_chart_do_not_overlap(
+def test_bars_and_labels_of_the_chart_do_not_overlap(
     calibrated: vr.ErrorBudget, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Labels of 10 points, 1.2 of these apart; title, axis and margins take 1.8 inches beside."""
     drawn: list[Figure] = []
     monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
     draw_budget(calibrated, tmp_path / "chart.svg")
@@ -98,6 +99,7 @@ def test_bars_of_the_chart_do_not_overlap(
     assert len(spans) == 2 * len(calibrated.rows)
     for (_, end), (start, _) in pairwise(spans):
         assert start > end - 1e-9
+    assert drawn[0].get_figheight() - 1.8 > len(calibrated.rows) * 1.2 * 10 / 72
 
 
 @pytest.mark.slow

@@ -172,6 +172,10 @@ def test_a_focal_length_of_film_is_by_the_diagonal() -> None:
     camera = found.camera(GLOBAL, 2.0, None)
     assert camera.uncertainty is not None
     assert camera.uncertainty.device_sigma == (0.03,)
+    # 3600 px are the 18 mm that the lens is said to have: 5 um each.
+    known = found.camera(GLOBAL, 2.0, 18.0)
+    assert known.pixel_pitch_um == pytest.approx(5.0)
+    assert known.image_distance_mm == pytest.approx(18.0)
 
 
 @pytest.mark.parametrize(

@@ -5,13 +5,14 @@ import numpy as np
 import pytest
 from estimator_correspondences import device, simulated
 from estimator_synthetic import Array, View, grid, view_of
+from test_estimator_robust_fit import VIEW, observed
 
 import estimator.methods.up2p
 from estimator.camera.leveling import level, tilt_from_gravity
 from estimator.camera.pose import rotation
 from estimator.errors import EstimationFailure
 from estimator.methods.pnp import position_from_pixels
-from estimator.methods.up2p import fit_correspondences, upright_pose
+from estimator.methods.up2p import fit_correspondences, pair_poses, upright_pose
 from estimator.solvers.observations import observe
 from estimator.solvers.ranging import law_of_sines, led_ranges
 from estimator.solvers.trilateration import position_from_ranges
@@ -84,3 +85,13 @@ def test_without_poselib_there_is_a_named_failure(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(estimator.methods.up2p, "poselib", None)
     with pytest.raises(EstimationFailure, match="up2p: PoseLib is not installed"):
         estimator.methods.up2p.up2p(device(view_of((3, 2, 2.7), 2.6), 0.1))
+
+
+def test_the_first_of_the_poses_by_two_spots_ignores_how_far_outliers_are() -> None:
+    """Four of nine spots off by 300 px to one side: squared errors without a limit rank a pose between them and the
+    true ones first. Exact spots and a tilt read without error, so that a pair of true ones gives the true pose.
+    """
+    offsets = np.zeros((9, 2))
+    offsets[[0, 1, 3, 4]] = [[300.0, 0.0], [300.0, 20.0], [290.0, 0.0], [300.0, -20.0]]
+    first = pair_poses(observed(offsets, np.full(9, 0.02)))[0]
+    np.testing.assert_allclose(first.position_m, VIEW.position_m, atol=1e-6)

@@ -11,12 +11,15 @@ from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.roi import Roi
 from vlcrender.camera.vignetting import relative_illumination
+from vlcrender.core.backend import mi
 from vlcrender.errors import InputError
 from vlcrender.light.lightmap import Lightmap, bake, room_mesh
+from vlcrender.light.raycast import Textures
 from vlcrender.rendering.background import Background
 from vlcrender.rendering.electron_rates import ElectronRates
 from vlcrender.scene.loader import Scene
 from vlcrender.scene.mesh import mesh_of_surfaces
+from vlcrender.scene.surfaces import Surface
 from vlcrender.scene.texture import Texture, read_reflectances
 
 PLAIN = {"floor": 0.3, "ceiling": 0.8, "walls": 0.5}
@@ -190,6 +193,25 @@ def test_a_textured_room_absorbs_the_flux_of_the_leds(tmp_path: Path) -> None:
     # 3 m are not whole tiles: the mean over the floor, which the vertices' areas weigh exactly but at the ends
     whole = texture.means(np.zeros((1, 3)), np.array([[3.0, 3.0, 0.0]]))[0]
     assert (floor.albedo * floor.areas_m2()).sum() / 9 == pytest.approx(whole, abs=1e-3)
+
+
+def test_rows_and_columns_of_an_image_are_alike(rng: np.random.Generator) -> None:
+    """An image along (x, y) and its transpose along (y, x) are one texture. Footprints of some 10 pixels of 5 mm, in
+    any direction; in float32, so that edges of up to 600 px round by 4e-5 px, of rectangles of 1 px at least:
+    2e-4 for their four edges.
+    """
+    image = rng.random((64, 64))
+    origin, across, down = np.zeros(3), np.array([0.32, 0.0, 0.0]), np.array([0.0, 0.32, 0.0])
+    n = 200
+    points, sides = rng.uniform(0, 3, (3, n)), rng.uniform(-0.05, 0.05, (2, 3, n))
+    points[2], directions, found = 0.0, np.array([[0.6], [0.0], [-0.8]]) + np.zeros((3, n)), []
+    for texture in (Texture(image, origin, across, down), Texture(image.T.copy(), origin, down, across)):
+        made = Textures((Surface("floor", origin, 9 * across, 9 * down, 0.5, texture=texture),), 1)
+        spread = mi.Vector3f(sides[0]), mi.Vector3f(sides[1])
+        of = made.reflectance(mi.UInt32(0), mi.Vector3f(points), mi.Vector3f(directions), mi.Float(1.0), spread)
+        found.append(of.numpy())
+    assert found[0].std() > 0.01
+    np.testing.assert_allclose(*found, rtol=0, atol=2e-4)
 
 
 def test_means_are_those_of_counted_pixels(rng: np.random.Generator) -> None:
