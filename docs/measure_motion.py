@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 
 import estimator as est
 from estimator.errors import EstimationFailure
-from estimator.io.device import DeviceFrame, DiscLed
+from estimator.io.device import DeviceFrame
+from estimator.io.led_map import DiscLed
 from estimator.io.shutter import GLOBAL, Gyroscope
 from estimator.methods.gravity_fit import fit_correspondences
 from estimator.spots.detect import Spot

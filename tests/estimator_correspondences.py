@@ -6,7 +6,10 @@ from dataclasses import replace
 import numpy as np
 from estimator_synthetic import Array, View, description
 
-from estimator.io.device import Accelerometer, Camera, CameraUncertainty, DeviceFrame, DiscLed, Sensor
+from estimator.io.camera import Camera, CameraUncertainty
+from estimator.io.device import Accelerometer, DeviceFrame
+from estimator.io.led_map import DiscLed
+from estimator.io.sensor import Sensor
 from estimator.spots.detect import Spot
 from estimator.spots.identify import Correspondence
 

@@ -10,7 +10,8 @@ from scipy.stats import chi2
 from test_estimator_maximum_likelihood import SAMPLES, TARGET, frame_of, most_likely
 
 from estimator.camera.pose import Pose
-from estimator.io.device import CameraUncertainty, DeviceFrame
+from estimator.io.camera import CameraUncertainty
+from estimator.io.device import DeviceFrame
 from estimator.methods.camera_statement import Judged
 from estimator.methods.maximum_likelihood import judged
 from estimator.pixels.camera_check import camera_errors_by_pixels

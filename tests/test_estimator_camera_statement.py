@@ -8,7 +8,7 @@ from estimator_correspondences import EXACT, device, simulated
 from estimator_synthetic import Array, view_of
 from test_estimator_stated_errors import LEDS_M, TARGET
 
-from estimator.io.device import CameraUncertainty
+from estimator.io.camera import CameraUncertainty
 from estimator.methods.camera_statement import Judged, judged_by_device
 from estimator.methods.gravity_fit import agreement, judged_by
 from estimator.methods.variant import Estimate

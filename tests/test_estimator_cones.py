@@ -8,7 +8,8 @@ from estimator_correspondences import device
 from estimator_synthetic import Array, View, view_of
 
 from estimator.errors import EstimationFailure
-from estimator.io.device import DecodedSpot, DeviceFrame, DiscLed, Part
+from estimator.io.device import DecodedSpot, DeviceFrame, Part
+from estimator.io.led_map import DiscLed
 from estimator.solvers.cones import discs, ellipse_centre, ellipse_centres, fit_cone, fit_plane
 from estimator.spots.contours import edges, find_contours
 

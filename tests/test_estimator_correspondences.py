@@ -8,7 +8,8 @@ import pytest
 from estimator_synthetic import Array, View, render, view_of
 from test_estimator_maximum_likelihood import frame_of
 
-from estimator.io.device import DecodedSpot, DeviceFrame, Led, Part, SquareLed
+from estimator.io.device import DecodedSpot, DeviceFrame, Part
+from estimator.io.led_map import Led, SquareLed
 from estimator.spots.correspondences import centroids_px, find_correspondences, led_positions_m
 from estimator.spots.denoise import Denoiser
 from estimator.spots.detect import detect

@@ -4,22 +4,19 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
+from estimator.io.camera import Camera
 from estimator.io.device import (
     MAX_SENSOR_AREAS,
     Accelerometer,
-    Camera,
     DeviceFrame,
-    DiscLed,
-    Luminaire,
-    MapDatum,
     Part,
-    Sensor,
     Shutter,
-    SquareLed,
     depth_problem,
     region_of,
     regions_problem,
 )
+from estimator.io.led_map import DiscLed, Luminaire, MapDatum, SquareLed
+from estimator.io.sensor import Sensor
 
 SENSOR = Sensor(
     bits=12,

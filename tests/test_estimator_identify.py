@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from estimator.errors import EstimationFailure
-from estimator.io.device import DecodedSpot, DiscLed
+from estimator.io.device import DecodedSpot
+from estimator.io.led_map import DiscLed
 from estimator.spots.detect import Spot
 from estimator.spots.identify import gate_px, identify
 

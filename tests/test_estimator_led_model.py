@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from estimator.camera.intrinsics import with_errors
 from estimator.camera.pose import Pose
-from estimator.io.device import Camera, DiscLed, Led, SquareLed
+from estimator.io.camera import Camera
+from estimator.io.led_map import DiscLed, Led, SquareLed
 from estimator.pixels.led_model import (
     IMAGE_PARAMETERS,
     PRINCIPAL_POINT,

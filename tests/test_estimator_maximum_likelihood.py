@@ -12,7 +12,10 @@ from scipy.stats import chi2
 
 from estimator.camera.pose import Pose, rotation
 from estimator.errors import EstimationFailure
-from estimator.io.device import Accelerometer, Camera, DecodedSpot, DeviceFrame, DiscLed, Part, Sensor
+from estimator.io.camera import Camera
+from estimator.io.device import Accelerometer, DecodedSpot, DeviceFrame, Part
+from estimator.io.led_map import DiscLed
+from estimator.io.sensor import Sensor
 from estimator.methods import maximum_likelihood
 from estimator.methods.maximum_likelihood import Maximum, maximize, ml
 from estimator.pixels import search

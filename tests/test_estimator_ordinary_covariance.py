@@ -8,7 +8,7 @@ from estimator_correspondences import device, simulated
 from estimator_synthetic import Array, grid, view_of
 
 from estimator.camera.pose import Pose
-from estimator.io.device import DiscLed
+from estimator.io.led_map import DiscLed
 from estimator.solvers.observations import Observations, centroid_images, observe, pose_slopes
 from estimator.solvers.ordinary_covariance import ordinary_covariance
 

@@ -7,7 +7,7 @@ import pytest
 from estimator_synthetic import View, description, view_of
 
 from estimator.camera.pose import POSE_PARAMETERS, Pose, rotation, rotation_angles
-from estimator.io.device import Camera
+from estimator.io.camera import Camera
 
 VIEW = view_of((3.5, 3.6, 3.5), 3.0, 25.0, -15.0, 40.0)
 TURNED = ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0))

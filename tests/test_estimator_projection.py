@@ -9,7 +9,7 @@ from estimator_synthetic import description, view_of
 
 from estimator.camera.pose import Pose
 from estimator.camera.projection import Equidistant, Perspective, project, projection_of, relative_illumination
-from estimator.io.device import Camera, Distortion
+from estimator.io.camera import Camera, Distortion
 
 VIEW = view_of((3.5, 3.6, 3.5), 3.0, 25.0, -15.0, 40.0)
 POINTS = np.array([[3.5, 3.6, 3.5], [3.7, 3.5, 3.5], [3.3, 3.65, 3.45], [3.52, 3.4, 3.2]])

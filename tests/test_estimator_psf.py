@@ -8,7 +8,7 @@ from estimator_synthetic import description, view_of
 from numpy.typing import NDArray
 from scipy.special import j0, j1
 
-from estimator.io.device import Camera
+from estimator.io.camera import Camera
 from estimator.pixels.psf import LensBlur, airy_scale_px, disc_diameter_px
 
 Floats = NDArray[np.float64]

@@ -12,7 +12,8 @@ from test_estimator_cones import rim
 from estimator.camera.pose import Pose, rotation
 from estimator.errors import EstimationFailure
 from estimator.io.dataset import read_dataset, read_frame
-from estimator.io.device import DeviceFrame, DiscLed, SquareLed
+from estimator.io.device import DeviceFrame
+from estimator.io.led_map import DiscLed, SquareLed
 from estimator.methods.catalogue import OWN
 from estimator.methods.circle_centre import METHODS, pose_from_centres
 from estimator.methods.eca_rssr import ranges_from_ratios

@@ -18,7 +18,7 @@ from downlink_signals import (
 )
 from test_estimator_device import CAMERA
 
-from estimator.io.device import Camera
+from estimator.io.camera import Camera
 from estimator.receiver.bits import NOT_SEEN, bit_error_rates, bits_seen, chip_levels
 from estimator.receiver.codes import MIN_CORRELATION, PHASES, code_books, match_code, match_code_of_frames, match_phase
 from estimator.receiver.packets import MAX_ERASED, PacketFormat, crc, decode_packet, solved_mod_2

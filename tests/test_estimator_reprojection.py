@@ -10,7 +10,8 @@ from estimator_synthetic import Array, View, grid, view_of
 
 from estimator.camera.pose import Pose
 from estimator.errors import EstimationFailure
-from estimator.io.device import DeviceFrame, Distortion
+from estimator.io.camera import Distortion
+from estimator.io.device import DeviceFrame
 from estimator.solvers.observations import centroid_images, corrected_for_eccentricity, observe
 from estimator.solvers.reprojection import fit
 from estimator.spots.identify import Correspondence

@@ -11,8 +11,8 @@ from conftest import copy_of
 
 from estimator.errors import InputError
 from estimator.evaluate.score import Scores, read_or_score, score, score_variant
-from estimator.io.device import DiscLed
 from estimator.io.estimates import EstimateRow, LedRange, write_estimates
+from estimator.io.led_map import DiscLed
 from estimator.io.truth import TrueLed, TruthRow
 
 LEDS = {10: DiscLed(id=10, position_m=(1.0, 2.0, 3.5), radius_m=0.01)}

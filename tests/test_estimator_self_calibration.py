@@ -14,7 +14,8 @@ from estimator.camera.intrinsics import intrinsic_slopes_px, with_errors
 from estimator.camera.pose import Pose
 from estimator.camera.projection import project
 from estimator.evaluate.statistics import Groups, nees
-from estimator.io.device import INTRINSICS, Camera, DiscLed, Luminaire, MapDatum
+from estimator.io.camera import INTRINSICS, Camera
+from estimator.io.led_map import DiscLed, Luminaire, MapDatum
 from estimator.solvers.device_equations import DeviceEquations, DeviceView, Unknowns
 from estimator.solvers.self_calibration import Adjusted, Adjustment, adjust
 

@@ -13,7 +13,8 @@ from scipy.stats import chi2
 
 from estimator.camera.motion import seen_in_motion, turned_back
 from estimator.camera.pose import Pose
-from estimator.io.device import DeviceFrame, DiscLed
+from estimator.io.device import DeviceFrame
+from estimator.io.led_map import DiscLed
 from estimator.io.shutter import Gyroscope, Shutter
 from estimator.methods import gravity_fit, pnp, self_calibrated, up2p
 from estimator.methods.variant import Estimate

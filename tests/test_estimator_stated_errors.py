@@ -10,15 +10,9 @@ from estimator_correspondences import device, simulated
 from estimator_synthetic import Array, grid, view_of
 
 from estimator.camera.pose import Pose
-from estimator.io.device import (
-    INTRINSICS,
-    Accelerometer,
-    CameraUncertainty,
-    DeviceFrame,
-    DiscLed,
-    Distortion,
-    Luminaire,
-)
+from estimator.io.camera import INTRINSICS, CameraUncertainty, Distortion
+from estimator.io.device import Accelerometer, DeviceFrame
+from estimator.io.led_map import DiscLed, Luminaire
 from estimator.methods import gravity_fit, pnp, up2p
 from estimator.methods.variant import Estimate
 from estimator.solvers.observations import observe

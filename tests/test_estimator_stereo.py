@@ -8,7 +8,9 @@ import pytest
 from estimator_synthetic import Array, View, grid, view_of
 
 from estimator.errors import EstimationFailure
-from estimator.io.device import Camera, DeviceFrame, Sensor
+from estimator.io.camera import Camera
+from estimator.io.device import DeviceFrame
+from estimator.io.sensor import Sensor
 from estimator.methods.catalogue import VARIANTS
 from estimator.methods.kim import position_from_vectors
 from estimator.solvers.stereo import stereo_partner, triangulated

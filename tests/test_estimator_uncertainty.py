@@ -8,17 +8,8 @@ from estimator_synthetic import Array, description, grid, view_of
 
 from estimator.camera.pose import Pose
 from estimator.camera.projection import project
-from estimator.io.device import (
-    INTRINSICS,
-    Camera,
-    CameraUncertainty,
-    DiscLed,
-    Distortion,
-    Led,
-    Luminaire,
-    MapDatum,
-    SquareLed,
-)
+from estimator.io.camera import INTRINSICS, Camera, CameraUncertainty, Distortion
+from estimator.io.led_map import DiscLed, Led, Luminaire, MapDatum, SquareLed
 from estimator.solvers.uncertainty import AS_SOLD, Parameter, Uncertainty, assumed_uncertainty, uncertainty
 
 VIEW = view_of((3, 3.2, 3.4), 2.0, 15, -10, 30, (4000, 3000, 3000.0))

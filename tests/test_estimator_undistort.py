@@ -7,7 +7,7 @@ from estimator_synthetic import Array
 from estimator.camera.projection import projection_of
 from estimator.camera.undistort import has_pinhole_image, pinhole_image, pinhole_pixels
 from estimator.errors import EstimationFailure
-from estimator.io.device import Camera, Distortion
+from estimator.io.camera import Camera, Distortion
 
 
 def camera(projection: str = "perspective", skew_px: float = 0.0, **coefficients: float) -> Camera:

@@ -18,9 +18,12 @@ from estimator_synthetic import Array, View, description, grid, poisson, render,
 
 from estimator.errors import InputError
 from estimator.evaluate.batch import estimate_dataset, estimate_frame
+from estimator.io.camera import Camera
 from estimator.io.dataset import read_dataset, read_frame
-from estimator.io.device import Accelerometer, Camera, DecodedSpot, DeviceFrame, DiscLed, Part, Sensor
+from estimator.io.device import Accelerometer, DecodedSpot, DeviceFrame, Part
 from estimator.io.estimates import EstimateRow
+from estimator.io.led_map import DiscLed
+from estimator.io.sensor import Sensor
 from estimator.methods.catalogue import PUBLISHED_SINCE, VARIANTS
 from estimator.spots.correspondences import find_correspondences
 from estimator.spots.detect import detect

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.io.device import INTRINSICS, Camera, Distortion
+from estimator.io.camera import INTRINSICS, Camera, Distortion
 
 Floats = NDArray[np.float64]
 

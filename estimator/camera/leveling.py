@@ -4,7 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.errors import EstimationFailure
-from estimator.io.device import Accelerometer, normalized, to_pixels
+from estimator.io.camera import normalized, to_pixels
+from estimator.io.device import Accelerometer
 
 Floats = NDArray[np.float64]
 

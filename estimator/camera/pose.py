@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.io.device import Camera
+from estimator.io.camera import Camera
 
 Floats = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.camera.pose import POSE_PARAMETERS, Pose, rotation
-from estimator.io.device import Camera, Distortion
+from estimator.io.camera import Camera, Distortion
 
 Floats = NDArray[np.float64]
 

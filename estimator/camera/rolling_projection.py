@@ -17,7 +17,7 @@ from estimator.camera.projection import (
     projection_of,
     rotation_slopes,
 )
-from estimator.io.device import Camera
+from estimator.io.camera import Camera
 
 Floats = NDArray[np.float64]
 

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from estimator.camera.projection import projection_of
 from estimator.errors import EstimationFailure
-from estimator.io.device import Camera
+from estimator.io.camera import Camera
 
 Floats = NDArray[np.float64]
 

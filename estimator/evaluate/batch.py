@@ -13,8 +13,9 @@ import numpy as np
 
 from estimator.errors import EstimationFailure, InputError
 from estimator.io.dataset import Dataset, FrameRecord, read_frame
-from estimator.io.device import DeviceFrame, Identity, Led
+from estimator.io.device import DeviceFrame, Identity
 from estimator.io.estimates import EstimateRow, LedRange
+from estimator.io.led_map import Led
 from estimator.io.records import MAX_NUMBER, is_covariance
 from estimator.io.shared import SharedResults
 from estimator.methods.variant import DeviceMethod, Estimate, Variant

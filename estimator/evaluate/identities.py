@@ -9,8 +9,9 @@ from pydantic import Field
 
 from estimator.camera.pose import Pose
 from estimator.camera.projection import project
+from estimator.io.camera import Camera
 from estimator.io.dataset import Dataset
-from estimator.io.device import Camera, Identity
+from estimator.io.device import Identity
 from estimator.io.estimates import EstimateRow
 from estimator.io.records import Row, Size
 from estimator.io.truth import WHOLE, TrueLed, TrueMapLed, TruthRow

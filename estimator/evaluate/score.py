@@ -32,8 +32,8 @@ from estimator.evaluate.statistics import (
 )
 from estimator.io.atomic import write_atomically
 from estimator.io.dataset import Dataset, read_dataset
-from estimator.io.device import AnyLed
 from estimator.io.estimates import EstimateRow, read_estimates
+from estimator.io.led_map import AnyLed
 from estimator.io.records import LedId, Number, Positive, Row, Size, Triple, first_problem
 from estimator.io.truth import TruthRow, read_true_map, read_truth
 

@@ -13,26 +13,20 @@ from numpy.typing import NDArray
 from pydantic import Field, Strict, ValidationError, field_validator, model_validator
 
 from estimator.errors import InputError
+from estimator.io.camera import Camera
 from estimator.io.device import (
     Accelerometer,
-    AnyLed,
-    Camera,
     DecodedSpot,
     DeviceFrame,
-    DeviceNumber,
-    Luminaire,
-    MapDatum,
     Part,
-    Sensor,
     decoding_problem,
     depth_problem,
     gravity_problem,
     gyro_problem,
-    leds_by_id,
-    luminaires_by_id,
     regions_problem,
 )
 from estimator.io.downlink import Downlink, downlink_problem, spots_problem
+from estimator.io.led_map import AnyLed, DeviceNumber, Luminaire, MapDatum, leds_by_id, luminaires_by_id
 from estimator.io.records import (
     INT64_MAX,
     Number,
@@ -44,6 +38,7 @@ from estimator.io.records import (
     missing_key,
     read_rows,
 )
+from estimator.io.sensor import Sensor
 from estimator.io.shard import frame_of_shard
 from estimator.io.shutter import Gyroscope
 from estimator.io.sweep import read_sweep

@@ -18,7 +18,8 @@ from estimator.camera.motion import turned_back
 from estimator.camera.pose import Pose
 from estimator.camera.undistort import pinhole_pixels
 from estimator.errors import EstimationFailure
-from estimator.io.device import DeviceFrame, normalized
+from estimator.io.camera import normalized
+from estimator.io.device import DeviceFrame
 from estimator.io.records import is_covariance
 from estimator.methods.variant import Estimate, Needs, Variant
 from estimator.solvers.observations import Observations, observe, observe_once

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.errors import InputError
-from estimator.io.device import Camera, CameraUncertainty, Distortion
+from estimator.io.camera import Camera, CameraUncertainty, Distortion
 from estimator.io.shutter import Shutter
 from estimator.photo.yaml_subset import YamlError, parse_yaml
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.errors import InputError
-from estimator.io.device import AnyLed, DiscLed, SquareLed
+from estimator.io.led_map import AnyLed, DiscLed, SquareLed
 
 Floats = NDArray[np.float64]
 Mirror = Literal["none", "x", "y"]

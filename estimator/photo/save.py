@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from estimator.errors import InputError
 from estimator.io.atomic import write_atomically
 from estimator.io.dataset import FORMAT_VERSION, FRAME_COLUMNS, write_image
-from estimator.io.device import DeviceFrame, Sensor
+from estimator.io.device import DeviceFrame
+from estimator.io.sensor import Sensor
 from estimator.photo.pictures import Picture
 
 BITS = 16

@@ -18,7 +18,8 @@ from estimator.camera.pose import Pose
 from estimator.camera.projection import project
 from estimator.camera.undistort import pinhole_image
 from estimator.errors import EstimationFailure
-from estimator.io.device import AnyLed, DeviceFrame
+from estimator.io.device import DeviceFrame
+from estimator.io.led_map import AnyLed
 from estimator.methods import gravity_fit, pnp, up2p
 from estimator.methods.gravity_fit import initial_poses
 from estimator.methods.maximum_likelihood import ml

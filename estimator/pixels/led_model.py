@@ -24,7 +24,8 @@ from estimator.camera.motion import MOTION_PARAMETERS
 from estimator.camera.pose import POSE_PARAMETERS, Pose
 from estimator.camera.projection import ProjectedPoints, project, projection_of, relative_illumination
 from estimator.camera.rolling_projection import project_rolling
-from estimator.io.device import Camera, Led
+from estimator.io.camera import Camera
+from estimator.io.led_map import Led
 from estimator.pixels.polygon_raster import MAX_EDGE_PX, EdgePieces, Outlines, RoiStack, cover
 from estimator.pixels.psf import LensBlur
 

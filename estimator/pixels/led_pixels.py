@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.errors import EstimationFailure
-from estimator.io.device import DeviceFrame, Led, LineGains, Part
+from estimator.io.device import DeviceFrame, LineGains, Part
+from estimator.io.led_map import Led
 from estimator.pixels.led_model import (
     POSE_ALONE,
     ImageState,

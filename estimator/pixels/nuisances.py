@@ -18,7 +18,9 @@ from numpy.typing import NDArray
 from estimator.camera.intrinsics import CAMERA_PARAMETERS, with_errors
 from estimator.camera.pose import POSE_PARAMETERS, Pose
 from estimator.errors import EstimationFailure
-from estimator.io.device import Camera, DeviceFrame, Led
+from estimator.io.camera import Camera
+from estimator.io.device import DeviceFrame
+from estimator.io.led_map import Led
 from estimator.pixels.led_model import FACE_PARAMETERS, LOCAL_PARAMETERS, PROFILE_PARAMETERS, ImageState
 from estimator.solvers.shutter_motion import motion_prior
 

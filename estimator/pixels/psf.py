@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.signal import convolve
 from scipy.special import j1
 
-from estimator.io.device import Camera
+from estimator.io.camera import Camera
 from estimator.pixels.polygon_raster import MAX_EDGE_PX, Outlines, RoiStack, cover
 
 Floats = NDArray[np.float64]

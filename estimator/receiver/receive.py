@@ -12,8 +12,9 @@ from itertools import pairwise
 import numpy as np
 
 from estimator.errors import InputError
-from estimator.io.device import AnyLed, DecodedSpot, DeviceFrame, DiscLed, Identity, Led, Luminaire, SquareLed
+from estimator.io.device import DecodedSpot, DeviceFrame, Identity
 from estimator.io.downlink import INDEX_BITS, Codes, DiscFace, Downlink, Packets, Tones
+from estimator.io.led_map import AnyLed, DiscLed, Led, Luminaire, SquareLed
 from estimator.io.shared import SharedResults
 from estimator.receiver.bits import bits_seen
 from estimator.receiver.codes import code_books, match_code, match_code_of_frames

@@ -17,7 +17,8 @@ from scipy.spatial.transform import Rotation
 from estimator.camera.intrinsics import intrinsic_slopes_px, with_errors
 from estimator.camera.pose import POSE_PARAMETERS, Pose
 from estimator.camera.projection import project
-from estimator.io.device import INTRINSICS, Camera, Led, Luminaire, MapDatum
+from estimator.io.camera import INTRINSICS, Camera
+from estimator.io.led_map import Led, Luminaire, MapDatum
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]

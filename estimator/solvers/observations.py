@@ -34,7 +34,8 @@ from estimator.camera.motion import seen_in_motion
 from estimator.camera.pose import Pose
 from estimator.camera.projection import projection_of
 from estimator.camera.undistort import has_pinhole_image, pinhole_image
-from estimator.io.device import Camera, DeviceFrame
+from estimator.io.camera import Camera
+from estimator.io.device import DeviceFrame
 from estimator.solvers.shutter_motion import ShutterMotion, image_slopes, motion_prior
 from estimator.solvers.uncertainty import Uncertainty, assumed_camera, uncertainty
 from estimator.spots.correspondences import centroids_px, led_positions_m

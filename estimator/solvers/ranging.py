@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.errors import EstimationFailure
-from estimator.io.device import normalized
+from estimator.io.camera import normalized
 
 Floats = NDArray[np.float64]
 PairLaw = Callable[[Floats, Floats, Floats], tuple[Floats, Floats]]

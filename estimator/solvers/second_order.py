@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from estimator.camera.pose import POSE_PARAMETERS, Pose
 from estimator.camera.projection import rotation_slopes
-from estimator.io.device import Camera
+from estimator.io.camera import Camera
 
 Floats = NDArray[np.float64]
 

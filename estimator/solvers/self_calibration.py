@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from estimator.camera.pose import POSE_PARAMETERS, Pose
-from estimator.io.device import INTRINSICS
+from estimator.io.camera import INTRINSICS
 from estimator.solvers.chi_square import chi2_limit
 from estimator.solvers.device_equations import DeviceEquations, DeviceView, Linear, Unknowns
 

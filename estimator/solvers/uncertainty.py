@@ -7,7 +7,7 @@ slopes are exact to first order. Three groups of parameters differ in which fram
 
 The parameters by name, with the LED or luminaire that they belong to:
 
-- `device` and `shot`: the intrinsics, `estimator.io.device.INTRINSICS`;
+- `device` and `shot`: the intrinsics, `estimator.io.camera.INTRINSICS`;
 - `map`: `datum_x`, `datum_y`, `datum_z` (m) and `datum_scale` (relative, about the world's origin); of a luminaire
   `luminaire_x`, `luminaire_y`, `luminaire_z` (m) and `turn_x`, `turn_y`, `turn_z` (rad, about its centre); of an LED
   `led_x`, `led_y`, `led_z` (m), `size` (half width, m) and `gradient_x`, `gradient_y` (relative, over the half width).
@@ -27,7 +27,8 @@ from numpy.typing import NDArray
 from estimator.camera.intrinsics import intrinsic_slopes_px
 from estimator.camera.pose import Pose
 from estimator.camera.projection import projection_of
-from estimator.io.device import INTRINSICS, Camera, CameraUncertainty, Led, Luminaire, MapDatum
+from estimator.io.camera import INTRINSICS, Camera, CameraUncertainty
+from estimator.io.led_map import Led, Luminaire, MapDatum
 
 Floats = NDArray[np.float64]
 

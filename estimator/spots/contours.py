@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from estimator.camera.undistort import has_pinhole_image, pinhole_image
 from estimator.errors import EstimationFailure
-from estimator.io.device import DeviceFrame, Led, Part
+from estimator.io.device import DeviceFrame, Part
+from estimator.io.led_map import Led
 from estimator.spots.correspondences import find_correspondences
 from estimator.spots.detect import Spot
 from estimator.spots.identify import Correspondence

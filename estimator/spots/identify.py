@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from estimator.errors import EstimationFailure
-from estimator.io.device import DecodedSpot, Led
+from estimator.io.device import DecodedSpot
+from estimator.io.led_map import Led
 from estimator.spots.detect import Spot
 
 # Standard deviation of a decoded pixel as a share of the sensor's width: 10 px of 4000 (datasets/FORMAT.md).

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.camera.projection import relative_illumination
-from estimator.io.device import Camera, DeviceFrame
+from estimator.io.camera import Camera
+from estimator.io.device import DeviceFrame
 from estimator.io.downlink import Codes, Downlink, Packets, SquareFace, Tones, Transmitter
 from estimator.spots.led_light import Readout
 from estimator.spots.striped import Lamp, find_lamps

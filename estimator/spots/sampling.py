@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import j0, j1
 
-from estimator.io.device import Camera
+from estimator.io.camera import Camera
 
 Floats = NDArray[np.float64]
 

@@ -1,0 +1,176 @@
+"""Cameras as devices know them: intrinsics, distortion, pose on the rig, and their uncertainty (datasets/FORMAT.md)."""
+
+from collections.abc import Mapping
+from typing import Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, field_validator, model_validator
+
+from estimator.io.records import (
+    NotNegative,
+    Number,
+    Positive,
+    Row,
+    Triple,
+)
+from estimator.io.shutter import GLOBAL, Shutter
+
+Floats = NDArray[np.float64]
+
+
+def normalized(pixels: Floats, K: Floats) -> Floats:
+    """Normalized image coordinates (n, 2), `K^-1 [u, v, 1]`, in units of the image distance, of pixels (n, 2)."""
+    return np.asarray((np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(K).T)[:, :2])
+
+
+def to_pixels(image: Floats, K: Floats) -> Floats:
+    """Pixels (n, 2), `K [x, y, 1]`, of normalized image coordinates (n, 2): the inverse of `normalized`."""
+    return np.asarray(image @ K[:2, :2].T + K[:2, 2])
+
+
+class Distortion(Row):
+    """Brown-Conrady coefficients in OpenCV's convention, for normalized image coordinates.
+
+    Other keys are refused: without a coefficient of the calibration, undistorted pixels would be wrong.
+    """
+
+    k1: Number
+    k2: Number
+    k3: Number
+    p1: Number
+    p2: Number
+
+    @model_validator(mode="before")
+    @classmethod
+    def _no_other_coefficients(cls, entry: Any) -> Any:
+        if isinstance(entry, Mapping) and (unknown := [key for key in entry if key not in cls.model_fields]):
+            raise ValueError(f"unknown key {unknown[0]!r}; allowed: {', '.join(cls.model_fields)}")
+        return entry
+
+
+IntrinsicName = Literal["focal", "aspect", "cx_px", "cy_px", "k1", "p1", "p2"]
+INTRINSICS: tuple[IntrinsicName, ...] = ("focal", "aspect", "cx_px", "cy_px", "k1", "p1", "p2")
+"""Names of the errors of a camera's intrinsics, in the order of all arrays of them.
+
+True from stated: fx (1 + focal) (1 + aspect / 2), fy (1 + focal) (1 - aspect / 2), cx + cx_px, cy + cy_px, and the
+coefficients of distortion plus k1, p1, p2. `focal` and `aspect` are relative, cx_px and cy_px in pixels.
+"""
+
+
+class CameraUncertainty(Row):
+    """Standard deviations of the stated intrinsics and mounting of a camera; keys as in dataset.json.
+
+    The errors are independent and normal. Those of `device_sigma` are the same in every frame of a device, those of
+    `shot_sigma` new in every frame. `offset_sigma_m` and `rotation_sigma_deg` are those of the mounting on the rig,
+    along and about each axis.
+    """
+
+    parameters: tuple[IntrinsicName, ...]
+    device_sigma: tuple[NotNegative, ...]
+    shot_sigma: tuple[NotNegative, ...]
+    offset_sigma_m: NotNegative
+    rotation_sigma_deg: NotNegative
+
+    @model_validator(mode="after")
+    def _one_of_each(self) -> Self:
+        if len(set(self.parameters)) != len(self.parameters):
+            raise ValueError("parameters have to be unique")
+        if not len(self.parameters) == len(self.device_sigma) == len(self.shot_sigma):
+            raise ValueError("device_sigma and shot_sigma need one number for each of parameters")
+        return self
+
+    def device_sigmas(self) -> Floats:
+        """Standard deviations (7,) of the errors of a device, in the order of INTRINSICS; 0 where there is no entry."""
+        return self._in_order(self.device_sigma)
+
+    def shot_sigmas(self) -> Floats:
+        """Standard deviations (7,) of the errors of a frame, in the order of INTRINSICS; 0 where there is no entry."""
+        return self._in_order(self.shot_sigma)
+
+    def _in_order(self, sigmas: tuple[float, ...]) -> Floats:
+        stated: dict[str, float] = dict(zip(self.parameters, sigmas, strict=True))
+        return np.array([stated.get(name, 0.0) for name in INTRINSICS])
+
+
+class Camera(Row):
+    """Camera of a device: intrinsics, lens, and mounting on the rig; keys as in dataset.json.
+
+    `K` maps normalized image coordinates to continuous pixels with pixel centres at +0.5. `uncertainty` is None where
+    the device does not state how well it knows its camera; deviations of 0 state that the camera is exact.
+    """
+
+    width_px: int = Field(ge=1, le=65536)
+    height_px: int = Field(ge=1, le=65536)
+    K: tuple[Triple, Triple, Triple]
+    pixel_pitch_um: Positive
+    focal_length_mm: Positive
+    image_distance_mm: Positive
+    f_number: Positive
+    projection: Literal["perspective", "equidistant"]
+    distortion: Distortion | None
+    focus_distance_m: Positive | Literal["infinity"] | None
+    psf: Literal["none", "diffraction", "measured"]
+    psf_wavelength_nm: Positive
+    psf_kernel: tuple[tuple[Number, ...], ...] | None
+    R_cam_rig: tuple[Triple, Triple, Triple]
+    offset_m: Triple
+    uncertainty: CameraUncertainty | None = None
+    shutter: Shutter = GLOBAL
+
+    @field_validator("K")
+    @classmethod
+    def _upper_triangular(cls, k: tuple[Triple, Triple, Triple]) -> tuple[Triple, Triple, Triple]:
+        if k[0][0] <= 0 or k[1][1] <= 0 or k[1][0] != 0 or k[2] != (0.0, 0.0, 1.0):
+            raise ValueError("K has to be [[fx, skew, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0")
+        return k
+
+    @model_validator(mode="after")
+    def _no_distortion_of_a_fish_eye(self) -> Self:
+        if self.projection == "equidistant" and self.distortion is not None:
+            raise ValueError('distortion has to be null with projection "equidistant"')
+        if self.projection == "equidistant" and self.uncertainty is not None:
+            of_distortion = [INTRINSICS.index(name) for name in ("k1", "p1", "p2")]
+            if (self.uncertainty.device_sigmas() + self.uncertainty.shot_sigmas())[of_distortion].any():
+                raise ValueError('sigmas of k1, p1 and p2 have to be 0 with projection "equidistant"')
+        return self
+
+    @property
+    def states_no_errors(self) -> bool:
+        """Whether the device states no error of the intrinsics: that they are exact, or nothing of them."""
+        stated = self.uncertainty
+        return stated is None or not any((*stated.device_sigma, *stated.shot_sigma))
+
+    def matrix(self) -> Floats:
+        """`K` as a (3, 3) array, pixels."""
+        return np.array(self.K, dtype=np.float64)
+
+    def normalized(self, pixels: Floats) -> Floats:
+        """Normalized image coordinates (n, 2) of this camera's pixels (n, 2)."""
+        return normalized(pixels, self.matrix())
+
+    def to_pixels(self, image: Floats) -> Floats:
+        """This camera's pixels (n, 2) of normalized image coordinates (n, 2)."""
+        return to_pixels(image, self.matrix())
+
+    @property
+    def pixel_angle_rad(self) -> float:
+        """Angle of one pixel on the optical axis, 1 / fx, radians."""
+        return 1 / self.K[0][0]
+
+    @property
+    def line_count(self) -> int:
+        """Lines that the shutter reads: rows of the sensor, or columns."""
+        return self.shutter.line_count(self.width_px, self.height_px)
+
+    def line_of(self, u_px: Floats, v_px: Floats) -> Floats:
+        """Continuous line coordinates, in readout order, of pixels (u, v) of any shape: line i is from i to i + 1."""
+        return self.shutter.line_of(u_px, v_px, self.width_px, self.height_px)
+
+    def times_s(self, u_px: Floats, v_px: Floats) -> Floats:
+        """Middle of the exposure of pixels (u, v) of any shape, relative to the frame's middle line, seconds."""
+        return (self.line_of(u_px, v_px) - self.line_count / 2) * self.shutter.row_time_s
+
+    def R_cam_rig_array(self) -> Floats:
+        """`R_cam_rig` as a (3, 3) array."""
+        return np.array(self.R_cam_rig, dtype=np.float64)
