@@ -6,6 +6,7 @@ from scipy.stats import norm
 
 from estimator.io.camera import Camera
 from estimator.io.device import (
+from estimator.io.shutter import Shutter
     MAX_SENSOR_AREAS,
     Accelerometer,
     DeviceFrame,
