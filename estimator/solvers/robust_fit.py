@@ -182,16 +182,24 @@ def _explanations(
     """
     ranked, assumed = _ranked(observations, rough), observations.with_assumed_camera()
     models = [observations] if assumed is observations else [observations, assumed]
+    # A camera that is stated as exact is one as sold only where the spots contradict it.
+    trusted = observations.camera.uncertainty is not None
     attempts = [(model, adapted) for adapted in sizes for model in models]
+    if trusted:
+        attempts.sort(key=lambda one: one[0] is not observations)
     found: list[Consensus] = []
     for model, adapted in attempts:
-        if adapted and model is not assumed and any(_contradicts_camera(one, observations) for one in found):
+        contradicted = any(_contradicts_camera(one, observations) for one in found)
+        if adapted and model is not assumed and contradicted:
             continue
+        if trusted and model is not observations and found and not contradicted:
+            break
         explained = _snooped_consensus(model, ranked, adapted)
         if explained is None:
             continue
-        # Larger errors than those of centroids are of the map or camera: one that states none is then not exact.
-        if model is not assumed and explained.model is not None and explained.model.added_sigma_px > MODEL_ERROR_PX:
+        # Larger errors than those of centroids are of the map or camera: one that states nothing is then not exact.
+        added_px = 0.0 if explained.model is None else explained.model.added_sigma_px
+        if model is not assumed and not trusted and added_px > MODEL_ERROR_PX:
             continue
         found.append(explained)
         count = len(explained.inliers)
