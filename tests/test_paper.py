@@ -65,7 +65,7 @@ def errors_m(name: str, variant: str, **where: str) -> list[float]:
     ("item", "view", "name", "variant", "x", "where"),
     [
         ("table2", "tilted", "table2", "huynh2016", [2.0], {"tilt": "[40.0, 40.0]", "error_deg": "2"}),
-        ("fig6", "photon", "fig6_photon", METHOD, [4000.0], {"width_px": "4000"}),
+        ("fig6", "errors", "fig6_photon", METHOD, [4000.0], {"width_px": "4000"}),
         (
             "fig9",
             "peak-fits",
