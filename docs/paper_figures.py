@@ -88,10 +88,10 @@ def fig7(t: Tables) -> dict[str, float]:
 
 def table1(t: Tables) -> dict[str, float]:
     """Errors, and coverage."""
-    one = {name: t.value("errors", name, "table1") for name in (PAPER, CENTROID, "huynh2016-as-printed", "ml", BOUND)}
-    rates = {"answered": t.value("errors", PAPER, "table1", statistic="success_rate")}
-    names = ("paper", "centroid", "printed", "ml", "bound")
-    return {**t.extra, **dict(zip(names, one.values(), strict=True)), **rates}
+    names = {PAPER: "paper", CENTROID: "centroid", "huynh2016-as-printed": "printed", "ml": "ml", BOUND: "bound"}
+    (at,) = {tuple(row["x"]) for row in t.views["errors"]["rows"]}
+    found = {name: t.value("errors", variant, *at) for variant, name in names.items()}
+    return {**t.extra, **found, "answered": t.value("errors", PAPER, *at, statistic="success_rate")}
 
 
 def table3(t: Tables) -> dict[str, float]:
