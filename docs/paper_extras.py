@@ -67,7 +67,7 @@ def coverage(_: Mapping[str, Measured]) -> Found:
     camera, found, rows = vr.Camera(), {}, []
     for scene, name in (("table1", "seen"), ("office", "office")):
         for yaw_deg, side in ((0.0, "x"), (90.0, "y")):
-            one = level_visibility(camera, vr.load_scene(scene), 1e-6, yaw_deg)
+            one = level_visibility(camera, vr.load_scene(scene), 0.0, yaw_deg)
             found[f"{name}_{side}"] = one.share
             rows.append([scene, side, str(one.poses), str(one.seen), f"{100 * one.share:.3f} %"])
     found["office"] = min(found["office_x"], found["office_y"])

@@ -52,15 +52,10 @@ def table2(t: Tables) -> dict[str, float]:
 
 
 def fig6(t: Tables) -> dict[str, float]:
-    """Ends of the curves."""
-    found = {}
-    for reading in ("photon", "peak"):
-        low, middle, high = (t.value(reading, PAPER, width) for width in (200.0, 2000.0, 4000.0))
-        found |= {f"{reading}_low": low, f"{reading}_high": high}
-        found |= {f"{reading}_fall": low / high, f"{reading}_rest": middle / high}
-        found[f"{reading}_ml"] = t.value(reading, "ml", 4000.0)
-        found[f"{reading}_centroid"] = t.value(reading, CENTROID, 4000.0)
-    return found
+    """Ends of the paper's curve, and of others."""
+    low, middle, high = (t.value("errors", PAPER, width) for width in (200.0, 2000.0, 4000.0))
+    ends = {"low": low, "high": high, "fall": low / high, "rest": middle / high}
+    return ends | {"ml": t.value("errors", "ml", 4000.0), "centroid": t.value("errors", CENTROID, 4000.0)}
 
 
 def fig9(t: Tables) -> dict[str, float]:
@@ -93,21 +88,19 @@ def fig7(t: Tables) -> dict[str, float]:
 
 def table1(t: Tables) -> dict[str, float]:
     """Errors, and coverage."""
-    one = {name: t.value("errors", name, "table1") for name in (PAPER, CENTROID, "huynh2016-as-printed", "ml", BOUND)}
-    rates = {"answered": t.value("errors", PAPER, "table1", statistic="success_rate")}
-    names = ("paper", "centroid", "printed", "ml", "bound")
-    return {**t.extra, **dict(zip(names, one.values(), strict=True)), **rates}
+    names = {PAPER: "paper", CENTROID: "centroid", "huynh2016-as-printed": "printed", "ml": "ml", BOUND: "bound"}
+    (at,) = {tuple(row["x"]) for row in t.views["errors"]["rows"]}
+    found = {name: t.value("errors", variant, *at) for variant, name in names.items()}
+    return {**t.extra, **found, "answered": t.value("errors", PAPER, *at, statistic="success_rate")}
 
 
 def table3(t: Tables) -> dict[str, float]:
-    """The paper's rows, quiet and noisy."""
-    found = {}
+    """The paper's rows, level: with little noise, and what much noise makes of it."""
+    found = {"nakazawa": t.value("fisheye", "nakazawa2013", "[0.0, 0.0]", -35.0)}
     names = {PAPER: "paper", "yoshino2008": "yoshino", "rahman2011": "rahman", "kim": "kim", "ml": "ml"}
-    for level in ("ideal", "calibrated"):
-        for variant, name in names.items():
-            quiet, noisy = (t.value(f"{level}-main", variant, "[0.0, 0.0]", db) for db in (-35.0, -9.0))
-            found |= {f"{level}_{name}": quiet, f"{level}_{name}_growth": noisy / quiet}
-        found[f"{level}_nakazawa"] = t.value(f"{level}-fisheye", "nakazawa2013", "[0.0, 0.0]", -35.0)
+    for variant, name in names.items():
+        quiet, noisy = (t.value("main", variant, "[0.0, 0.0]", db) for db in (-35.0, -9.0))
+        found |= {name: quiet, f"{name}_growth": noisy / quiet}
     return found
 
 

@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,8 @@ import numpy as np
 
 import estimator as est
 import vlcrender as vr
-from estimator.evaluate.frame_columns import read_frame_columns
-from estimator.evaluate.table import Table, TableRow
+from estimator.evaluate.frame_columns import FrameColumns, read_frame_columns
+from estimator.evaluate.table import Table, TableRow, _table
 from estimator.evaluate.table_text import table_csv
 from estimator.io.sweep import dataset_folders
 from estimator.report.plot import plot
@@ -142,24 +143,30 @@ def measure(one: PaperSet, out: Path, seeds: int, full: bool, workers: int, cloc
     return Measured(folder, digest, frames, state["generate_s"], state.get("estimate_s", 0.0))
 
 
+@cache
+def frame_columns(folder: Path) -> FrameColumns:
+    """Columns of all frames and variants of a set, read once."""
+    return read_frame_columns([folder])
+
+
 def table_of(view: View, folder: Path, extra: tuple[str, ...] = ()) -> Table:
     """All statistics of a view; `extra` are further keys. The bound is a group of its own."""
 
-    def cells(metric: str, statistics: Sequence[str], variants: Sequence[str] | None) -> Table:
+    def cells(metric: str, statistics: Sequence[str]) -> Table:
         keys = (*view.x, *extra)
-        whole = est.table([folder], (*keys, *view.where), view.by, statistics, metric, view.bins, variants)
+        whole = _table(frame_columns(folder), (*keys, *view.where), view.by, statistics, metric, view.bins)
         rows = [
             replace(row, keys=row.keys[: len(keys)])
             for row in whole.rows
             if [key.value for key in row.keys[len(keys) :]] == list(view.where.values())
+            and (view.variants is None or row.group[0] in view.variants)
         ]
         return replace(whole, x=keys, rows=tuple(rows))
 
-    table = cells(view.metric, STATISTICS, view.variants)
+    table = cells(view.metric, STATISTICS)
     if not view.bound:
         return table
-    first = (view.variants or (table.rows[0].group[0],))[:1]
-    limits = cells("bound_m", ("rmse",), first).rows
+    limits = [row for row in cells("bound_m", ("rmse",)).rows if row.group == table.rows[0].group]
     bounds = (replace(row, group=(BOUND,), statistics=row.statistics * len(STATISTICS)) for row in limits)
     return replace(table, rows=(*table.rows, *bounds))
 
@@ -229,7 +236,7 @@ def seeds_inside(view: View, folder: Path, rows: Sequence[Mapping[str, Any]]) ->
 
 def keep_scores(one: PaperSet, folder: Path) -> None:
     """Errors of every frame in docs/paper/scores/SET.csv: swept values, pose, bound, and a column for each variant."""
-    columns = read_frame_columns([folder], one.variants).columns
+    columns = frame_columns(folder).columns
     swept = [name for name in columns if name in _swept_names(folder)]
     extras = ("tilt_x_deg", "tilt_y_deg", "yaw_deg", "capturable", "bound_m")
     frame_keys = [*swept, "pose", "camera", *(name for name in extras if name in columns and name not in swept)]

@@ -6,18 +6,17 @@ from scipy.stats import norm
 
 from estimator.io.camera import Camera
 from estimator.io.device import (
-from estimator.io.shutter import Shutter
     MAX_SENSOR_AREAS,
     Accelerometer,
     DeviceFrame,
     Part,
-    Shutter,
     depth_problem,
     region_of,
     regions_problem,
 )
 from estimator.io.led_map import DiscLed, Luminaire, MapDatum, SquareLed
 from estimator.io.sensor import Sensor
+from estimator.io.shutter import Shutter
 
 SENSOR = Sensor(
     bits=12,

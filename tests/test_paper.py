@@ -65,19 +65,12 @@ def errors_m(name: str, variant: str, **where: str) -> list[float]:
     ("item", "view", "name", "variant", "x", "where"),
     [
         ("table2", "tilted", "table2", "huynh2016", [2.0], {"tilt": "[40.0, 40.0]", "error_deg": "2"}),
-        ("fig6", "photon", "fig6_photon", METHOD, [4000.0], {"width_px": "4000"}),
-        (
-            "fig9",
-            "peak-fits",
-            "fig9_added",
-            "huynh2016:denoise=none,spot=brightest",
-            [0.0],
-            {"radius_m": "0.01", "relative_to": "peak", "level_db": "0"},
-        ),
+        ("table2", "level", "table2", METHOD, [0.0], {"tilt": "[0.0, 0.0]", "error_deg": "0"}),
+        ("table1", "errors", "table1", METHOD, ["table1"], {}),
     ],
 )
 def test_numbers_of_the_page_follow_from_the_kept_scores(
-    item: str, view: str, name: str, variant: str, x: list[float], where: dict[str, str], page: ModuleType
+    item: str, view: str, name: str, variant: str, x: list[float | str], where: dict[str, str], page: ModuleType
 ) -> None:
     """A mean by hand from the frames' errors is the kept table's, and stands in the page as text.
 
