@@ -215,7 +215,7 @@ def claim_row(claim: Claim, figures: Mapping[str, float] | None) -> list[str]:
 
 
 def _ratio(value: float) -> str:
-    return f"{value:.3g}" if value < 1e4 else f"{value:.1e}"
+    return "–" if math.isnan(value) else f"{value:.3g}" if value < 1e4 else f"{value:.1e}"
 
 
 def _number(value: float, unit: str) -> str:
