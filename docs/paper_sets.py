@@ -22,7 +22,7 @@ import numpy as np
 import estimator as est
 import vlcrender as vr
 from estimator.evaluate.frame_columns import FrameColumns, read_frame_columns
-from estimator.evaluate.table import Table, TableRow, _table
+from estimator.evaluate.table import Table, TableRow, table_of_columns
 from estimator.evaluate.table_text import table_csv
 from estimator.io.sweep import dataset_folders
 from estimator.report.plot import plot
@@ -154,7 +154,7 @@ def table_of(view: View, folder: Path, extra: tuple[str, ...] = ()) -> Table:
 
     def cells(metric: str, statistics: Sequence[str]) -> Table:
         keys = (*view.x, *extra)
-        whole = _table(frame_columns(folder), (*keys, *view.where), view.by, statistics, metric, view.bins)
+        whole = table_of_columns(frame_columns(folder), (*keys, *view.where), view.by, statistics, metric, view.bins)
         rows = [
             replace(row, keys=row.keys[: len(keys)])
             for row in whole.rows

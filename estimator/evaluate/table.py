@@ -171,10 +171,10 @@ def table(
     for key in bins or {}:
         if key not in x:
             raise InputError(f"bins of {key}: is not one of the keys: {', '.join(x) or 'there are none'}")
-    return _table(read_frame_columns(folders, variants), x, groups, names, metric, bins or {})
+    return table_of_columns(read_frame_columns(folders, variants), x, groups, names, metric, bins or {})
 
 
-def _table(
+def table_of_columns(
     frames: FrameColumns,
     x: Sequence[str],
     by: Sequence[str],
@@ -182,6 +182,7 @@ def _table(
     metric: str,
     bins: Mapping[str, Bins],
 ) -> Table:
+    """The table of frames that were read before, of which several may be made; as `table`, raises InputError."""
     values = frames.column(metric, "metric")
     if values.dtype == object:
         raise InputError(f"metric {metric}: holds texts, needed numbers")
