@@ -8,8 +8,8 @@ to the spots that it leaves in, from poses that put most spots about right:
 - errors as stated, and outliers;
 - stated errors of camera, map and gravity that are larger or smaller by a common factor, estimated from the residuals;
 - where the map's errors are not stated: a further error of each centroid, of a size estimated from the residuals. A
-  camera that states no errors then has those of one as sold (`estimator.solvers.uncertainty`), because the residuals
-  hardly reveal a focal length;
+  camera that states nothing then has the errors of one as sold (`estimator.solvers.uncertainty`), because the
+  residuals hardly reveal a focal length, and one that is stated as exact has them where the spots contradict it;
 - errors as stated without gravity, where that is optional and contradicts the spots.
 
 The explanation with the largest restricted likelihood is taken; an outlier lies anywhere in OUTLIER_RADIUS. An
