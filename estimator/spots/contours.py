@@ -124,5 +124,7 @@ def _right_edges(electrons: Floats, own: Mask, used: Mask) -> Floats:
     clear = inside[:, :SIDE_PX].all(axis=1) & ~inside[:, SIDE_PX:].any(axis=1)
     row, column, light = row[clear, 0], column[clear], light[clear]
     plateau, background = light[:, :2].mean(axis=1), light[:, -2:].mean(axis=1)
-    lit = (light[:, 2:-2] - background[:, None]).sum(axis=1) / (plateau - background)
+    falls = plateau > background  # in noise some do not, and say nothing of an edge
+    row, column, light, background = row[falls], column[falls], light[falls], background[falls]
+    lit = (light[:, 2:-2] - background[:, None]).sum(axis=1) / (plateau[falls] - background)
     return np.column_stack([column[:, 2] + lit, row + 0.5])
