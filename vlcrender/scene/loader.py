@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlcrender.config.toml_model import check, override, read_toml
-from vlcrender.errors import InputError
 from vlcrender.scene.leds import Leds, leds_of
+from vlcrender.scene.paths import file_inside
 from vlcrender.scene.schema import SceneSettings
 from vlcrender.scene.surfaces import Glazing, Surface, check_absorptance, glazings_of, panel_surfaces, room_surfaces
 
@@ -57,8 +57,9 @@ def load_scene(
 def build_scene(settings: SceneSettings, source: str, folder: Path = Path()) -> Scene:
     """The scene of checked settings. Files of furniture and textures are looked up in `folder`.
 
-    Raises InputError that starts with `source` for geometry outside the room, for overlaps, for missing files, for
-    textures that cannot be read and for surfaces that absorb no light. Furniture is read, and checked, by a bake.
+    Raises InputError that starts with `source` for geometry outside the room, for overlaps, for files that are missing
+    or outside `folder`, for textures that cannot be read and for surfaces that absorb no light. Furniture is read, and
+    checked, by a bake.
     """
     leds = leds_of(settings, source)
     glazings = glazings_of(settings, source)
@@ -66,8 +67,7 @@ def build_scene(settings: SceneSettings, source: str, folder: Path = Path()) -> 
     for index, grid in enumerate(settings.panels):
         surfaces += panel_surfaces(grid, np.array(settings.room.size_m), f"{source}: panels[{index}]")
     for index, piece in enumerate(settings.furniture):
-        if not (folder / piece.file).is_file():
-            raise InputError(f"{source}: furniture[{index}].file = {piece.file!r}: no such file in the scene's folder")
+        file_inside(folder, piece.file, f"{source}: furniture[{index}].file = {piece.file!r}")
     if not settings.furniture:
         glazing_m2 = sum(glazing.area_m2 for glazing in glazings)
         absorbing_m2 = sum((1 - surface.reflectance) * surface.area_m2 for surface in surfaces) + glazing_m2
