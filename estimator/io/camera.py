@@ -29,6 +29,7 @@ Sigma = Annotated[float, Field(ge=0, le=1e6)]
 MAX_DISTANCE_ERROR = 1e-12
 """Relative difference of `image_distance_mm` from the mean of fx and fy: rounding of a double."""
 MAX_KERNEL_ERROR = 1e-6
+MAX_SKEW_PX = 1e4
 
 
 class Distortion(Entry):
@@ -126,6 +127,15 @@ class Camera(Entry):
         if k[0][0] <= 0 or k[1][1] <= 0 or k[1][0] != 0 or k[2] != (0.0, 0.0, 1.0):
             raise ValueError("K has to be [[fx, skew, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0")
         return k
+
+    @model_validator(mode="after")
+    def _image_is_near_the_axis(self) -> Self:
+        (fx, skew, u), (_, fy, v), _ = self.K
+        if not (-self.width_px <= u <= 2 * self.width_px and -self.height_px <= v <= 2 * self.height_px):
+            raise ValueError("K: the principal point has to lie at most one image beside the image")
+        if not (0.5 <= fx / fy <= 2 and abs(skew) <= MAX_SKEW_PX):
+            raise ValueError(f"K: fx / fy has to be from 0.5 to 2, and the skew at most {MAX_SKEW_PX:g} px")
+        return self
 
     @model_validator(mode="after")
     def _focal_lengths_agree(self) -> Self:

@@ -149,7 +149,8 @@ def read_rows(
     with _parquet(path) as file:
         there = {name: kind for name, kind in optional.items() if name in file.schema_arrow.names}
         _check_columns(path, file.schema_arrow, {**columns, **there})
-        records = file.read(columns=[*columns, *there]).to_pylist()
+        whole = [name for name, kind in {**columns, **there}.items() if pa.types.is_integer(kind)]
+        records = [_with_integers(record, whole) for record in file.read(columns=[*columns, *there]).to_pylist()]
     try:
         return tuple(TypeAdapter(list[row]).validate_python(records))  # type: ignore[valid-type]
     except ValidationError as error:
@@ -190,6 +191,15 @@ def _parquet(path: Path) -> Iterator[pq.ParquetFile]:
         raise InputError(f"{path}: not a readable Parquet file ({first_line(error)})") from None
 
 
+def _with_integers(record: dict[str, object], names: Sequence[str]) -> dict[str, object]:
+    """A record whose whole floats in some columns are integers: pandas has floats where a column has nulls."""
+    for name in names:
+        value = record[name]
+        if isinstance(value, float) and value.is_integer():
+            record[name] = int(value)
+    return record
+
+
 def _check_columns(path: Path, schema: pa.Schema, columns: Mapping[str, pa.DataType]) -> None:
     for name, wanted in columns.items():
         found = schema.get_all_field_indices(name)
@@ -197,7 +207,8 @@ def _check_columns(path: Path, schema: pa.Schema, columns: Mapping[str, pa.DataT
             has = ", ".join(schema.names) or "none"
             raise InputError(f"{path}: column {name!r} is there {len(found)} times, needed once; columns: {has}")
         actual = schema.field(found[0]).type
-        if not _same_type(actual, wanted):
+        is_real = pa.types.is_integer(wanted) and pa.types.is_floating(actual)
+        if not (is_real or _same_type(actual, wanted)):
             raise InputError(f"{path}: column {name!r} has type {actual}, needed {wanted}")
 
 

@@ -45,8 +45,8 @@ class Sensor(Entry):
 
     @model_validator(mode="after")
     def _black_is_a_code(self) -> Self:
-        if not self.black_level_dn <= 2**self.bits - 1:
-            raise ValueError(f"black_level_dn {self.black_level_dn}, but {self.bits} bits end at {2**self.bits - 1}")
+        if not (self.black_level_dn.is_integer() and self.black_level_dn <= 2**self.bits - 1):
+            raise ValueError(f"black_level_dn {self.black_level_dn}: has to be whole, up to {2**self.bits - 1}")
         return self
 
     @property

@@ -58,8 +58,12 @@ def read_table(path: Path, model: type[R], constants: Constants | None = None) -
         found = table.schema.get_all_field_indices(field.name)
         if len(found) > 1 or (not found and field.name not in optional):
             different.append(f"{field.name}: {len(found)} times, needed once")
-        elif found and not holds(table.schema.field(found[0]).type, field.type):
-            different.append(f"{field.name}: {table.schema.field(found[0]).type}, needed {field.type}")
+        elif found:
+            kind = table.schema.field(found[0]).type
+            # pandas has floats for integers where a column has nulls; the model demands whole ones.
+            is_real = pa.types.is_integer(field.type) and pa.types.is_floating(kind)
+            if not (is_real or holds(kind, field.type)):
+                different.append(f"{field.name}: {kind}, needed {field.type}")
     if different:
         raise InputError(f"{path}: columns differ from FORMAT.md: {', '.join(different)}")
     names = [field.name for field in schema if field.name in table.schema.names]
