@@ -1,6 +1,5 @@
-"""Checks of FORMAT.md: verify and the reader of estimator, which share no code, come to the same verdict of a dataset."""
+"""Checks of FORMAT.md: verify and the reader, which share no code, come to the same verdict of a dataset."""
 
-import copy
 import json
 import os
 import random
@@ -383,14 +382,14 @@ def mutate(folder: Path, good: Path, chance: random.Random) -> tuple[str, object
 VERIFY_ALONE = {
     r"dataset\.json/(accelerometer|room_m|sensor/(gain_e_per_dn|full_well_e)|led_map/\d+/radius_m)": "null is for "
     "photographs, which are not rendered",
-    r"dataset\.json/cameras/main/(K|distortion|shutter|projection|R_cam_rig|offset_m)(/.*)?": "the lens is invertible on "
-    "the sensor; the camera is that of the true poses",
-    r"dataset\.json/led_map(/\d+(/(id|position_m|luminaire)(/\d)?)?)?": "the true poses put the map's LEDs at their pixels",
+    r"dataset\.json/cameras/main/(K|distortion|shutter|projection|R_cam_rig|offset_m)(/.*)?": "the lens is "
+    "invertible on the sensor; the camera is that of the true poses",
+    r"dataset\.json/led_map(/\d+(/(id|position_m|luminaire)(/\d)?)?)?": "the true poses put LEDs at their pixels",
     r"dataset\.json/(downlink|gyroscope)(/.*)?": "the scene of the provenance tells what LEDs send",
     r"frames\.parquet/(start_s|burst|shot|pose|device|accelerometer_m_s2)": "the recipe tells times and devices",
     r"truth\.parquet/.*": "readers take of the truth what scores need",
 }
-"""Places of dataset.json and tables where verify, which has the recipe and the truth, may refuse what readers accept."""
+"""Places where verify, which has the recipe and the truth, may refuse what readers accept, with the reason."""
 
 
 def test_both_agree_on_a_dataset_with_one_other_value(good: Path, tmp_path: Path) -> None:

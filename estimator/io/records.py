@@ -14,7 +14,6 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, Strict, TypeA
 
 from estimator.errors import InputError
 
-
 R = TypeVar("R")
 
 

@@ -91,7 +91,7 @@ def read_exr_parts(path: Path) -> list[ExrPart]:
 
 
 def _part(part: OpenEXR.Part) -> ExrPart:
-    """Raises ValueError for a part of another kind than scan lines of Y, one value for each place of the data window."""
+    """Raises ValueError for a part of other than scan lines of Y, one value for each place of the data window."""
     if part.header["type"] != OpenEXR.scanlineimage:
         raise ValueError("not stored as scan lines")
     if list(part.channels) != ["Y"]:

@@ -261,11 +261,19 @@ TRUTH_SCHEMA = arrow_schema(TruthRow)
 class CameraUncertainty(Settings):
     """Standard deviations of a camera's errors, as dataset.json states them."""
 
-    parameters: tuple[str, ...]
-    device_sigma: Seven
-    shot_sigma: Seven
+    parameters: tuple[Literal["focal", "aspect", "cx_px", "cy_px", "k1", "p1", "p2"], ...]
+    device_sigma: tuple[Sigma, ...]
+    shot_sigma: tuple[Sigma, ...]
     offset_sigma_m: Sigma
     rotation_sigma_deg: Sigma
+
+    @model_validator(mode="after")
+    def _has_one_of_each(self) -> Self:
+        if len(set(self.parameters)) != len(self.parameters):
+            raise ValueError("parameters have to be unique")
+        if not len(self.parameters) == len(self.device_sigma) == len(self.shot_sigma):
+            raise ValueError("device_sigma and shot_sigma need one number for each of parameters")
+        return self
 
 
 class CameraEntry(Settings):

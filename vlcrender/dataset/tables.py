@@ -41,8 +41,9 @@ def _schema(model: type[Settings], constants: Constants) -> pa.Schema:
 def read_table(path: Path, model: type[R], constants: Constants | None = None) -> list[R]:
     """Read a Parquet table of rows of this model.
 
-    The columns may be in any order and of any type that `holds` the values; other columns are ignored. Raises InputError
-    where the file is missing or no Parquet, or its columns or cells differ from the model's or from `constants`.
+    The columns may be in any order and of any type that `holds` the values; other columns are ignored. Raises
+    InputError where the file is missing or no Parquet, or its columns or cells differ from the model's or from
+    `constants`.
     """
     constants = constants or {}
     if not path.is_file():
