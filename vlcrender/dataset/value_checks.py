@@ -3,8 +3,9 @@
 from collections.abc import Sequence
 from itertools import pairwise
 
+from vlcrender.dataset.camera_entries import CameraEntry, SensorEntry
 from vlcrender.dataset.exr import ExrPart
-from vlcrender.dataset.schema import CameraEntry, DatasetFile, FrameRow, SensorEntry, TruthRow
+from vlcrender.dataset.schema import DatasetFile, FrameRow, TruthRow
 from vlcrender.dataset.values import MAX_ANGLE_DEG, MAX_VISIBLE, is_covariance, is_rotation, repeated
 
 MAX_SENSOR_AREAS = 16

@@ -14,11 +14,11 @@ from vlcrender.camera.distortion import Distortion
 from vlcrender.camera.intrinsics import Camera, transform
 from vlcrender.camera.roi import Roi
 from vlcrender.config.toml_model import check
+from vlcrender.dataset.camera_entries import CameraEntry
 from vlcrender.dataset.exr import ExrPart, read_exr_parts
 from vlcrender.dataset.file_settings import FileSettings
 from vlcrender.dataset.files import EXPECTED, PREVIEWS, PROCESSED, read_dataset_file, read_sweep_file, sha256_of
 from vlcrender.dataset.schema import (
-    CameraEntry,
     DatasetFile,
     DeviceTruthRow,
     FrameRow,
