@@ -166,7 +166,7 @@ DAMAGES: list[tuple[int, str, Callable[[Path], None]]] = [
     (4, "lower triangle of K", at(*MAIN, "K", 1, 0, value=1.0)),
     (4, "image distance", at(*MAIN, "image_distance_mm", value=19.0)),
     (4, "no f-number", at(*MAIN, "f_number", value=0.0)),
-    (4, "distortion of a fish-eye", lambda folder: [at(*MAIN, k, value=v)(folder) for k, v in FISH_EYE] and None),
+    (4, "distortion of a fish-eye", lambda folder: bend_a_fish_eye(folder)),
     (4, "kernel without its psf", at(*MAIN, "psf_kernel", value=[[1.0]])),
     (4, "negative deviation", at(*MAIN, "uncertainty", "shot_sigma", 0, value=-1.0)),
     (4, "row time of 0", at(*MAIN, "shutter", value={"kind": "rolling", "row_time_us": 0.0, "direction": "down"})),
@@ -224,10 +224,18 @@ DAMAGES: list[tuple[int, str, Callable[[Path], None]]] = [
     (13, "window beyond the sensor", image({"dataWindow": SMALL_BOX}, Y=np.zeros((301, 400), np.uint32))),
     (13, "another sensor", image({"displayWindow": SMALL_BOX}, Y=DARK)),
     (13, "not capturable, but on the sensor", cell("frames", False, "capturable")),
-    (13, "other bytes", lambda folder: (folder / "frames/000001.exr").write_bytes(b"no EXR") and None),
+    (13, "other bytes", lambda folder: change_bytes(folder)),
     (14, "numbers beyond the bits", image(Y=DARK + np.uint32(2**31))),
 ]
-FISH_EYE = [("projection", "equidistant"), ("distortion", LENS)]
+
+
+def bend_a_fish_eye(folder: Path) -> None:
+    at(*MAIN, "projection", value="equidistant")(folder)
+    at(*MAIN, "distortion", value=LENS)(folder)
+
+
+def change_bytes(folder: Path) -> None:
+    (folder / "frames/000001.exr").write_bytes(b"no EXR")
 
 
 def halve(folder: Path) -> None:
