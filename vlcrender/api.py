@@ -135,8 +135,9 @@ class RawFrame:
         region.
         """
         from vlcrender.camera.rig import mounted_cameras
+        from vlcrender.dataset.camera_entries import SensorEntry
         from vlcrender.dataset.downlink_entry import downlink_entry
-        from vlcrender.dataset.schema import SensorEntry, accelerometer_entry, camera_entry, led_map
+        from vlcrender.dataset.schema import accelerometer_entry, camera_entry, led_map
 
         (mounted,) = mounted_cameras(self.camera, ())
         downlink = downlink_entry(self.scene.leds, self.demodulation)

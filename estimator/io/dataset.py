@@ -229,7 +229,10 @@ def _check_frames(path: Path, dataset: Dataset, frame_count: int) -> None:
             raise InputError(f"{path}: frame {index}: unknown camera {record.camera!r}; cameras: {known}")
         problem = spots_problem(dataset.downlink, record.spots) or decoding_problem(record.spots, dataset.leds)
         problem = problem or gravity_problem(record.accelerometer_m_s2, dataset.accelerometer)
-        if problem := problem or gyro_problem(record.gyro_rad_s, dataset.gyroscope):
+        problem = problem or gyro_problem(record.gyro_rad_s, dataset.gyroscope)
+        if problem is None and record.gyro_rad_s is None and dataset.gyroscope is not None:
+            problem = "gyro_rad_s is null, but gyroscope is given"
+        if problem:
             raise InputError(f"{path}: frame {index}: {problem}")
     _check_bursts(path, dataset.frames)
 
@@ -382,6 +385,8 @@ def _check_headers(record: FrameRecord, headers: list[dict[str, object]], camera
         if record.capturable and ((box[0] < sensor[0]) | (box[1] > sensor[1])).any():
             raise InputError(f"{record.file}: dataWindow {box.tolist()} extends beyond the sensor, but is capturable")
         boxes.append(box)
+    if not record.capturable and all(((box[0] >= sensor[0]) & (box[1] <= sensor[1])).all() for box in boxes):
+        raise InputError(f"{record.file}: every dataWindow lies on the sensor, but capturable is false")
     if problem := regions_problem(boxes, camera):
         raise InputError(f"{record.file}: {problem}")
     return boxes

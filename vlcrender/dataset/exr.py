@@ -2,7 +2,7 @@
 
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -69,23 +69,38 @@ class ExrPart:
     roi: Roi
     sensor: Roi
     dtype: np.dtype[Any]
+    largest: float = field(default=0.0, compare=False)
+    """Largest value of its pixels."""
 
 
 def read_exr_parts(path: Path) -> list[ExrPart]:
-    """The parts of a frame's file. Raises InputError where it cannot be read or lacks the channel Y."""
+    """The parts of a frame's file.
+
+    Raises InputError where it cannot be read, or a part has not scan lines with the channel Y alone.
+    """
     try:
+        with OpenEXR.File(str(path), header_only=True) as file:
+            count = len(file.parts)
         with OpenEXR.File(str(path), separate_channels=True) as file:
-            return [
-                ExrPart(
-                    part.header.get("name", ""),
-                    _roi(part.header["dataWindow"]),
-                    _roi(part.header["displayWindow"]),
-                    part.channels["Y"].pixels.dtype,
-                )
-                for part in file.parts
-            ]
+            parts = [_part(part) for part in file.parts]
+        if len(parts) != count:  # the decoder drops unreadable parts silently
+            raise ValueError(f"{len(parts)} of {count} parts")
+        return parts
     except (RuntimeError, KeyError, ValueError, TypeError) as error:
         raise InputError(f"{path}: cannot be read as an EXR with a channel Y: {error}") from None
+
+
+def _part(part: OpenEXR.Part) -> ExrPart:
+    """Raises ValueError for a part of other than scan lines of Y, one value for each place of the data window."""
+    if part.header["type"] != OpenEXR.scanlineimage:
+        raise ValueError("not stored as scan lines")
+    if list(part.channels) != ["Y"]:
+        raise ValueError(f"channels {', '.join(part.channels)}, needed Y alone")
+    pixels, roi = part.channels["Y"].pixels, _roi(part.header["dataWindow"])
+    if pixels is None or pixels.shape != (roi.rows, roi.columns):
+        raise ValueError("Y has not one value for each pixel")
+    sensor = _roi(part.header["displayWindow"])
+    return ExrPart(part.header.get("name", ""), roi, sensor, pixels.dtype, float(pixels.max()))
 
 
 def _roi(box: tuple[NDArray[np.int32], NDArray[np.int32]]) -> Roi:

@@ -12,6 +12,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from vlcrender.dataset.camera_entries import SensorEntry
 from vlcrender.dataset.downlink_entry import downlink_entry
 from vlcrender.dataset.files import FRAMES, sha256_of, whole_file, write_json
 from vlcrender.dataset.frame_job import Job
@@ -25,7 +26,6 @@ from vlcrender.dataset.schema import (
     FrameRecord,
     FrameRow,
     MapTruthRow,
-    SensorEntry,
     TruthRow,
     accelerometer_entry,
     camera_entry,

@@ -14,11 +14,11 @@ from vlcrender.camera.distortion import Distortion
 from vlcrender.camera.intrinsics import Camera, transform
 from vlcrender.camera.roi import Roi
 from vlcrender.config.toml_model import check
+from vlcrender.dataset.camera_entries import CameraEntry
 from vlcrender.dataset.exr import ExrPart, read_exr_parts
 from vlcrender.dataset.file_settings import FileSettings
 from vlcrender.dataset.files import EXPECTED, PREVIEWS, PROCESSED, read_dataset_file, read_sweep_file, sha256_of
 from vlcrender.dataset.schema import (
-    CameraEntry,
     DatasetFile,
     DeviceTruthRow,
     FrameRow,
@@ -30,6 +30,7 @@ from vlcrender.dataset.schema import (
 from vlcrender.dataset.shard import parts_of_frame
 from vlcrender.dataset.sweep import SWEEP_FILE, sweep_columns
 from vlcrender.dataset.tables import Constants, read_table
+from vlcrender.dataset.value_checks import image_problem, row_problems, truth_problem
 from vlcrender.errors import InputError
 from vlcrender.modulation.transmission import Transmitter, led_waves
 from vlcrender.modulation.wave import Wave
@@ -100,6 +101,7 @@ def _problems(directory: Path) -> list[str]:
     folders = extra_folders(bool(recipe.get("expected")), recipe.get("processed") is not None, files)
     missing = missing_files(directory, folders, range(dataset.frame_count), files)
     problems += [f"{path}: is missing" for path in missing.values()]
+    problems += row_problems(frames, dataset)
     problems += _time_problems(frames, dataset)
     waves = cache(partial(_waves_of, dataset))
     for number, pose in enumerate(truth):
@@ -224,7 +226,8 @@ def _frame_problems(
         return [f"{path}: regions overlap"]
     if row.capturable != all(sensor.contains(roi) for roi in regions):
         return [f"{path}: capturable is {row.capturable}, which its regions contradict"]
-    return []
+    problem = image_problem(parts, camera, dataset.sensor)
+    return [] if problem is None else [f"{path}: {problem}"]
 
 
 def _read_sealed(path: Path, model: type[S], problems: list[str]) -> list[S]:
@@ -370,9 +373,8 @@ def _image_at_own_line(row: TruthRow, camera: Camera, offset_m: Array, point_m: 
 
 def _truth_problems(row: TruthRow, camera: Camera | None, maps: Mapping[int, Positions], offset_m: Array) -> list[str]:
     where = f"truth.parquet: frame {row.frame}"
-    rotation = np.array(row.R_cam_world).reshape(3, 3)
-    if not (np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-9) and np.linalg.det(rotation) > 0):
-        return [f"{where}: R_cam_world is not a rotation"]
+    if (problem := truth_problem(row)) is not None:
+        return [problem]
     if camera is None or row.map not in maps:
         return []
     positions = maps[row.map]
