@@ -78,7 +78,7 @@ class Pace:
 
 def duration_text(seconds: float) -> str:
     """A duration in two digits or so: "0.52 s", "26 min", "3.5 h", "12 days"."""
-    for unit, length_s, limit in (("s", 1.0, 100.0), ("min", 60.0, 100.0), ("h", 3600.0, 48.0)):
+    for unit, length_s, limit in (("s", 1.0, 99.5), ("min", 60.0, 99.5), ("h", 3600.0, 48.0)):
         if seconds < limit * length_s:
             return f"{seconds / length_s:.2g} {unit}"
     return f"{seconds / 86400:.3g} days"
