@@ -1,9 +1,9 @@
-"""Memory and rate of a long run: resident sets of the parent and of both workers after a fifth of the frames, and at the end.
+"""Memory and rate of a long run: resident sets of parent and workers after a fifth of the frames, and at the end.
 
     python benchmarks/long_run.py [FRAMES] [SCALE]
 
-LED regions of the office at a quarter of the resolution (SCALE 4), made by `generate` with two workers, then estimated and
-scored with `pnp`. Exits with 1 where a process of `generate` has grown by more than wanted.
+LED regions of the office at a quarter of the resolution (SCALE 4), made by `generate` with two workers, then estimated
+with `pnp` and scored. Exits with 1 where a process of `generate` has grown by more than wanted.
 """
 
 import os
