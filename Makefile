@@ -48,6 +48,7 @@ bench: $(READY)
 	$(BIN)/python benchmarks/errors.py
 	$(BIN)/python benchmarks/memory.py
 	$(BIN)/python benchmarks/growth.py
+	$(BIN)/python benchmarks/plan.py
 	$(BIN)/python benchmarks/sweep.py
 	$(BIN)/python benchmarks/denoise.py
 	$(BIN)/python benchmarks/shards.py

@@ -306,4 +306,4 @@ def test_shards_of_full_frames_are_refused() -> None:
 
 def test_provenance_says_how_files_are_laid_out(shards: Path) -> None:
     recipe = json.loads((shards / "dataset.json").read_text())["provenance"]["recipe"]
-    assert recipe["files"] == {"previews": 2, "frames_per_file": 4}
+    assert recipe["files"] == {"format": "exr-uint32", "previews": 2, "frames_per_file": 4}

@@ -63,14 +63,24 @@ def _box(roi: Roi) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
 
 @dataclass(frozen=True)
 class ExrPart:
-    """One part of an EXR file: its name, its region, the whole sensor, and the type of its pixels."""
+    """One part of an EXR file: its name, its region, the whole sensor, its header and its pixels."""
 
     name: str
     roi: Roi
     sensor: Roi
-    dtype: np.dtype[Any]
-    largest: float = field(default=0.0, compare=False)
-    """Largest value of its pixels."""
+    attributes: Mapping[str, Any]
+    image: NDArray[Any] = field(compare=False)
+    """Channel Y, (rows, columns)."""
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """The type of its pixels."""
+        return self.image.dtype
+
+    @property
+    def largest(self) -> float:
+        """Largest value of its pixels."""
+        return float(self.image.max())
 
 
 def read_exr_parts(path: Path) -> list[ExrPart]:
@@ -100,7 +110,7 @@ def _part(part: OpenEXR.Part) -> ExrPart:
     if pixels is None or pixels.shape != (roi.rows, roi.columns):
         raise ValueError("Y has not one value for each pixel")
     sensor = _roi(part.header["displayWindow"])
-    return ExrPart(part.header.get("name", ""), roi, sensor, pixels.dtype, float(pixels.max()))
+    return ExrPart(part.header.get("name", ""), roi, sensor, dict(part.header), pixels)
 
 
 def _roi(box: tuple[NDArray[np.int32], NDArray[np.int32]]) -> Roi:

@@ -20,6 +20,8 @@ from vlcrender.config.toml_model import Settings
 from vlcrender.dataset.belief import CAMERA_PARAMETERS, EXACT_CAMERA, CameraSigmas, Sigmas
 from vlcrender.dataset.camera_entries import CameraEntry, CameraUncertainty, SensorEntry
 from vlcrender.dataset.downlink_entry import DownlinkEntry, downlink_problem
+from vlcrender.dataset.file_settings import FilesEntry
+from vlcrender.dataset.frame_numbers import FrameNumbers, Summary
 from vlcrender.dataset.values import (
     Coordinate,
     Count,
@@ -208,6 +210,8 @@ class FrameRecord(Settings):
 
     device: FrameRow
     truth: TruthRow
+    numbers: FrameNumbers | None = None
+    """For the summary of the set; None where they are not known."""
 
     @property
     def frame(self) -> int:
@@ -332,6 +336,10 @@ class DatasetFile(Settings):
     map_datum: MapDatumEntry | None
     downlink: DownlinkEntry | None
     room_m: tuple[Positive, Positive, Positive]
+    files: FilesEntry = FilesEntry()
+    """Where not given, as the default: sets made before it was stated."""
+    summary: Summary | None = None
+    """None in sets made before it was stated."""
     provenance: dict[str, Any]
 
     @model_validator(mode="after")

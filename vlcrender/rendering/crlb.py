@@ -18,8 +18,8 @@ ASSP 35(3), 1987) lets lens and map err too, by the sigmas of `Uncertainty`: eac
 prior, which adds 1 / sigma^2 to its own information. In units of the sigmas all priors are rows of the identity; the
 bound is found by QR from the slopes themselves, never from their products, because these lose the pose where priors are
 wide. Every unknown moves an LED's image as a motion of the LED's face in its own plane would: a shift and a linear
-deformation (`face_motions`). So the pixels of an image tell six numbers, whose slopes follow from those by the camera's x
-and y; all else is geometry. Unknowns that cannot be told apart, such as the map's datum and the position, therefore
+deformation (`face_motions`). So the pixels of an image tell six numbers, whose slopes follow from those by the camera's
+x and y; all else is geometry. Unknowns that cannot be told apart, such as the map's datum and the position, therefore
 remain so in the last digit, as they would not with slopes by pixels for each. Motions within a face that are not linear
 are left out: of a disc they show nothing, and of a small square next to nothing.
 
