@@ -6,7 +6,7 @@ import pytest
 from conftest import ROOT, SMALL
 from distributed import LocalCluster
 
-from vlcrender.dataset.files import sha256_of
+from vlcrender.core.digest import sha256_of
 from vlcrender.dataset.generate import generate
 from vlcrender.dataset.plan import load_plan
 from vlcrender.errors import InputError

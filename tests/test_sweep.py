@@ -15,9 +15,9 @@ from conftest import ROOT, SMALL, run, unchanged
 from scipy import stats
 
 import vlcrender as vr
+from vlcrender.core.digest import sha256_of
 from vlcrender.dataset import files, frame_job
 from vlcrender.dataset.dependence import keyed_recipe
-from vlcrender.dataset.files import sha256_of
 from vlcrender.dataset.plan import load_plan
 from vlcrender.dataset.progress import Progress
 from vlcrender.dataset.sweep import SweepTable

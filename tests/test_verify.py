@@ -9,8 +9,8 @@ import pytest
 from conftest import ROOT, SMALL
 
 from vlcrender.camera.roi import RegionImage, Roi
+from vlcrender.core.digest import sha256_of
 from vlcrender.dataset.exr import write_exr
-from vlcrender.dataset.files import sha256_of
 from vlcrender.dataset.generate import generate
 from vlcrender.dataset.plan import load_plan
 from vlcrender.dataset.schema import FrameRow, TruthRow, flat9

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from vlcrender.camera.intrinsics import Camera
 from vlcrender.camera.roi import RegionImage, Roi
-from vlcrender.dataset.files import replace_durably, sha256_of
+from vlcrender.core.digest import sha256_of
+from vlcrender.dataset.files import replace_durably
 from vlcrender.errors import InputError
 
 
@@ -63,12 +64,19 @@ def _box(roi: Roi) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
 
 @dataclass(frozen=True)
 class ExrPart:
-    """One part of an EXR file: its name, its region, the whole sensor, and the type of its pixels."""
+    """One part of an EXR file: its name, its region, the whole sensor, its header and its pixels."""
 
     name: str
     roi: Roi
     sensor: Roi
-    dtype: np.dtype[Any]
+    attributes: Mapping[str, Any]
+    image: NDArray[Any]
+    """Channel Y, (rows, columns)."""
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """The type of its pixels."""
+        return self.image.dtype
 
 
 def read_exr_parts(path: Path) -> list[ExrPart]:
@@ -80,7 +88,8 @@ def read_exr_parts(path: Path) -> list[ExrPart]:
                     part.header.get("name", ""),
                     _roi(part.header["dataWindow"]),
                     _roi(part.header["displayWindow"]),
-                    part.channels["Y"].pixels.dtype,
+                    dict(part.header),
+                    part.channels["Y"].pixels,
                 )
                 for part in file.parts
             ]
