@@ -92,11 +92,36 @@ def files_of_set(directory: Path) -> list[str]:
     return sorted(set(found) - set(NO_PART))
 
 
+def manifest_of_files(directory: Path, per_file: int, to: Path) -> str:
+    """Write manifest.json of the files of `directory` as they are to the folder `to`; return its SHA-256.
+
+    The order is that of every manifest. per_file: frames in each file.
+    """
+
+    def place(name: str) -> tuple[int, str]:
+        """Tables first, then files by the number of their first frame."""
+        folder, _, stem = name.rpartition(".")[0].rpartition("/")
+        of_shard = stem.startswith("shard-")
+        number = stem.removeprefix("shard-")
+        if not folder or not number.isdecimal():
+            return -1, name
+        return int(number) * (per_file if of_shard else 1), name
+
+    names = sorted(files_of_set(directory), key=place)
+    return write_manifest(to, ((name, entry_of(directory / name)) for name in names))
+
+
+def frames_per_file(tree: Mapping[str, Any]) -> int:
+    """Frames in each file of the set of a dataset.json; 1 where its provenance does not say."""
+    files = tree.get("provenance", {}).get("recipe", {}).get("files", {})
+    return int(files.get("frames_per_file", 1))
+
+
 def seal_dataset(directory: Path) -> None:
     """Write manifest.json of the files as they are, and dataset.json with its digest and a seal.
 
     Raises InputError where dataset.json cannot be read, or a file cannot be written.
     """
     tree = read_json_object(directory / DATASET_FILE)
-    digest = write_manifest(directory, ((name, entry_of(directory / name)) for name in files_of_set(directory)))
+    digest = manifest_of_files(directory, frames_per_file(tree), directory)
     write_sealed(directory / DATASET_FILE, {**tree, "manifest_sha256": digest})

@@ -5,7 +5,7 @@ import json
 import logging
 import os
 import platform
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cache, partial
 from importlib.metadata import version
 from itertools import accumulate
@@ -61,8 +61,7 @@ def is_complete(directory: Path, file: str, wanted: Mapping[str, Any], other: st
     """
     if not (directory / file).exists():
         return False
-    provenance = {key: value for key, value in wanted["provenance"].items() if key != "program_sha256"}
-    check_same(directory / file, {**wanted, "provenance": provenance}, other)
+    check_same(directory / file, wanted, other, ignored=("program_sha256",))
     for leftover in (PLAN, JOURNAL):  # of a run that was killed after the last file
         (directory / leftover).unlink(missing_ok=True)
     damage = verify(directory)
@@ -74,14 +73,18 @@ def is_complete(directory: Path, file: str, wanted: Mapping[str, Any], other: st
     return True
 
 
-def check_same(path: Path, wanted: Mapping[str, Any], other: str) -> None:
+def check_same(path: Path, wanted: Mapping[str, Any], other: str, ignored: Sequence[str] = ()) -> None:
     """Raise InputError that names a difference where the JSON file `path` has not the values of `wanted`.
 
-    It then holds `other`. Keys that `wanted` has not are not compared.
+    It then holds `other`. Keys that `wanted` has not, and those `ignored` in the provenance, are not compared.
     """
     try:
         tree = json.loads(path.read_text(encoding="utf-8"))
-        found = _difference({key: tree.get(key) for key in wanted}, json.loads(json.dumps(wanted)))
+        there, here = {key: tree.get(key) for key in wanted}, json.loads(json.dumps(wanted))
+        for provenance in (there["provenance"], here["provenance"]):
+            for key in ignored:
+                provenance.pop(key, None)
+        found = _difference(there, here)
     except (ValueError, RecursionError, AttributeError, OSError):
         raise InputError(f"{path}: damaged; delete {path.parent} or choose another --out") from None
     if found is not None:
@@ -314,13 +317,13 @@ def write_tables(plan: Plan, directory: Path, records: Records) -> list[str]:
 
 
 def _entries(directory: Path, tables: list[str], records: Records) -> Iterator[tuple[str, FileEntry]]:
-    """The entries of manifest.json: those of the tables as they are, those of frames as they were made."""
-    for name in tables:
+    """The entries of manifest.json in its order: those of the tables as they are, those of frames as they were made."""
+    for name in sorted(tables):
         yield name, entry_of(directory / name)
     before: Mapping[str, FileEntry] = {}
     for record in records():
         # A shard is a file of several frames that follow each other.
-        yield from ((name, entry) for name, entry in record.files.items() if name not in before)
+        yield from ((name, entry) for name, entry in sorted(record.files.items()) if name not in before)
         before = record.files
 
 
