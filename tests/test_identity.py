@@ -1,6 +1,7 @@
 """What a set is made of: files of the scene and the program; nothing is mixed, and a difference is named."""
 
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -20,11 +21,6 @@ CUBE = "v 3 3 0\nv 4 3 0\nv 4 4 0\nv 3 4 0\nv 3 3 {h}\nv 4 3 {h}\nv 4 4 {h}\nv 3
 )
 XML = """<scene version="3.0.0"><default name="meshes" value="parts"/><include filename="shared.xml"/>
 <shape type="obj"><string name="filename" value="$meshes/cube.obj"/></shape></scene>"""
-SCENE = """
-name = "furnished"
-led_spectrum = "phosphor-4000K"
-{}
-"""
 
 
 def write_texture(path: Path, grey: int) -> None:
@@ -34,27 +30,19 @@ def write_texture(path: Path, grey: int) -> None:
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """A recipe with a scene of a textured floor and a cube."""
-    text = (ROOT / "scenes/table1.toml").read_text()
-    start = text.index("[room.reflectance]")
-    floor = next(line for line in text[start:].splitlines() if line.startswith("floor"))
+    text = (ROOT / "scenes/table1.toml").read_text().replace("{ floor = 0.2, ceiling", "{ ceiling", 1)
     texture = '[room.texture.floor]\nfile = "floor.png"\ntile_m = [1.0, 1.0]\n'
     furniture = '[[furniture]]\nfile = "cube.obj"\nreflectance = 0.5\n'
     bake = "[bake]\ntexel_m = 1.0\npaths = 16\n"
-    kept = text.replace(floor + "\n", "", 1).split("[bake]")[0]
-    (tmp_path / "room.toml").write_text(f"{kept}\n{texture}\n{furniture}\n{bake}")
+    (tmp_path / "room.toml").write_text("\n".join([text.split("[bake]")[0], texture, furniture, bake]))
     write_texture(tmp_path / "floor.png", 120)
     (tmp_path / "cube.obj").write_text(CUBE.format(h=0.5))
     return tmp_path
 
 
 def plan(folder: Path) -> vr.Plan:
-    here = [{"position_m": [1.0, 1.0, 0.05], "yaw_deg": yaw} for yaw in (0, 30, 60)]
-    poses = (
-        "poses={ kind = 'list', pose = ["
-        + ", ".join(f"{{ position_m = {pose['position_m']}, yaw_deg = {pose['yaw_deg']} }}" for pose in here)
-        + "] }"
-    )
-    return small_plan(f"scene={json.dumps(str(folder / 'room.toml'))}", poses)
+    here = ", ".join(f"{{ position_m = [1.0, 1.0, 0.05], yaw_deg = {yaw} }}" for yaw in (0, 30, 60))
+    return small_plan(f"scene={json.dumps(str(folder / 'room.toml'))}", f"poses={{ kind = 'list', pose = [{here}] }}")
 
 
 class Crash(Exception):
@@ -95,7 +83,7 @@ def test_a_file_edited_between_two_runs_is_refused_by_name(folder: Path, name: s
     (out / "frames/000001.exr").write_bytes(b"x")
     with pytest.raises(vr.InputError, match="give the scene's folder with --scene-folder"):
         vr.repair(out)
-    with pytest.raises(vr.InputError, match="cube.obj: is not the file that"):
+    with pytest.raises(vr.InputError, match=r"cube.obj: is not the file that"):
         vr.repair(out, scene_folder=folder)
     (folder / name).write_bytes(before)
     assert vr.repair(out, scene_folder=folder) == ["frames/000001.exr: made again"]
@@ -230,8 +218,6 @@ def test_each_changed_byte_of_a_line_is_noticed(half: Path) -> None:
 
 def test_files_are_on_the_disk_before_their_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """After a power cut every frame of the journal has its files: file, folder, line, in this order."""
-    import os
-
     events: list[str] = []
     sync = os.fsync
 
