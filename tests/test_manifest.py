@@ -199,6 +199,16 @@ def test_frames_with_their_files_exchanged_are_found_by_their_headers(copied: Pa
     assert any("vlcrender:frame of its header is 1; frames.parquet has 0" in line for line in verify(copied))
 
 
+def test_a_run_that_was_killed_after_its_last_file_is_complete(copied: Path) -> None:
+    """plan.json and journal.jsonl are removed after dataset.json is there: what is left of them is no damage."""
+    for name in ("plan.json", "journal.jsonl"):
+        (copied / name).write_text("{}")
+    assert verify(copied) == []
+    assert vr.generate(small_plan(*ASSIGNMENTS), copied) is False
+    assert not (copied / "plan.json").exists()
+    assert not (copied / "journal.jsonl").exists()
+
+
 def test_verify_repair_on_the_command_line(made: Path, copied: Path) -> None:
     (copied / "previews/000000.png").unlink()
     assert run("vlcrender", "verify", str(copied)).returncode == 2
@@ -227,6 +237,13 @@ def test_a_sweep_has_a_seal_and_its_cells_are_repaired(tmp_path: Path) -> None:
     shutil.rmtree(folder / "cells/000002")
     assert vr.repair(folder) == ["cells/000001: frames/000000.exr: made again"]
     assert content(folder) == before
+    (folder / "cells/000000/dataset.json").unlink()
+    (folder / "cells/000001/frames.parquet").unlink()
+    lines = vr.repair(folder)
+    assert lines[0].startswith("cells/000000: not repaired: ")
+    assert lines[1:] == ["cells/000001: frames.parquet: made again"]
+    (folder / "cells/000000/dataset.json").write_bytes(before["cells/000000/dataset.json"])
+    assert verify(folder) == []
     tree = read_json_object(folder / "sweep.json")
     tree["name"] = "another"
     (folder / "sweep.json").write_text(json.dumps(tree))

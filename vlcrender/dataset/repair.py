@@ -45,13 +45,17 @@ def repair(directory: Path, scene_folder: Path | None = None, workers: int = 1) 
     """Make again what is missing or damaged in a dataset, or in all cells of a sweep; a line for each file.
 
     scene_folder: folder of the scene file, needed where the scene has textures or furniture. Raises InputError where
-    dataset.json is missing or damaged, where the files of the scene are others, and where another data_version made it.
+    dataset.json is missing or damaged, where the files of the scene are others, and where another data_version made it;
+    of a cell this is a line.
     """
     if not (directory / SWEEP_FILE).is_file():
         return _repaired(directory, scene_folder, workers)
     done = []
     for cell in read_sweep_file(directory).cells:
-        done += [f"{cell.folder}: {line}" for line in _repaired(directory / cell.folder, scene_folder, workers)]
+        try:
+            done += [f"{cell.folder}: {line}" for line in _repaired(directory / cell.folder, scene_folder, workers)]
+        except InputError as error:
+            done.append(f"{cell.folder}: not repaired: {error}")
     tree = read_json_object(directory / SWEEP_FILE)
     if "seal" not in tree and len(verify(directory)) == 1:  # that the seal is missing
         write_sealed(directory / SWEEP_FILE, tree)

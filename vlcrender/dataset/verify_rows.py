@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from itertools import pairwise
+from pathlib import PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -42,14 +43,14 @@ def row_problems(row: FrameRow, truth: TruthRow | None, recipe: Recipe) -> list[
     pose, shot, which = recipe.place_of_frame(number)
     device, shots = device_of_pose(recipe, pose), shot - recipe.first_shot
     per_file = recipe.files.frames_per_file
-    file = f"{FRAMES}/{row.frame:06d}.exr" if per_file == 1 else f"{FRAMES}/shard-{row.frame // per_file:06d}.exr"
+    stem = f"{row.frame:06d}" if per_file == 1 else f"shard-{row.frame // per_file:06d}"
     wanted: dict[str, Any] = {
         "shot": shots,
         "burst": shots // recipe.burst_frames,
         "pose": pose - recipe.pose_numbers.start,
         "device": device,
         "camera": recipe.cameras[which].name,
-        "file": file,
+        "file": f"{FRAMES}/{stem}{PurePosixPath(row.file).suffix}",
     }
     found = [(key, getattr(row, key), value) for key, value in wanted.items()]
     problems = [f"{where}: {key} is {own!r}; the recipe gives {value!r}" for key, own, value in found if own != value]
