@@ -94,7 +94,10 @@ def test_a_file_edited_between_two_runs_is_refused_by_name(folder: Path, name: s
 def test_a_file_edited_after_the_plan_is_refused_by_name(folder: Path) -> None:
     """The texture was read by the plan, the mesh is read later: both have to be those that the plan stated."""
     made = plan(folder)
+    job = Job.of(made, folder / "set")
     CHANGES["cube.obj"](folder)
+    with pytest.raises(vr.InputError, match=r"cube.obj: was changed while frames were made of it"):
+        make_frames([(job, 0)])  # as a worker does
     with pytest.raises(vr.InputError, match=r"cube.obj: was changed while frames were made of it"):
         vr.generate(made, folder / "set")
     assert not list((folder / "set").glob("frames/*"))
