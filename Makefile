@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: check demo test lint docs figures paper paper-full bench mutants clean
+.PHONY: check demo test lint docs figures paper paper-full bench mutants damage clean
 
 demo: $(READY)
 	$(BIN)/vlcrender generate datasets/quickstart.toml --out out/quickstart
@@ -70,6 +70,11 @@ mutants: $(READY)
 	test -f out/mutants/branches.sqlite || $(BIN)/python tests/mutation/run.py map
 	$(BIN)/python tests/mutation/run.py chosen
 	$(BIN)/python tests/mutation/run.py sample --count 150 --seed 7
+
+# Not in CI: some minutes.
+damage: $(READY)
+	$(BIN)/python tests/damage/flips.py --finished 2000 --unfinished 500
+	$(BIN)/python tests/damage/flips.py --finished 1000 --unfinished 200 --sharded
 
 clean:
 	rm -rf .venv out

@@ -20,6 +20,7 @@ from estimator_synthetic import small_dataset
 import vlcrender as vr
 from estimator.cli import main as estimator_main
 from vlcrender.cli import main as vlcrender_main
+from vlcrender.dataset.manifest import seal_dataset
 
 os.environ.setdefault("VLCRENDER_CACHE", tempfile.mkdtemp(prefix="vlcrender-tests-"))
 # No bake of an earlier run is taken, and processes that tests start share this one's.
@@ -91,6 +92,12 @@ def wait_until(happened: Callable[[], bool], process: subprocess.Popen[str]) -> 
 def small_plan(*assignments: str) -> vr.Plan:
     """Three small frames of the quickstart recipe."""
     return vr.load_recipe(ROOT / "datasets/quickstart.toml", [*SMALL, "poses.count=3", *assignments])
+
+
+def sealed(dataset: Path) -> Path:
+    """A dataset with a new manifest and seal, after its files were changed on purpose."""
+    seal_dataset(dataset)
+    return dataset
 
 
 def copy_of(dataset: Path, to: Path) -> Path:

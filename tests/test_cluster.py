@@ -9,8 +9,8 @@ import pytest
 from conftest import ROOT, SMALL
 from distributed import LocalCluster
 
+from vlcrender.core.digest import sha256_of
 from vlcrender.dataset import workers
-from vlcrender.dataset.files import sha256_of
 from vlcrender.dataset.frame_job import Job
 from vlcrender.dataset.generate import generate
 from vlcrender.dataset.plan import load_plan

@@ -14,6 +14,7 @@ from vlcrender.dataset.schema import (
     FRAMES_SCHEMA,
     TRUTH_SCHEMA,
     DeviceTruthRow,
+    FileEntry,
     FrameRecord,
     FrameRow,
     LedTruth,
@@ -134,7 +135,8 @@ def record(rng: np.random.Generator, bound: bool) -> FrameRecord:
         "bound_exact_m2": numbers(9) if bound else None,
         "added_noise_dn": float(rng.uniform()) if bound else None,
     }
-    return FrameRecord(device=FrameRow.model_validate(device), truth=TruthRow.model_validate(truth))
+    files = {"frames/000003.exr": FileEntry(sha256="0" * 64, bytes=7)}
+    return FrameRecord(device=FrameRow.model_validate(device), truth=TruthRow.model_validate(truth), files=files)
 
 
 def test_rows_survive_journal_and_table_bit_for_bit(tmp_path: Path, rng: np.random.Generator) -> None:

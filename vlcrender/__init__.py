@@ -25,6 +25,7 @@ if TYPE_CHECKING:
         load_recipe,
         load_scene,
         render,
+        repair,
         verify,
     )
     from vlcrender.camera.intrinsics import Camera, Pose
@@ -50,6 +51,7 @@ _MODULES = {
     "generate": "vlcrender.api",
     "budget": "vlcrender.api",
     "verify": "vlcrender.api",
+    "repair": "vlcrender.api",
     "ExpectedFrame": "vlcrender.api",
     "RawFrame": "vlcrender.api",
     "RawRegion": "vlcrender.api",
@@ -99,6 +101,7 @@ __all__ = [
     "load_recipe",
     "load_scene",
     "render",
+    "repair",
     "verify",
 ]
 

@@ -344,6 +344,20 @@ def verify(directory: str | Path) -> list[str]:
     return problems_of(Path(directory))
 
 
+def repair(directory: str | Path, *, scene_folder: str | Path | None = None, workers: int = 1) -> list[str]:
+    """Make files of a dataset, or of the cells of a sweep, again where they are missing or damaged.
+
+    They are made of the recipe, scene and seed in dataset.json, and take the place of damaged ones only where their
+    digests are those of the manifest: then every bit is as it was. A set that was made before there were manifests gets
+    one if `verify` finds nothing else. `scene_folder` is the folder of the scene file, where the scene has textures or
+    furniture. Returns a line for each file that was made again or could not be. Raises InputError if dataset.json is
+    damaged, which alone says what the set is made of, or if files of the scene are not those of the set.
+    """
+    from vlcrender.dataset.repair import repair as repaired  # loads Mitsuba
+
+    return repaired(Path(directory), None if scene_folder is None else Path(scene_folder), workers)
+
+
 def _plan(
     recipe: "str | Path | Plan", overrides: Overrides | None, scale: int = 1, scale_mode: ScaleMode = "binned"
 ) -> "Plan":

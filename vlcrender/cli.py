@@ -113,13 +113,27 @@ def _dry_run(plan: "Plan", workers: int, out: Path) -> None:
 
 
 @app.command
-def verify(directory: Path, /) -> None:
+def verify(
+    directory: Path,
+    /,
+    *,
+    repair: Annotated[bool, Parameter(negative=())] = False,
+    scene_folder: Path | None = None,
+    workers: int = 1,
+) -> None:
     """Check that a dataset, or each cell of a sweep, is complete and intact; the exit code is 0 only then.
 
     Parameters
     ----------
     directory
         Folder of the dataset or sweep.
+    repair
+        Make files that are missing or damaged again, of the recipe, scene and seed in dataset.json, and check then.
+        A file is replaced only by one with the digest that the manifest has.
+    scene_folder
+        With --repair: folder of the scene file, where the scene has textures or furniture.
+    workers
+        With --repair: processes that make frames.
     """
     from vlcrender import api
     from vlcrender.dataset.files import read_dataset_file, read_sweep_file
@@ -129,6 +143,9 @@ def verify(directory: Path, /) -> None:
         content = f"{len(read_sweep_file(directory).cells)} cells"
     else:
         content = f"{read_dataset_file(directory).frame_count} frames"
+    if repair:
+        for line in api.repair(directory, scene_folder=scene_folder, workers=workers):
+            print(f"{directory}: {line}")
     found = api.verify(directory)
     for problem in found:
         _complain(problem)

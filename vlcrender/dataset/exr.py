@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from vlcrender.camera.intrinsics import Camera
 from vlcrender.camera.roi import RegionImage, Roi
-from vlcrender.dataset.files import replace_durably, sha256_of
+from vlcrender.core.digest import sha256_of
+from vlcrender.dataset.files import replace_durably
 from vlcrender.errors import InputError
 
 

@@ -11,14 +11,14 @@ import numpy as np
 
 from vlcrender.core.warn_once import warn_once
 from vlcrender.dataset.dependence import Seen, keyed_recipe
-from vlcrender.dataset.files import write_json
-from vlcrender.dataset.frame_job import Job
+from vlcrender.dataset.frame_job import Job, SceneKey
 from vlcrender.dataset.light_checks import light_warnings
+from vlcrender.dataset.manifest import PLAN, write_sealed
 from vlcrender.dataset.plan import Plan, PlannedCells
 from vlcrender.dataset.possible import check_possible
 from vlcrender.dataset.progress import FRAMES_STAGE, Progress, ProgressCallback
 from vlcrender.dataset.sweep import SWEEP_FILE, sweep_tree
-from vlcrender.dataset.unfinished import PLAN, Unfinished, is_complete, prepare_folder, provenance_of
+from vlcrender.dataset.unfinished import Unfinished, is_complete, prepare_folder, provenance_of
 from vlcrender.dataset.workers import Task, done_frames
 from vlcrender.errors import InputError
 from vlcrender.light.lightmap import Lightmap, bake
@@ -92,7 +92,7 @@ def generate(
     for dataset in unfinished.values():  # of which an interrupted run had made all frames
         dataset.finish()
     if plan.cells is not None:
-        write_json(directory / SWEEP_FILE, wanted)
+        write_sealed(directory / SWEEP_FILE, wanted)
         (directory / PLAN).unlink()
     return True
 
@@ -116,14 +116,14 @@ def _cells(cells: PlannedCells, directory: Path) -> list[Unfinished]:
     return datasets
 
 
-def _view_of(job: Job) -> tuple[str, str, Seen]:
+def _view_of(job: Job) -> tuple[SceneKey, Seen]:
     """What the views of a job's frames depend on."""
-    return job.scene_json, job.scene_folder, keyed_recipe(job.recipe_json).seen
+    return job.scene_key, keyed_recipe(job.recipe_json).seen
 
 
 def _with_each_scene(datasets: list[Unfinished]) -> Iterator[Plan]:
     """The plan of the first dataset with each scene, and of the last dataset; one scene at a time is in memory."""
-    first = {(d.job.scene_json, d.job.scene_folder): d for d in reversed(datasets)}
+    first = {d.job.scene_key: d for d in reversed(datasets)}
     return (dataset.plan() for dataset in dict.fromkeys([*reversed(first.values()), *datasets[-1:]]))
 
 
@@ -133,14 +133,14 @@ def _tasks(datasets: Iterable[Unfinished]) -> tuple[Iterator[Task], int]:
     A task is a burst, a single shot, or the frames of a file that holds several, in all datasets whose views are the
     same. Its datasets are open. Tasks of one scene follow one another, then those of one view in the order of poses.
     """
-    scenes: dict[tuple[str, str], dict[tuple[Seen, int], list[Unfinished]]] = {}
+    scenes: dict[SceneKey, dict[tuple[Seen, int], list[Unfinished]]] = {}
     for dataset in datasets:
         recipe = keyed_recipe(dataset.job.recipe_json).recipe
         together = len(recipe.cameras) * recipe.burst_frames
         if recipe.files.frames_per_file > 1:
             together = recipe.files.frames_per_file
-        *scene, seen = _view_of(dataset.job)
-        scenes.setdefault((scene[0], scene[1]), {}).setdefault((seen, together), []).append(dataset)
+        scene, seen = _view_of(dataset.job)
+        scenes.setdefault(scene, {}).setdefault((seen, together), []).append(dataset)
     groups = [(group, together) for of_scene in scenes.values() for (_, together), group in of_scene.items()]
     shots = (
         (group, range(start, start + together))

@@ -205,22 +205,32 @@ class MapTruthRow(Settings):
     """Relative change of luminance from the centre to the rim along x and y."""
 
 
+class FileEntry(Settings):
+    """A file of a dataset in manifest.json."""
+
+    sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+    bytes: Annotated[int, Field(ge=0)]
+
+
 class FrameRecord(Settings):
-    """One finished frame: its row in both tables. A line of journal.jsonl."""
+    """One finished frame: its row in both tables, and its files. In a line of journal.jsonl."""
 
     device: FrameRow
     truth: TruthRow
     numbers: FrameNumbers | None = None
     """For the summary of the set; None where they are not known."""
+    files: dict[str, FileEntry]
+    """Every file that was made of the frame, by its path below the dataset; a shard is a file of each of its frames."""
 
     @property
     def frame(self) -> int:
         """Number of the frame."""
         return self.device.frame
 
-    def with_digest(self, sha256: str) -> "FrameRecord":
-        """The record with the digest of its file."""
-        return self.model_copy(update={"device": self.device.model_copy(update={"sha256": sha256})})
+    def with_file(self, entry: FileEntry) -> "FrameRecord":
+        """The record with the digest of the file of its pixels."""
+        device = self.device.model_copy(update={"sha256": entry.sha256})
+        return self.model_copy(update={"device": device, "files": {device.file: entry, **self.files}})
 
 
 _SCALARS = {int: pa.int64(), float: pa.float64(), str: pa.string(), bool: pa.bool_()}
@@ -341,6 +351,10 @@ class DatasetFile(Settings):
     summary: Summary | None = None
     """None in sets made before it was stated."""
     provenance: dict[str, Any]
+    manifest_sha256: str | None = None
+    """SHA-256 of manifest.json; None in a set that was made before there were manifests."""
+    seal: str | None = None
+    """SHA-256 of this file's content without the seal, see manifest.py."""
 
     @model_validator(mode="after")
     def _identities_agree(self) -> Self:

@@ -3,7 +3,7 @@
 World frame: metres, right-handed, z up, origin at a floor corner.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from vlcrender.config.toml_model import check, override, read_toml
 from vlcrender.scene.leds import Leds, leds_of
 from vlcrender.scene.paths import file_inside
+from vlcrender.scene.scene_files import scene_sources
 from vlcrender.scene.schema import SceneSettings
 from vlcrender.scene.surfaces import Glazing, Surface, check_absorptance, glazings_of, panel_surfaces, room_surfaces
 
@@ -31,6 +32,8 @@ class Scene:
     """All LEDs."""
     folder: Path
     """The folder of furniture and textures."""
+    sources: Mapping[str, str]
+    """SHA-256 of each file of the folder that the scene is made of, before it was read, by its path from the folder."""
 
     @property
     def name(self) -> str:
@@ -61,6 +64,7 @@ def build_scene(settings: SceneSettings, source: str, folder: Path = Path()) -> 
     or outside `folder`, for textures that cannot be read and for surfaces that absorb no light. Furniture is read, and
     checked, by a bake.
     """
+    sources = scene_sources(settings, folder)  # before the files are read: a change while they are is found later
     leds = leds_of(settings, source)
     glazings = glazings_of(settings, source)
     surfaces = room_surfaces(settings.room, settings.panels, glazings, folder, source)
@@ -72,4 +76,4 @@ def build_scene(settings: SceneSettings, source: str, folder: Path = Path()) -> 
         glazing_m2 = sum(glazing.area_m2 for glazing in glazings)
         absorbing_m2 = sum((1 - surface.reflectance) * surface.area_m2 for surface in surfaces) + glazing_m2
         check_absorptance(absorbing_m2, sum(surface.area_m2 for surface in surfaces) + glazing_m2, source)
-    return Scene(settings, tuple(surfaces), glazings, leds, folder)
+    return Scene(settings, tuple(surfaces), glazings, leds, folder, sources)
