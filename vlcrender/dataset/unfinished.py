@@ -357,7 +357,7 @@ def write_dataset(plan: Plan, directory: Path, provenance: dict[str, Any], recor
         downlink=downlink_entry(scene.leds, recipe.demodulation),
         room_m=scene.settings.room.size_m,
         files=FilesEntry(format=recipe.files.format),
-        summary=summary_of(recipe, _recorded(journal, places), directory, plan.warnings),
+        summary=summary_of(recipe, records(), directory, plan.warnings),
         provenance=provenance,
         manifest_sha256=manifest_sha256,
     )
