@@ -65,7 +65,7 @@ class Job:
     @classmethod
     def of(cls, plan: Plan, directory: Path) -> Self:
         """The job of a plan. In this process its frames use the plan's scene, which is not loaded again."""
-        scene, folder = plan.scene.settings.model_dump_json(), str(plan.scene.folder)
+        scene, folder = plan.scene.settings.model_dump_json(), str(plan.scene.folder.absolute())
         _loaded.pop((scene, folder), None)
         _loaded[scene, folder] = plan.scene
         while len(_loaded) > MAX_SCENES:

@@ -15,6 +15,7 @@ from pydantic import ValidationError
 from vlcrender.dataset.downlink_entry import downlink_entry
 from vlcrender.dataset.files import FRAMES, sha256_of, whole_file, write_json
 from vlcrender.dataset.frame_job import Job
+from vlcrender.dataset.lock import LOCK
 from vlcrender.dataset.plan import Plan
 from vlcrender.dataset.recipe import Recipe
 from vlcrender.dataset.schema import (
@@ -80,7 +81,7 @@ def prepare_folder(directory: Path, wanted: Mapping[str, Any], other: str) -> No
     plan_file = directory / PLAN
     if plan_file.exists():
         check_same(plan_file, wanted, other)
-    elif directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
+    elif directory.exists() and (not directory.is_dir() or any(path.name != LOCK for path in directory.iterdir())):
         raise InputError(f"{directory}: neither empty nor a dataset; nothing was changed; choose another --out")
     directory.mkdir(parents=True, exist_ok=True)
     write_json(plan_file, wanted)

@@ -4,7 +4,7 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -23,7 +23,7 @@ Done = tuple[Job, FrameRecord]
 
 def done_frames(
     tasks: Iterator[Task], count: int, workers: int, scheduler: str | None, directory: Path
-) -> Iterator[Done]:
+) -> Generator[Done, None, None]:
     """Make the frames of all tasks; their records in any order, each with its dataset's job.
 
     tasks: taken one by one, shortly before they start. count: the number of tasks. Raises InputError where a worker
@@ -58,6 +58,13 @@ def _in_processes(tasks: Iterator[Task], workers: int, directory: Path) -> Itera
             f"{directory}: a worker process died (out of memory?); run the same command again, "
             "with fewer --workers, to resume"
         ) from None
+    except BaseException:
+        # Frames in the making would not be recorded: end their workers now, and do not wait for them.
+        with _interrupts_deferred():
+            for process in list((pool._processes or {}).values()):
+                process.kill()
+            pool.shutdown(cancel_futures=True)
+        raise
     finally:
         pool.shutdown(cancel_futures=True)
 
@@ -99,7 +106,8 @@ def _exit_with_parent() -> None:
 
 def _on_cluster(tasks: Iterator[Task], address: str) -> Iterator[Done]:
     try:
-        from dask.distributed import Client, as_completed
+        from dask.distributed import Client, KilledWorker, as_completed
+        from distributed.client import FutureCancelledError
     except ImportError:
         raise InputError(f"--scheduler {address}: needs dask.distributed: pip install 'vlcrender[cluster]'") from None
     try:
@@ -108,7 +116,14 @@ def _on_cluster(tasks: Iterator[Task], address: str) -> Iterator[Done]:
         raise InputError(f"--scheduler {address}: no answer from a scheduler: {error}") from None
     with client:
         of_future = {client.submit(make_frames, task, pure=False): task for task in tasks}
-        for future in as_completed(list(of_future)):
-            task = of_future.pop(future)
-            yield from zip((job for job, _ in task), future.result(), strict=True)
-            future.release()
+        try:
+            for future in as_completed(list(of_future)):
+                task = of_future.pop(future)
+                for (job, _), record in zip(task, future.result(), strict=True):
+                    if not (Path(job.directory) / record.device.file).is_file():
+                        raise InputError(f"--scheduler {address}: its workers do not see the folder {job.directory}")
+                    yield job, record
+                future.release()
+        except (KilledWorker, FutureCancelledError) as error:
+            died = " ".join(str(error).split())
+            raise InputError(f"--scheduler {address}: {died}; run the same command again to resume") from None
