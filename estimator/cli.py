@@ -10,7 +10,7 @@ import logging
 import os
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -18,7 +18,7 @@ from cyclopts import App, CycloptsError, Parameter
 
 import estimator
 from estimator.errors import InputError
-from estimator.io.process import INTERRUPTED, ending_at_second_interrupt, prepare_streams
+from estimator.io.process import INTERRUPTED, ending_at_second_interrupt, prepare_streams, progress_console
 from estimator.report.table_commands import plot, table
 
 INTERNAL_ERROR = 1
@@ -79,7 +79,6 @@ def run(
         Folder for the estimates, in place of DATASET, which is then only read; `score`, `report` and the other commands
         take it as they take a dataset.
     """
-    from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     from estimator.io.estimates import estimates_path
@@ -88,7 +87,7 @@ def run(
     if workers < 1:
         raise InputError(f"--workers {workers}: is not 1 or more")
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    bar = Progress(*columns, console=Console(stderr=True))
+    bar = Progress(*columns, console=progress_console())
     task = bar.add_task("frames", total=None)
     with ExitStack() as stack:
 
@@ -175,8 +174,8 @@ def compare(dataset: Path, a: str, b: str, /, *, json: Annotated[bool, Parameter
         Print JSON instead of a table.
     """
     from estimator.evaluate.comparison import compare as compare_variants
-    from estimator.evaluate.score import read_or_score
     from estimator.evaluate.score_table import PAIR_HEADERS, PAIR_NOTE, pair_cells
+    from estimator.evaluate.scores_file import read_or_score
 
     if a == b:
         raise InputError(f"{a} and {b}: needed two different variants")
@@ -206,7 +205,7 @@ def report(*datasets: Annotated[Path, Parameter(required=True)], out: Path) -> N
     out
         The page to write.
     """
-    from estimator.evaluate.score import read_or_score
+    from estimator.evaluate.scores_file import read_or_score
     from estimator.io.atomic import write_atomically
     from estimator.report.report import page
 
@@ -230,7 +229,7 @@ def levels(*datasets: Annotated[Path, Parameter(required=True)], out: Path) -> N
         The SVG to write.
     """
     from estimator.evaluate.levels import LEVEL_NOTE, level_cells, levels_of
-    from estimator.evaluate.score import read_or_score
+    from estimator.evaluate.scores_file import read_or_score
     from estimator.io.atomic import write_atomically
     from estimator.report.levels import level_picture
     from estimator.report.terminal import print_table
@@ -364,7 +363,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _complain(message: str, code: int) -> int:
-    print("estimator:", " ".join(message.split()), file=sys.stderr)
+    with suppress(BrokenPipeError):
+        print("estimator:", " ".join(message.split()), file=sys.stderr)
     return code
 
 
@@ -373,7 +373,8 @@ class _LineHandler(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write the record."""
-        print(f"estimator: {record.levelname.lower()}:", " ".join(record.getMessage().split()), file=sys.stderr)
+        with suppress(BrokenPipeError):
+            print(f"estimator: {record.levelname.lower()}:", " ".join(record.getMessage().split()), file=sys.stderr)
 
 
 @contextmanager

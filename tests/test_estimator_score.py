@@ -10,7 +10,8 @@ import pytest
 from conftest import copy_of
 
 from estimator.errors import InputError
-from estimator.evaluate.score import Scores, read_or_score, score, score_variant
+from estimator.evaluate.score import Scores, score, score_variant
+from estimator.evaluate.scores_file import read_or_score
 from estimator.io.estimates import EstimateRow, LedRange, write_estimates
 from estimator.io.led_map import DiscLed
 from estimator.io.truth import TrueLed, TruthRow

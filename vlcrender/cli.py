@@ -9,13 +9,13 @@ import math
 import os
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, CycloptsError, Parameter
 
-from vlcrender.core.process import INTERRUPTED, ending_at_second_interrupt, prepare_streams
+from vlcrender.core.process import INTERRUPTED, ending_at_second_interrupt, prepare_streams, progress_console
 from vlcrender.errors import InputError
 
 if TYPE_CHECKING:
@@ -92,7 +92,6 @@ class _Bar:
     """Progress of a dataset on the terminal: a bar of frames, and one of the room's light while it is computed."""
 
     def __init__(self, name: str, frames: int) -> None:
-        from rich.console import Console
         from rich.progress import (
             BarColumn,
             MofNCompleteColumn,
@@ -110,7 +109,7 @@ class _Bar:
             TimeElapsedColumn(),
             TimeRemainingColumn(),
         )
-        self._bar = Progress(*columns, console=Console(stderr=True))
+        self._bar = Progress(*columns, console=progress_console())
         self._light = self._bar.add_task("light", total=1.0, visible=False)
         self._frames = self._bar.add_task(name, total=frames)
 
@@ -458,4 +457,5 @@ def _log_on_stderr() -> Iterator[None]:
 
 
 def _complain(message: str) -> None:
-    print("vlcrender:", " ".join(message.split()), file=sys.stderr)
+    with suppress(BrokenPipeError):
+        print("vlcrender:", " ".join(message.split()), file=sys.stderr)

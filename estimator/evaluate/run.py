@@ -57,8 +57,8 @@ def run(
     Raises
     ------
     InputError
-        The dataset cannot be read, files of frames are missing, a variant is unknown, another run uses the folder, or
-        a worker process died.
+        The dataset cannot be read, the files of all frames are missing, a variant is unknown, another run uses the
+        folder, or a worker process died.
     OSError
         The estimates cannot be written.
     """
@@ -68,8 +68,8 @@ def run(
     chosen = _chosen(variants)
     for name in chosen:
         estimates_path(folder, name)
-    home = folder if out is None else Path(out)
-    if out is not None:
+    home = folder if out is None or os.path.realpath(out) == os.path.realpath(folder) else Path(out)
+    if home != folder:
         dataset_folders(folder)  # refuses a damaged sweep before the folder is made
         make_results_folder(home, dataset_folder(folder))
     with locked(home, "estimator run"):
@@ -125,13 +125,11 @@ def _run(
 
 
 def _check_files(dataset: Dataset) -> None:
-    """Refuse a dataset without the files of all its frames: their loss is no failure of a variant."""
-    files = dict.fromkeys(record.file for record in dataset.frames)
-    missing = [file for file in files if not (dataset.folder / file).is_file()]
-    if missing:
+    """Refuse a dataset of which no frame has a file: their loss is no failure of a variant."""
+    if dataset.frames and not any((dataset.folder / record.file).is_file() for record in dataset.frames):
         raise InputError(
-            f"{dataset.folder}: {len(missing)} of {len(files)} files of frames are missing, the first {missing[0]}; "
-            "generate or copy the dataset again"
+            f"{dataset.folder}: the files of all {len(dataset.frames)} frames are missing, the first "
+            f"{dataset.frames[0].file}; generate or copy the dataset again"
         )
 
 

@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
 from estimator.errors import InputError
 from estimator.evaluate.identities import IdentityScore, score_identities
+from estimator.evaluate.sources import sources_of
 from estimator.evaluate.statistics import (
     AgainstBound,
     DeviceScore,
@@ -34,11 +35,10 @@ from estimator.evaluate.statistics import (
 )
 from estimator.io.atomic import write_atomically
 from estimator.io.dataset import Dataset, read_dataset
-from estimator.io.estimates import EstimateRow, read_estimates, sha256_of
+from estimator.io.estimates import EstimateRow, read_estimates
 from estimator.io.led_map import AnyLed
 from estimator.io.lock import locked
-from estimator.io.records import LedId, Number, Positive, Row, Size, Triple, first_problem
-from estimator.io.results import dataset_folder
+from estimator.io.records import LedId, Number, Positive, Row, Size, Triple
 from estimator.io.truth import TruthRow, read_true_map, read_truth
 
 if TYPE_CHECKING:
@@ -53,8 +53,6 @@ ENOUGH_LEDS = 4
 
 
 Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
-SOURCES = ("dataset.json", "frames.parquet", "truth.parquet", "truth_map.parquet")
-"""Files of a dataset that scores are made of, beside estimates; of a missing one there is no digest."""
 
 
 class RangeError(Row):
@@ -139,7 +137,7 @@ class Scores(Row):
 
     format: Literal["estimator-scores"] = "estimator-scores"
     version: Literal[4] = 4
-    sources: dict[str, Sha256]
+    sources: dict[str, Sha256] = Field(default_factory=dict)
     """SHA-256 of each file that the scores are made of, by its path below the dataset or its results."""
     dataset: str
     room_m: tuple[Positive, Positive, Positive] | None
@@ -439,7 +437,7 @@ def _score(folder: Path) -> Scores:
     paths = estimate_paths(folder)
     if not paths:
         raise InputError(f"{folder / 'estimates'}: no estimates to score; make them with `estimator run {folder}`")
-    sources = _sources(folder, paths)
+    sources = sources_of(folder, paths)
     truth = read_truth(dataset.folder / "truth.parquet", len(dataset.frames))
     devices = [record.device for record in dataset.frames]
     true_map = () if dataset.leds or not dataset.frames else read_true_map(dataset.folder / "truth_map.parquet")
@@ -461,40 +459,6 @@ def _score(folder: Path) -> Scores:
         if error.errno not in (errno.EROFS, errno.EACCES, errno.EPERM):
             raise
         logger.warning("%s: not written: %s", folder / "scores.json", error.strerror)
-    return scores
-
-
-def _sources(folder: Path, estimates: Sequence[Path]) -> dict[str, str]:
-    """SHA-256 of the files that are there of those that scores are made of, by path."""
-    paths = {name: dataset_folder(folder) / name for name in SOURCES}
-    paths |= {f"estimates/{path.name}": path for path in estimates}
-    return {name: sha256_of(path) for name, path in paths.items() if path.exists()}
-
-
-class _Header(BaseModel):
-    version: int
-    sources: dict[str, str] = {}
-
-
-def read_or_score(folder: Path) -> Scores:
-    """Scores of scores.json if it is made of the truth and estimates that are there, by their digests, else new scores.
-
-    The truth may be missing if scores.json is there, and so may all estimates. Scores of an older version are computed
-    again. Raises InputError.
-    """
-    path, estimates = folder / "scores.json", estimate_paths(folder)
-    if not path.exists():
-        return score(folder)
-    content = path.read_bytes()
-    try:
-        header = _Header.model_validate_json(content)
-        if header.version < VERSION or not _sources(folder, estimates).items() <= header.sources.items():
-            return score(folder)
-        scores = Scores.model_validate_json(content)
-    except ValidationError as error:
-        raise InputError(f"{path}: {first_problem(error)}") from None
-    if estimates and [one.variant for one in scores.variants] != [estimate.stem for estimate in estimates]:
-        return score(folder)
     return scores
 
 

@@ -9,6 +9,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from io import TextIOWrapper
 from types import FrameType
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C."""
@@ -31,6 +35,17 @@ def prepare_streams() -> None:
             stream.reconfigure(errors="replace")
 
 
+def progress_console() -> "Console":
+    """A console on stderr that falls silent where its reader has gone (`2>&1 | head`): the work goes on."""
+    from rich.console import Console
+
+    class Quiet(Console):
+        def on_broken_pipe(self) -> None:
+            self.quiet = True
+
+    return Quiet(stderr=True)
+
+
 @contextmanager
 def ending_at_second_interrupt() -> Iterator[None]:
     """Raise KeyboardInterrupt at the first interrupt (SIGINT); at the second, end this process and its workers at once.
@@ -45,8 +60,9 @@ def ending_at_second_interrupt() -> Iterator[None]:
     try:
         yield
     finally:
-        if signal.getsignal(signal.SIGINT) is _first:  # else interrupted: the process is ending
-            signal.signal(signal.SIGINT, signal.default_int_handler)
+        # After an interrupt the process is ending: a second one must not break its last lines.
+        interrupted = signal.getsignal(signal.SIGINT) is _second
+        signal.signal(signal.SIGINT, signal.SIG_IGN if interrupted else signal.default_int_handler)
 
 
 def _first(number: int, frame: FrameType | None) -> None:
