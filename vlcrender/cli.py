@@ -117,7 +117,8 @@ class _Bar:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self._bar.stop()
+        if self._bar.live.is_started:
+            self._bar.stop()
 
     def show(self, progress: "Progress") -> None:
         """Draw what `api.generate` reports."""
