@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: check demo test lint docs figures paper paper-full bench mutants clean
+.PHONY: check demo test lint docs figures paper paper-full bench mutants damage clean
 
 demo: $(READY)
 	$(BIN)/vlcrender generate datasets/quickstart.toml --out out/quickstart
@@ -69,6 +69,11 @@ mutants: $(READY)
 	test -f out/mutants/branches.sqlite || $(BIN)/python tests/mutation/run.py map
 	$(BIN)/python tests/mutation/run.py chosen
 	$(BIN)/python tests/mutation/run.py sample --count 150 --seed 7
+
+# Not in CI: each prints a line for every run, and exits with 1 where a set is lost or mixed.
+damage: $(READY)
+	$(BIN)/python tests/damage/kills.py --count 50
+	$(BIN)/python tests/damage/races.py --count 20
 
 clean:
 	rm -rf .venv out

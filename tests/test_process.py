@@ -201,4 +201,5 @@ def test_a_cluster_gets_absolute_folders(rendered_set: Path, tmp_path: Path, mon
     monkeypatch.chdir(tmp_path)
     with pytest.raises(KeyboardInterrupt):
         generate(small_plan(), Path("set"), scheduler="tcp://nowhere")
-    assert set(folders) == {tmp_path / "set", ROOT / "scenes"}
+    assert {folder.is_absolute() for folder in folders} == {True}
+    assert {folder.resolve() for folder in folders} == {tmp_path / "set", ROOT / "scenes"}
