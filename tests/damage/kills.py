@@ -19,7 +19,7 @@ import psutil
 from runs import end, generate_command, journal_size, manifest, start, verified, work_folder
 
 KINDS = ("1 worker", "2 workers", "cluster")
-LONGEST_S = 600.0
+HANG_S = 600.0
 """A run that takes longer hangs."""
 
 
@@ -96,7 +96,7 @@ def main() -> int:
                     chance.choice(found).kill()
             process = start(command)
             try:
-                output = process.communicate(timeout=LONGEST_S)[0]
+                output = process.communicate(timeout=HANG_S)[0]
             except subprocess.TimeoutExpired:
                 output = "hangs"
             end(process)
