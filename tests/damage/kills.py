@@ -37,11 +37,20 @@ def workers_of_cluster() -> list[psutil.Process]:
 
 
 def kill_at_random(command: list[str], folder: Path, chance: random.Random, usual_s: float) -> float | None:
-    """Start a command and kill it alone, not its workers, after a random part of a run; None where it ended before."""
+    """Start a command and kill it alone, not its workers, after a random part of a run; None where it ended before.
+
+    Every second time, on average, the part counts from the next frame on that is in the journal.
+    """
+    before = journal_size(folder)
     process = start(command)
     begun = time.monotonic()
+    wait_s = chance.uniform(0.02, 1.0) * usual_s
+    if chance.random() < 0.5:
+        while process.poll() is None and journal_size(folder) <= before:
+            time.sleep(0.005)
+        wait_s = chance.uniform(0.0, 0.2) * usual_s
     try:
-        process.wait(chance.uniform(0.02, 1.0) * usual_s)
+        process.wait(wait_s)
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
