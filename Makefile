@@ -71,10 +71,12 @@ mutants: $(READY)
 	$(BIN)/python tests/mutation/run.py chosen
 	$(BIN)/python tests/mutation/run.py sample --count 150 --seed 7
 
-# Not in CI: some minutes.
+# Not in CI: some minutes. Each prints what came of every flip or run, and exits with 1 where a set is lost or mixed.
 damage: $(READY)
 	$(BIN)/python tests/damage/flips.py --finished 2000 --unfinished 500
 	$(BIN)/python tests/damage/flips.py --finished 1000 --unfinished 200 --sharded
+	$(BIN)/python tests/damage/kills.py --count 50
+	$(BIN)/python tests/damage/races.py --count 20
 
 clean:
 	rm -rf .venv out

@@ -192,7 +192,7 @@ def test_a_frame_is_in_the_journal_before_it_is_reported(
     """A run that is killed then loses no frame that it reported. The frames here are those of another set."""
 
     def done_frames(tasks: Iterable[Task], *_: object) -> Iterator[Done]:
-        return zip((job for task in tasks for job, _ in task), records_of(made), strict=True)
+        yield from zip((job for task in tasks for job, _ in task), records_of(made), strict=True)
 
     monkeypatch.setattr("vlcrender.dataset.generate.done_frames", done_frames)
     lines: list[int] = []

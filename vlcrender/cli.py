@@ -9,13 +9,13 @@ import math
 import os
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from io import TextIOWrapper
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, CycloptsError, Parameter
 
+from vlcrender.core.process import INTERRUPTED, ending_at_second_interrupt, prepare_streams
 from vlcrender.errors import InputError
 
 if TYPE_CHECKING:
@@ -414,11 +414,9 @@ def _print_budget(found: "ErrorBudget") -> None:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line, by default with the arguments of this process; exit unless the code is 0."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):
-            stream.reconfigure(errors="replace")  # a terminal without a degree sign gets a question mark, not an error
+    prepare_streams()
     try:
-        with _log_on_stderr():
+        with ending_at_second_interrupt(), _log_on_stderr():
             app(arguments, exit_on_error=False, print_error=False)
         sys.stdout.flush()
     except (CycloptsError, InputError) as error:
@@ -432,7 +430,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sys.exit(2)
     except KeyboardInterrupt:
         _complain("interrupted; run the same command again to go on")
-        sys.exit(130)
+        sys.exit(INTERRUPTED)
     except Exception as error:
         # A fault of this program: one line, without a traceback.
         _complain(f"internal error, please report it: {type(error).__name__}: {error}")
@@ -459,4 +457,5 @@ def _log_on_stderr() -> Iterator[None]:
 
 
 def _complain(message: str) -> None:
-    print("vlcrender:", " ".join(message.split()), file=sys.stderr)
+    with suppress(BrokenPipeError):
+        print("vlcrender:", " ".join(message.split()), file=sys.stderr)

@@ -39,6 +39,7 @@ from estimator.io.records import (
     missing_key,
     read_rows,
 )
+from estimator.io.results import dataset_folder
 from estimator.io.sensor import Sensor
 from estimator.io.shard import frame_of_shard
 from estimator.io.shutter import Gyroscope
@@ -164,7 +165,7 @@ def read_dataset(path: str | Path) -> Dataset:
     Parameters
     ----------
     path
-        Folder of the dataset.
+        Folder of the dataset, or of its results (datasets/FORMAT.md).
 
     Returns
     -------
@@ -176,7 +177,7 @@ def read_dataset(path: str | Path) -> Dataset:
     InputError
         A file is missing, damaged, or of another version of the format; the message names the file and the key.
     """
-    folder = Path(path)
+    folder = dataset_folder(path)
     description_path = folder / "dataset.json"
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder")

@@ -156,6 +156,13 @@ def read_rows(
         raise InputError(f"{path}: row {first_problem(error)}") from None
 
 
+def read_metadata(path: Path) -> dict[str, str]:
+    """Key-value metadata of a Parquet file. Raises InputError if the file is missing or damaged."""
+    with _parquet(path) as file:
+        metadata = file.metadata.metadata or {}
+        return {key.decode(errors="replace"): value.decode(errors="replace") for key, value in metadata.items()}
+
+
 def read_scalars(path: Path) -> dict[str, list[float | str | None]]:
     """Columns of a Parquet file that hold one number or text a row, by name; a truth value is 1 or 0.
 

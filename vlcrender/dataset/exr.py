@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from vlcrender.camera.intrinsics import Camera
 from vlcrender.camera.roi import RegionImage, Roi
 from vlcrender.core.digest import sha256_of
-from vlcrender.dataset.files import replace_durably
+from vlcrender.dataset.files import partial_of, replace_durably
 from vlcrender.errors import InputError
 
 
@@ -23,7 +23,7 @@ def write_exr(path: Path, images: Sequence[RegionImage], sensor: Roi, attributes
     The file appears whole or not at all. Raises InputError where it cannot be written.
     """
     names = [f"region {number}" for number in range(len(images))] if len(images) > 1 else [""]
-    partial = path.with_suffix(".partial")
+    partial = partial_of(path)
     try:
         OpenEXR.File(_parts(images, sensor, attributes, names)).write(str(partial))
     except RuntimeError as error:  # OpenEXR raises it for a full disk as well

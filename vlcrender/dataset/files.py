@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 from vlcrender.config.toml_model import S, check
 from vlcrender.dataset.schema import FORMAT_VERSION, DatasetFile
@@ -23,10 +24,15 @@ def write_json(path: Path, tree: Mapping[str, Any]) -> None:
         partial.write_text(json.dumps(tree, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
+def partial_of(path: Path) -> Path:
+    """Where a file is written before it has its name: a worker of a run that was killed may be writing it as well."""
+    return path.with_name(f"{path.stem}.{uuid4().hex[:12]}.partial")
+
+
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
     """A path to write to; the file then replaces `path`, or is removed where writing failed. Raises InputError."""
-    partial = path.with_suffix(".partial")
+    partial = partial_of(path)
     try:
         yield partial
         replace_durably(partial, path)

@@ -82,7 +82,7 @@ class Job:
     @classmethod
     def of(cls, plan: Plan, directory: Path) -> Self:
         """The job of a plan. In this process its frames use the plan's scene, which is not loaded again."""
-        scene, folder = plan.scene.settings.model_dump_json(), str(plan.scene.folder)
+        scene, folder = plan.scene.settings.model_dump_json(), str(plan.scene.folder.absolute())
         sources = tuple(plan.scene.sources.items())
         job = cls(plan.recipe.model_dump_json(), scene, folder, str(directory), sources, program_sha256())
         _loaded.pop(job.scene_key, None)

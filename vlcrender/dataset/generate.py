@@ -1,7 +1,9 @@
 """Generation of a dataset, or of the cells of a sweep, from a plan. Resumable; any number of workers, same bytes."""
 
 import logging
+import os
 from collections.abc import Iterable, Iterator
+from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,6 +15,7 @@ from vlcrender.core.warn_once import warn_once
 from vlcrender.dataset.dependence import Seen, keyed_recipe
 from vlcrender.dataset.frame_job import Job, SceneKey
 from vlcrender.dataset.light_checks import light_warnings
+from vlcrender.dataset.lock import locked
 from vlcrender.dataset.manifest import PLAN, write_sealed
 from vlcrender.dataset.plan import Plan, PlannedCells
 from vlcrender.dataset.possible import check_possible
@@ -41,14 +44,24 @@ def generate(
 
     Resumes an interrupted run of the same plan. `workers` is the number of processes; `scheduler` is the address of a
     dask scheduler whose workers share the folder. `progress` is called with each report. Raises InputError where the
-    folder holds anything else, and where a pose, the furniture, or a true camera or LED of the plan is impossible:
-    before the first frame, except for a pose among thousands (`possible`).
+    folder holds anything else or is in use, and where a pose, the furniture, or a true camera or LED of the plan is
+    impossible: before the first frame, except for a pose among thousands (`possible`).
     """
-    report = progress or (lambda report: None)
     try:
         str(directory).encode()
     except UnicodeEncodeError:
         raise InputError(f"--out {directory}: not a UTF-8 name; EXR files need one") from None
+    if scheduler is not None:
+        directory = Path(os.path.abspath(directory))  # workers have working folders of their own
+    with locked(directory, "vlcrender generate"):
+        return _generate(plan, directory, workers, scheduler, progress)
+
+
+def _generate(
+    plan: Plan, directory: Path, workers: int, scheduler: str | None, progress: ProgressCallback | None
+) -> bool:
+    """`generate` in a folder that is locked."""
+    report = progress or (lambda report: None)
     if plan.cells is None:
         file, kind = "dataset.json", "dataset"
         wanted: dict[str, Any] = {"provenance": provenance_of(plan)}
@@ -82,13 +95,15 @@ def generate(
         report(Progress(FRAMES_STAGE, done, total))
     unfinished = {dataset.job.directory: dataset for dataset in datasets}
     tasks, count = _tasks(datasets)
-    for job, record in done_frames(tasks, count, workers, scheduler, directory):
-        dataset = unfinished[job.directory]
-        dataset.add(record)
-        done += 1
-        report(Progress(FRAMES_STAGE, done, total))
-        if dataset.done == dataset.frame_count:
-            unfinished.pop(job.directory).finish()
+    # Workers end before the lock is released, also after an interrupt.
+    with closing(done_frames(tasks, count, workers, scheduler, directory)) as made:
+        for job, record in made:
+            dataset = unfinished[job.directory]
+            dataset.add(record)
+            done += 1
+            report(Progress(FRAMES_STAGE, done, total))
+            if dataset.done == dataset.frame_count:
+                unfinished.pop(job.directory).finish()
     for dataset in unfinished.values():  # of which an interrupted run had made all frames
         dataset.finish()
     if plan.cells is not None:

@@ -7,6 +7,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn
 from rich.progress import Progress as Bars
 
+from vlcrender.core.process import progress_console
 from vlcrender.dataset.progress import FRAMES_STAGE, Pace, Progress
 
 
@@ -16,7 +17,7 @@ class ProgressDisplay:
     def __init__(self, name: str, frames: int, console: Console | None = None) -> None:
         """console: by default stderr."""
         self._name = name
-        self._console = console or Console(stderr=True)
+        self._console = console or progress_console()
         self._pace = Pace()
         columns = (
             TextColumn("{task.description}"),

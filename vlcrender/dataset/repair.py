@@ -11,6 +11,7 @@ from vlcrender.config.toml_model import check
 from vlcrender.dataset.files import FRAMES, read_dataset_file, read_json_object, read_sweep_file, replace_durably
 from vlcrender.dataset.frame_job import Job
 from vlcrender.dataset.layout import extra_folders
+from vlcrender.dataset.lock import locked
 from vlcrender.dataset.manifest import (
     DATASET_FILE,
     MANIFEST,
@@ -46,8 +47,14 @@ def repair(directory: Path, scene_folder: Path | None = None, workers: int = 1) 
 
     scene_folder: folder of the scene file, needed where the scene has textures or furniture. Raises InputError where
     dataset.json is missing or damaged, where the files of the scene are others, and where another data_version made it;
-    of a cell this is a line.
+    of a cell this is a line. Also raises it where the folder is in use.
     """
+    with locked(directory, "vlcrender verify --repair"):
+        return _repair(directory, scene_folder, workers)
+
+
+def _repair(directory: Path, scene_folder: Path | None, workers: int) -> list[str]:
+    """`repair` in a folder that is locked."""
     if not (directory / SWEEP_FILE).is_file():
         return _repaired(directory, scene_folder, workers)
     done = []

@@ -22,6 +22,7 @@ from vlcrender.dataset.file_settings import FilesEntry
 from vlcrender.dataset.files import FRAMES, sync_folder, whole_file, write_json
 from vlcrender.dataset.frame_job import Job
 from vlcrender.dataset.layout import extra_folders
+from vlcrender.dataset.lock import LOCK
 from vlcrender.dataset.manifest import JOURNAL, PLAN, entry_of, write_manifest, write_sealed
 from vlcrender.dataset.plan import Plan
 from vlcrender.dataset.recipe import Recipe
@@ -130,7 +131,7 @@ def prepare_folder(directory: Path, wanted: Mapping[str, Any], other: str) -> No
     plan_file = directory / PLAN
     if plan_file.exists():
         check_same(plan_file, wanted, other)
-    elif directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
+    elif directory.exists() and (not directory.is_dir() or any(path.name != LOCK for path in directory.iterdir())):
         raise InputError(f"{directory}: neither empty nor a dataset; nothing was changed; choose another --out")
     directory.mkdir(parents=True, exist_ok=True)
     write_json(plan_file, wanted)

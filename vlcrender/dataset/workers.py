@@ -4,7 +4,7 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -28,7 +28,7 @@ Done = tuple[Job, FrameRecord]
 
 def done_frames(
     tasks: Iterator[Task], count: int, workers: int, scheduler: str | None, directory: Path
-) -> Iterator[Done]:
+) -> Generator[Done, None, None]:
     """Make the frames of all tasks; their records in any order, each with its dataset's job.
 
     tasks: taken one by one, shortly before they start. count: the number of tasks. Raises InputError where a worker
@@ -63,6 +63,13 @@ def _in_processes(tasks: Iterator[Task], workers: int, directory: Path) -> Itera
             f"{directory}: a worker process died (out of memory?); run the same command again, "
             "with fewer --workers, to resume"
         ) from None
+    except BaseException:
+        # Frames in the making would not be recorded: end their workers now, and do not wait for them.
+        with _interrupts_deferred():
+            for process in list((pool._processes or {}).values()):
+                process.kill()
+            pool.shutdown(cancel_futures=True)
+        raise
     finally:
         pool.shutdown(cancel_futures=True)
 
@@ -105,6 +112,7 @@ def _exit_with_parent() -> None:
 def _on_cluster(tasks: Iterator[Task], address: str) -> Iterator[Done]:
     try:
         from dask.distributed import Client, KilledWorker, as_completed
+        from distributed.client import FutureCancelledError
     except ImportError:
         raise InputError(f"--scheduler {address}: needs dask.distributed: pip install 'vlcrender[cluster]'") from None
     try:
@@ -130,5 +138,11 @@ def _on_cluster(tasks: Iterator[Task], address: str) -> Iterator[Done]:
                     f"--scheduler {address}: each worker that took frame {task[0][1]} died (out of memory?): "
                     f"{first_line(str(error))}; run the same command again to resume"
                 ) from None
-            yield from zip((job for job, _ in task), records, strict=True)
+            except FutureCancelledError as error:
+                died = " ".join(str(error).split())
+                raise InputError(f"--scheduler {address}: {died}; run the same command again to resume") from None
+            for (job, _), record in zip(task, records, strict=True):
+                if not (Path(job.directory) / record.device.file).is_file():
+                    raise InputError(f"--scheduler {address}: its workers do not see the folder {job.directory}")
+                yield job, record
             submit(1)
