@@ -75,17 +75,27 @@ def read_exr_parts(path: Path) -> list[ExrPart]:
     """The parts of a frame's file. Raises InputError where it cannot be read or lacks the channel Y."""
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
-            return [
-                ExrPart(
-                    part.header.get("name", ""),
-                    _roi(part.header["dataWindow"]),
-                    _roi(part.header["displayWindow"]),
-                    part.channels["Y"].pixels.dtype,
-                )
-                for part in file.parts
-            ]
+            return [_part(part) for part in file.parts]
     except (RuntimeError, KeyError, ValueError, TypeError) as error:
         raise InputError(f"{path}: cannot be read as an EXR with a channel Y: {error}") from None
+
+
+def read_exr_images(path: Path) -> list[tuple[ExrPart, NDArray[Any]]]:
+    """The parts of a frame's file, each with its pixels (rows, columns). Raises InputError as `read_exr_parts`."""
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            return [(_part(part), np.array(part.channels["Y"].pixels)) for part in file.parts]
+    except (RuntimeError, KeyError, ValueError, TypeError) as error:
+        raise InputError(f"{path}: cannot be read as an EXR with a channel Y: {error}") from None
+
+
+def _part(part: Any) -> ExrPart:
+    return ExrPart(
+        part.header.get("name", ""),
+        _roi(part.header["dataWindow"]),
+        _roi(part.header["displayWindow"]),
+        part.channels["Y"].pixels.dtype,
+    )
 
 
 def _roi(box: tuple[NDArray[np.int32], NDArray[np.int32]]) -> Roi:

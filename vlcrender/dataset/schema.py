@@ -353,6 +353,8 @@ class DatasetFile(Settings):
     map_datum: MapDatumEntry | None
     downlink: DownlinkEntry | None
     room_m: Triple
+    licence: str | None = None
+    """SPDX licence expression of the recipe; None where not stated."""
     provenance: dict[str, Any]
 
 

@@ -243,6 +243,7 @@ def _finish(plan: Plan, directory: Path, provenance: dict[str, Any], places: dic
         map_datum=None if sigmas is None else map_datum_entry(sigmas),
         downlink=downlink_entry(scene.leds, recipe.demodulation),
         room_m=scene.settings.room.size_m,
+        licence=recipe.licence,
         provenance=provenance,
     )
     write_json(directory / "dataset.json", dataset.model_dump(mode="json"))
