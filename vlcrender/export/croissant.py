@@ -17,7 +17,18 @@ from vlcrender.export.source import Source
 
 TYPES = {int: "sc:Integer", float: "sc:Float", str: "sc:Text", bool: "sc:Boolean"}
 TERMS = (
-    *("citeAs", "column", "extract", "field", "fileProperty", "fileObject", "fileSet", "format", "includes"),
+    *(
+        "citeAs",
+        "column",
+        "equivalentProperty",
+        "extract",
+        "field",
+        "fileProperty",
+        "fileObject",
+        "fileSet",
+        "format",
+        "includes",
+    ),
     *("isLiveDataset", "jsonPath", "key", "md5", "parentField", "path", "recordSet", "references", "regex", "repeated"),
     *("replace", "samplingRate", "separator", "source", "subField", "transform"),
 )
