@@ -1,16 +1,24 @@
 """Licence, Croissant metadata and dataset card of a set, and the command line."""
 
 import json
+import re
 from pathlib import Path
 
+import cv2
 import mlcroissant
+import numpy as np
+import OpenEXR
 import pyarrow.parquet as pq
+import pycolmap
 import pytest
 import yaml
 from conftest import ROOT, SMALL, copy_of, run
 from export_reading import exported
 
 import vlcrender as vr
+from vlcrender.camera.roi import RegionImage, Roi
+from vlcrender.core.backend import mi
+from vlcrender.dataset.exr import write_exr
 from vlcrender.dataset.files import read_dataset_file
 from vlcrender.export.card import card
 from vlcrender.export.source import Source
@@ -133,3 +141,29 @@ def test_cells_of_a_sweep_are_exported_one_by_one(tmp_path: Path) -> None:
     (tmp_path / "sweep.json").write_text("{}")
     with pytest.raises(vr.InputError, match="is a sweep; export its cells one by one"):
         vr.export_dataset(tmp_path, "tum", tmp_path.parent / "never")
+
+
+def test_the_loaders_of_the_docs_run(rendered_set: Path, tmp_path: Path) -> None:
+    """The blocks for NumPy and WebDataset of docs/exporting.md; that for PyTorch needs torch."""
+    exported(rendered_set, "webdataset", tmp_path)
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs/exporting.md").read_text(), re.DOTALL)
+    by_numpy, by_torch, by_webdataset = blocks
+    assert "torch" in by_torch
+    names: dict[str, object] = {}
+    exec(by_numpy.replace("out/quickstart", str(rendered_set)), names)
+    pixels = eval("image(frames[2])", names)
+    exec(by_webdataset.replace("out/quickstart-wds", str(tmp_path / "out")), names)
+    np.testing.assert_array_equal(names["pixels"], pixels)
+    assert names["true"]["position_m"] == eval("truth[2]['position_m']", names)  # type: ignore[index]
+
+
+def test_readers_read_a_frame_as_the_table_of_format_md_says(tmp_path: Path) -> None:
+    """Of those that are installed here: OpenEXR and Mitsuba right, pycolmap 0 everywhere, OpenCV's wheel not at all."""
+    numbers = np.arange(64 * 48, dtype=np.uint32).reshape(48, 64)
+    path, sensor = tmp_path / "frame.exr", Roi(0, 0, 48, 64)
+    write_exr(path, [RegionImage(sensor, numbers)], sensor, {})
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        np.testing.assert_array_equal(file.parts[0].channels["Y"].pixels, numbers)
+    np.testing.assert_array_equal(np.array(mi.Bitmap(str(path))).reshape(48, 64), numbers)
+    assert not pycolmap.Bitmap.read(str(path), as_rgb=False).to_array().any()
+    assert cv2.imread(str(path), cv2.IMREAD_UNCHANGED) is None
