@@ -19,6 +19,7 @@ class TrueFrame:
     """A frame of truth.parquet with the LEDs that light it."""
 
     frame: int
+    map: int
     camera: str
     R_cam_world: NDArray[np.float64]
     position_m: NDArray[np.float64]
@@ -44,6 +45,7 @@ def true_frames(folder: Path) -> list[TrueFrame]:
         found.append(
             TrueFrame(
                 row["frame"],
+                row["map"],
                 camera,
                 np.reshape(row["R_cam_world"], (3, 3)),
                 np.array(row["position_m"]),

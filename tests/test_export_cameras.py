@@ -10,12 +10,13 @@ import numpy as np
 import pycolmap
 import pytest
 import yaml
-from conftest import small_plan, unchanged
+from conftest import copy_of, small_plan, unchanged
 from export_reading import MAX_ERROR_PX, TrueFrame, exported, true_frames
 from numpy.typing import NDArray
 from PIL import Image
 
 import vlcrender as vr
+from vlcrender.export.source import Source
 
 Array = NDArray[np.float64]
 FISHEYE = 'camera.projection="equidistant"', "camera.focal_length_mm=3.0", "poses.count=1"
@@ -78,7 +79,7 @@ def test_pycolmap_reads_the_model_and_projects_leds_to_the_same_pixels(
         image = model.images[frame.frame + 1]
         camera = model.cameras[image.camera_id]
         points = [model.points3D[point.point3D_id] for point in image.points2D]
-        assert [point.point3D_id % stride for point in image.points2D] == frame.led
+        assert [divmod(point.point3D_id, stride) for point in image.points2D] == [(frame.map, n) for n in frame.led]
         np.testing.assert_array_equal([point.xyz for point in points], frame.world_m)
         np.testing.assert_array_equal([point.xy for point in image.points2D], frame.pixels)
         projected = [camera.img_from_cam(image.cam_from_world() * point.xyz) for point in points]
@@ -208,3 +209,43 @@ def test_a_lens_that_the_target_cannot_express_is_refused_by_name(
         vr.export_dataset(request.getfixturevalue(which), to, tmp_path / "out")
     assert "\n" not in str(refusal.value)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_distortion_of_a_frame_is_the_true_one(rig_set: Path) -> None:
+    source = Source.open(rig_set, "colmap", True)
+    row, truth = source.frames[1], source.truth[1]
+    other = truth.model_copy(update={"distortion": (0.1, 0.2, 0.3, 0.4, 0.5)})
+    assert source.told_camera("left").brown == source.true_camera(row, truth).brown == (-0.05, 0.01, 0.0, 1e-5, -2e-4)
+    assert source.true_camera(row, other).brown == (0.1, 0.2, 0.3, 0.4, 0.5)
+
+
+def test_transforms_json_has_k3(wide_set: Path, rig_set: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = Source.open(wide_set, "nerfstudio", True)
+    with_k3 = source.true_camera(source.frames[1], source.truth[1])
+    monkeypatch.setattr(Source, "true_camera", lambda *_: with_k3)
+    tree = json.loads((exported(rig_set, "nerfstudio", tmp_path) / "transforms.json").read_text())
+    keys = ("k1", "k2", "k3", "k4", "p1", "p2")
+    assert [tree["frames"][0][key] for key in keys] == [-0.05, 0.01, 0.3, 0.0, 1e-5, -2e-4]
+
+
+@pytest.mark.parametrize("to", ["opencv-yaml", "kalibr", "rosbag2"])
+def test_skew_and_a_fisheye_of_90_deg_are_refused_by_name(
+    to: str, rig_set: Path, belief_set: Path, tmp_path: Path
+) -> None:
+    """The corner of the fish-eye is 250 px off the axis: at 159 px a radian it is at 90.1 deg."""
+    for folder, place, number, message in (
+        (rig_set, (0, 1), 0.5, "camera main has a skew of 0.5 px"),
+        (belief_set, (0, 0), 159.0, "the sensor of camera main extends to"),
+    ):
+        copy = copy_of(folder, tmp_path / folder.parent.name)
+        tree = json.loads((copy / "dataset.json").read_text())
+        matrix = tree["cameras"]["main"]["K"]
+        matrix[place[0]][place[1]] = number
+        if number > 1:
+            matrix[1][1] = number
+        (copy / "dataset.json").write_text(json.dumps(tree))
+        with pytest.raises(vr.InputError, match=f"^{to}: {message}"):
+            vr.export_dataset(copy, to, tmp_path / "out")
+    matrix[0][0] = matrix[1][1] = 160.0  # 89.5 deg
+    (copy / "dataset.json").write_text(json.dumps(tree))
+    exported(copy, to, tmp_path)

@@ -307,3 +307,21 @@ def test_a_yaml_number_is_one_for_yaml_1_1(number: float) -> None:
     """PyYAML takes 1e-05 for text."""
     yaml = pytest.importorskip("yaml")
     assert yaml.safe_load(f"[{yaml_number(number)}]") == [number]
+
+
+def test_a_mosaic_has_its_name_in_a_bag(rig_set: Path, tmp_path: Path) -> None:
+    folder = copy_of(rig_set, tmp_path / "set")
+    tree = json.loads((folder / "dataset.json").read_text())
+    tree["sensor"]["mosaic"] = "rggb"
+    (folder / "dataset.json").write_text(json.dumps(tree))
+    with AnyReader([exported(folder, "rosbag2", tmp_path) / "bag"]) as bag:
+        connections = [one for one in bag.connections if one.topic == "/main/image_raw"]
+        (_, _, raw), *_ = bag.messages(connections)
+        assert bag.deserialize(raw, connections[0].msgtype).encoding == "bayer_rggb16"
+
+
+def test_regions_beyond_the_sensor_have_no_image(rig_set: Path) -> None:
+    source = Source.open(rig_set, "png16", False)
+    row = source.frames[0].model_copy(update={"capturable": False})
+    with pytest.raises(vr.InputError, match="png16: frame 0 has regions beyond the sensor"):
+        source.image(row)
