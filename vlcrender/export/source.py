@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vlcrender.dataset.exr import ExrPart, read_exr_images
+from vlcrender.dataset.exr import read_exr_images
 from vlcrender.dataset.files import read_dataset_file, sha256_of
 from vlcrender.dataset.schema import CameraEntry, DatasetFile, FrameRow, MapTruthRow, TruthRow, five
 from vlcrender.dataset.shard import parts_of_frame
@@ -243,6 +243,3 @@ def _intrinsics(name: str, entry: CameraEntry, matrix: Array, distortion: Five |
 def _point(led: Any) -> LedPoint:
     size_m = led.radius_m if led.shape == "disc" else led.side_m
     return LedPoint(led.id, np.array(led.position_m), led.shape, size_m)
-
-
-__all__ = ["ExrPart", "FrameImage", "LedPoint", "Source"]
