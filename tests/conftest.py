@@ -127,6 +127,19 @@ def rendered_set(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 @pytest.fixture(scope="session")
+def rig_set(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Two shots of LED regions: `main` without distortion, and `left`, mounted beside it, with one."""
+    distortion = "{ k1 = -0.05, k2 = 0.01, p1 = 1e-5, p2 = -2e-4 }"
+    camera = f"{{ width_px = 320, height_px = 240, pixel_pitch_um = 12.0, distortion = {distortion} }}"
+    left = f'[{{ name = "left", offset_m = [0.1, 0.02, 0.01], tilt_x_deg = 3.0, yaw_deg = 7.0, camera = {camera} }}]'
+    folder = tmp_path_factory.mktemp("rig") / "set"
+    plan = small_plan("poses.count=2", 'regions={ kind = "leds", margin_px = 2 }', f"rig={left}")
+    assert vr.generate(plan, folder)
+    with unchanged(folder):
+        yield folder
+
+
+@pytest.fixture(scope="session")
 def synthetic_set(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Three frames with shot noise that the renderer has no part in."""
     with unchanged(small_dataset(tmp_path_factory.mktemp("synthetic") / "set")) as folder:

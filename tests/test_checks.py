@@ -20,7 +20,7 @@ import pytest
 from estimator.errors import InputError as ReaderError
 from estimator.io.dataset import read_dataset, read_frame
 from estimator.io.truth import read_truth
-from vlcrender.dataset.files import sha256_of
+from vlcrender.core.digest import sha256_of
 from vlcrender.dataset.verify import verify
 from vlcrender.errors import InputError
 

@@ -358,6 +358,18 @@ def repair(directory: str | Path, *, scene_folder: str | Path | None = None, wor
     return repaired(Path(directory), None if scene_folder is None else Path(scene_folder), workers)
 
 
+def export_dataset(directory: str | Path, to: str, out: str | Path) -> int:
+    """Export a complete dataset to another tool's format; returns the number of frames.
+
+    `to` is one of png16, csv, tum, opencv-yaml, kalibr, colmap, nerfstudio, bop, webdataset, rosbag2, croissant and
+    card (docs/exporting.md). `out` is a new folder, or a new file for croissant and card; it appears whole or not at
+    all. Raises InputError for bad input, and names what the format cannot express.
+    """
+    from vlcrender.export.registry import export_dataset as export
+
+    return export(Path(directory), to, Path(out))
+
+
 def _plan(
     recipe: "str | Path | Plan", overrides: Overrides | None, scale: int = 1, scale_mode: ScaleMode = "binned"
 ) -> "Plan":

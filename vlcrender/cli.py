@@ -155,6 +155,25 @@ def verify(
 
 
 @app.command
+def export(directory: Path, /, *, to: str, out: Path) -> None:
+    """Export a dataset to the format of another tool; docs/exporting.md has the conventions of each.
+
+    Parameters
+    ----------
+    directory
+        Folder of a complete dataset.
+    to
+        png16, csv, tum, opencv-yaml, kalibr, colmap, nerfstudio, bop, webdataset, rosbag2, croissant or card.
+    out
+        Folder to write, new or empty; a file for croissant (.json) and card (.md).
+    """
+    from vlcrender import api
+
+    count = api.export_dataset(directory, to, out)
+    print(f"{out}: {to} of {count} frames")
+
+
+@app.command
 def show(scene: str, /, *, out: Path | None = None, reference: Annotated[bool, Parameter(negative=())] = False) -> None:
     """Draw a room's floor plan and a camera's view of it; print how many poses see four LEDs or more, and the flicker.
 

@@ -23,7 +23,7 @@ MANIFEST = "manifest.json"
 """File of a dataset with the digest and size of every other file."""
 DATASET_FILE, JOURNAL, PLAN = "dataset.json", "journal.jsonl", "plan.json"
 """The last file of a dataset. Files of an unfinished one: a line for each frame that is done; what it is made of."""
-NO_PART = (DATASET_FILE, MANIFEST, PLAN, JOURNAL, "scores.json", "report.html")
+NO_PART = (DATASET_FILE, MANIFEST, PLAN, JOURNAL, "scores.json", "report.html", "croissant.json", "README.md")
 """Files in a dataset's folder that its manifest does not list."""
 ESTIMATES = "estimates"
 """Folder in a dataset's folder that `estimator` writes."""

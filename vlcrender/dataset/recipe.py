@@ -15,6 +15,7 @@ from vlcrender.dataset.added_noise import AddedNoise
 from vlcrender.dataset.auto_exposure import Metering, NoiseLevelMetering
 from vlcrender.dataset.belief import Belief
 from vlcrender.dataset.file_settings import FileSettings
+from vlcrender.dataset.licence import Licence
 from vlcrender.dataset.motion import Motion
 from vlcrender.dataset.pose_sampling import Aim, Poses
 from vlcrender.dataset.sweep import SweepTable
@@ -44,6 +45,8 @@ class Recipe(Settings):
     """Name of the dataset."""
     description: str = ""
     """One line about the dataset."""
+    licence: Licence | None = None
+    """Licence of the dataset, an SPDX expression such as "CC-BY-4.0"; not stated where not given."""
     scene: str
     """Path of the scene file, relative to the recipe's folder, or the name of a packaged scene."""
     seed: Annotated[int, Field(ge=0, lt=2**63)]

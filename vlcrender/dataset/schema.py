@@ -350,6 +350,8 @@ class DatasetFile(Settings):
     """Where not given, as the default: sets made before it was stated."""
     summary: Summary | None = None
     """None in sets made before it was stated."""
+    licence: str | None = None
+    """SPDX licence expression of the recipe; None where not stated."""
     provenance: dict[str, Any]
     manifest_sha256: str | None = None
     """SHA-256 of manifest.json; None in a set that was made before there were manifests."""

@@ -359,6 +359,7 @@ def write_dataset(plan: Plan, directory: Path, provenance: dict[str, Any], recor
         room_m=scene.settings.room.size_m,
         files=FilesEntry(format=recipe.files.format),
         summary=summary_of(recipe, records(), directory, plan.warnings),
+        licence=recipe.licence,
         provenance=provenance,
         manifest_sha256=manifest_sha256,
     )
