@@ -6,6 +6,7 @@ import random
 import re
 import shutil
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import polars as pl
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from conftest import sealed
 
 from estimator.errors import InputError as ReaderError
 from estimator.io.dataset import read_dataset, read_frame
@@ -30,7 +32,10 @@ TABLES = ("frames.parquet", "truth.parquet")
 
 @pytest.fixture(scope="module")
 def good(rendered_set: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The first two frames of the rendered set, with a rolling shutter, uncertain luminaires and codes stated."""
+    """The first two frames of the rendered set, with uncertain luminaires and codes stated, and without a recipe.
+
+    The checks of values are those that need no recipe.
+    """
     folder = tmp_path_factory.mktemp("checks") / "set"
     shutil.copytree(rendered_set, folder)
     for name in TABLES:
@@ -38,6 +43,7 @@ def good(rendered_set: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     def change(tree: Tree) -> None:
         tree["frame_count"] = 2
+        del tree["provenance"]["recipe"]
         ids = [led["id"] for led in tree["led_map"][:2]]
         one = {"send": "code", "chip_us": 25.0, "depth": 1.0, "clock_error": 1e-4, "leds": ids, "codes": ["01", "10"]}
         tree["downlink"] = {"demodulation": "given", "transmitters": [one]}
@@ -75,8 +81,10 @@ def change_image(folder: Path, header: Tree, channels: dict[str, Any]) -> None:
 
 
 def verdict_of_verify(folder: Path) -> str | None:
-    """The first problem, None for a valid dataset."""
+    """The first problem, None for a valid dataset; with a new seal, since the files were changed on purpose."""
     try:
+        with suppress(InputError, ValueError):  # of a dataset.json that cannot be read, or written as JSON
+            sealed(folder)
         return next(iter(verify(folder)), None)
     except InputError as error:
         return str(error)
@@ -395,6 +403,8 @@ VERIFY_ALONE = {
     r"dataset\.json/led_map(/\d+(/(id|position_m|luminaire)(/\d)?)?)?": "the true poses put LEDs at their pixels",
     r"dataset\.json/(downlink|gyroscope)(/.*)?": "the scene of the provenance tells what LEDs send",
     r"frames\.parquet/(start_s|burst|shot|pose|device|accelerometer_m_s2)": "the recipe tells times and devices",
+    r"dataset\.json/(summary|licence|manifest_sha256|seal|withheld)(/.*)?": "readers do not use it",
+    r"frames\.parquet/(exposure_s|camera)": "the header of a frame's file states it",
     r"truth\.parquet/.*": "readers take of the truth what scores need",
 }
 """Places where verify, which has the recipe and the truth, may refuse what readers accept, with the reason."""

@@ -78,7 +78,7 @@ def sealed_problems(
     devices: Sequence[DeviceTruthRow] | None, built: Sequence[MapTruthRow], dataset: DatasetFile
 ) -> list[str]:
     """Rows of the sealed tables that are missing, repeated or out of order. A table without rows has a line already."""
-    belief = dataset.provenance["recipe"].get("belief") or {"devices": 0, "maps": 1}
+    belief = (dataset.provenance.get("recipe") or {}).get("belief") or {"devices": 0, "maps": 1}
     problems = []
     expected = [(device, camera) for device in range(belief["devices"]) for camera in dataset.cameras]
     if devices and [(row.device, row.camera) for row in devices] != expected:
@@ -120,9 +120,9 @@ def device_problems(
 
 
 def waves_of(dataset: DatasetFile, map_number: int) -> dict[int, Wave]:
-    """The waves of a map's LEDs, from the scene and the seed."""
-    transmitters = _transmitters_of(dataset)
-    return led_waves(transmitters, int(dataset.provenance["recipe"]["seed"]), map_number) if transmitters else {}
+    """The waves of a map's LEDs, from the scene and the seed; none where the provenance states no recipe."""
+    transmitters, recipe = _transmitters_of(dataset), dataset.provenance.get("recipe")
+    return led_waves(transmitters, int(recipe["seed"]), map_number) if transmitters and recipe else {}
 
 
 def _transmitters_of(dataset: DatasetFile) -> tuple[Transmitter, ...]:

@@ -8,7 +8,7 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 from types import UnionType
-from typing import Any, Union, get_args, get_origin
+from typing import Annotated, Any, Union, get_args, get_origin
 
 from vlcrender.config.toml_model import Settings
 from vlcrender.core.digest import sha256_of
@@ -123,8 +123,9 @@ def _field(table: str, column: str, annotation: Any) -> dict[str, Any] | None:
     """A column of numbers, text, or lists of numbers; None for lists of structures."""
     if get_origin(annotation) in (Union, UnionType):
         (annotation,) = (one for one in get_args(annotation) if one is not type(None))
+    annotation = _plain(annotation)
     repeated = get_origin(annotation) is tuple
-    item = get_args(annotation)[0] if repeated else annotation
+    item = _plain(get_args(annotation)[0]) if repeated else annotation
     if item not in TYPES:
         return None
     return {
@@ -135,3 +136,8 @@ def _field(table: str, column: str, annotation: Any) -> dict[str, Any] | None:
         **({"repeated": True} if repeated else {}),
         "source": {"fileObject": {"@id": f"{table}.parquet"}, "extract": {"column": column}},
     }
+
+
+def _plain(annotation: Any) -> Any:
+    """A type without its limits."""
+    return get_args(annotation)[0] if get_origin(annotation) is Annotated else annotation
