@@ -13,7 +13,7 @@ from pydantic import Field, Strict, model_validator
 from estimator.errors import InputError
 from estimator.io.atomic import write_atomically
 from estimator.io.device import Identity
-from estimator.io.records import Covariance, LedId, Number, Row, Triple, read_rows
+from estimator.io.records import Covariance, LedId, Number, Row, Size, Triple, read_rows
 
 COLUMNS = {
     "frame": pa.int64(),
@@ -38,6 +38,11 @@ COLUMNS = {
     ),
 }
 
+SPOT_COLUMNS = {
+    "spots": pa.list_(pa.struct([("led", pa.int64()), *((name, pa.float64()) for name in ("u_px", "v_px", "snr"))])),
+}
+"""Null where the run states no spots; files without the column are such."""
+
 # Most file systems allow names of 255 bytes; the name of the temporary file is longer than the variant's.
 NAME = r"[A-Za-z0-9][A-Za-z0-9._:=,+-]{0,199}"
 NAME_RULE = "at most 200 of A-Z a-z 0-9 . _ : = , + -, a letter or digit first"
@@ -50,11 +55,21 @@ class LedRange(Row):
     range_m: Number
 
 
+class FoundSpot(Row):
+    """Identified spot: centroid, continuous pixels, and signal to noise of its brightest pixel; None where unknown."""
+
+    led: LedId
+    u_px: Number
+    v_px: Number
+    snr: Size | None
+
+
 class EstimateRow(Row):
     """Estimate of one frame: a world position in metres, or `failed` and a reason `stage: what went wrong`.
 
     `covariance_m2` is the covariance of the position, row by row, if the variant reports one. `identities` are the LED
-    images that the receiver found, decoded or not; None where identities are given.
+    images that the receiver found, decoded or not; None where identities are given. `spots` are those that were found
+    and identified, the same for every variant; None where they are not stated.
     """
 
     frame: int = Field(ge=0)
@@ -66,6 +81,7 @@ class EstimateRow(Row):
     covariance_m2: Covariance | None = None
     ambiguous: bool = False
     identities: Annotated[tuple[Identity, ...], Strict(False)] | None = None
+    spots: Annotated[tuple[FoundSpot, ...], Strict(False)] | None = None
 
     @model_validator(mode="after")
     def _status_fits(self) -> "EstimateRow":
@@ -86,7 +102,7 @@ def write_estimates(folder: Path, variant: str, rows: Sequence[EstimateRow]) -> 
     """Write a variant's rows, replacing an older file atomically; returns the path. Raises InputError, OSError."""
     path = estimates_path(folder, variant)
     path.parent.mkdir(exist_ok=True)
-    schema = pa.schema(list(COLUMNS.items()))
+    schema = pa.schema([*COLUMNS.items(), *SPOT_COLUMNS.items()])
     buffer = io.BytesIO()
     pq.write_table(pa.Table.from_pylist([row.model_dump() for row in rows], schema), buffer)
     write_atomically(path, buffer.getvalue())
@@ -95,7 +111,7 @@ def write_estimates(folder: Path, variant: str, rows: Sequence[EstimateRow]) -> 
 
 def read_estimates(path: Path, frame_count: int) -> tuple[EstimateRow, ...]:
     """Read one variant's rows; raises InputError if they are damaged or not one a frame, in order."""
-    rows = read_rows(path, COLUMNS, EstimateRow)
+    rows = read_rows(path, COLUMNS, EstimateRow, SPOT_COLUMNS)
     if [row.frame for row in rows] != list(range(frame_count)):
         raise InputError(f"{path}: {len(rows)} rows, needed one for each of the {frame_count} frames, in order")
     return rows

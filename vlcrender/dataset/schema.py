@@ -336,6 +336,15 @@ class MapDatumEntry(Settings):
     scale_sigma_ppm: float
 
 
+class NamesEntry(Settings):
+    """Names of the presets that the recipe names; None for a table without one."""
+
+    camera: str | None = None
+    sensor: str | None = None
+    accelerometer: str | None = None
+    belief: str | None = None
+
+
 class DatasetFile(Settings):
     """dataset.json."""
 
@@ -353,6 +362,7 @@ class DatasetFile(Settings):
     map_datum: MapDatumEntry | None
     downlink: DownlinkEntry | None
     room_m: Triple
+    names: NamesEntry
     provenance: dict[str, Any]
 
 

@@ -25,6 +25,7 @@ from vlcrender.dataset.schema import (
     FrameRecord,
     FrameRow,
     MapTruthRow,
+    NamesEntry,
     SensorEntry,
     TruthRow,
     accelerometer_entry,
@@ -243,6 +244,7 @@ def _finish(plan: Plan, directory: Path, provenance: dict[str, Any], places: dic
         map_datum=None if sigmas is None else map_datum_entry(sigmas),
         downlink=downlink_entry(scene.leds, recipe.demodulation),
         room_m=scene.settings.room.size_m,
+        names=NamesEntry.model_validate(plan.presets),
         provenance=provenance,
     )
     write_json(directory / "dataset.json", dataset.model_dump(mode="json"))
