@@ -11,6 +11,7 @@ from pydantic import BaseModel, Field, ValidationError, model_validator
 from estimator.errors import InputError
 from estimator.evaluate.entry import MadeBy, VariantEntry, entry_of
 from estimator.evaluate.frame_score import FrameScore, Position, frame_columns, frame_row, score_frame
+from estimator.evaluate.frames import FramePose, bound_quantiles_m, frame_poses
 from estimator.evaluate.identities import IdentityScore, score_identities
 from estimator.evaluate.statistics import (
     AgainstBound,
@@ -95,6 +96,8 @@ class Scores(Row):
     room_m: tuple[Positive, Positive, Positive] | None
     led_map: tuple[AnyLed, ...]
     made_by: MadeBy | None = None
+    bound_quantiles_m: tuple[Size, ...] | None = None
+    frames: tuple[FramePose, ...] = ()
     variants: tuple[VariantScore, ...]
 
     @model_validator(mode="after")
@@ -346,6 +349,8 @@ def score(directory: str | Path) -> Scores:
         room_m=dataset.room_m,
         led_map=tuple(dataset.leds.values()),
         made_by=MadeBy.here(),
+        bound_quantiles_m=bound_quantiles_m(truth),
+        frames=frame_poses(dataset.frames, truth),
         variants=tuple(variants),
     )
     write_atomically(folder / "scores.json", scores.model_dump_json(indent=1).encode() + b"\n")
