@@ -104,6 +104,7 @@ def answer_rows(variants: Sequence[VariantScore], diag_m: float) -> list[AnswerR
         median_m, p95_m = _of_all(one)
         of_none = math.inf if one.frames else None
         interval, ratio, nees = one.median_interval, one.ratio_to_bound, one.nees
+        beyond = one.error_3d is not None and one.error_3d.rmse_m > diag_m
         has_limits = ratio is not None and ratio.low is not None and ratio.high is not None
         rows.append(
             AnswerRow(
@@ -114,8 +115,10 @@ def answer_rows(variants: Sequence[VariantScore], diag_m: float) -> list[AnswerR
                 interval_m=None if interval is None or one.failed else (interval.low_m, interval.high_m),
                 p95=cell(p95_m, of_none),
                 max=cell(None if one.error_3d is None else one.error_3d.max_m),
-                ratio="" if ratio is None else three(ratio.rms),
-                ratio_interval=f"{three(ratio.low or 0)} to {three(ratio.high or 0)}" if ratio and has_limits else "",
+                ratio="" if ratio is None else "out" if beyond else three(ratio.rms),
+                ratio_interval=f"{three(ratio.low or 0)} to {three(ratio.high or 0)}"
+                if ratio and has_limits and not beyond
+                else "",
                 verdict="" if nees is None else verdict_of(nees),
                 nees="" if nees is None else three(nees.mean),
                 nees_interval="" if nees is None else f"{three(nees.low)} to {three(nees.high)}",
@@ -186,7 +189,9 @@ def lede(scores: Scores, variants: Sequence[VariantScore]) -> Markup:
     failing = [one for one in variants if one.failed]
     if not failing:
         return text + Markup("No frame failed.")
-    return text + Markup("{} of {} variants failed on frames.").format(len(failing), len(variants))
+    words = [f"{one.variant} {one.failed}" for one in failing[:3]]
+    more = f" and {len(failing) - 3} variants more" if len(failing) > 3 else ""
+    return text + Markup("Failed frames: {}{}, of {}.").format(", ".join(words), more, frames)
 
 
 def failure_rows(variants: Sequence[VariantScore]) -> list[tuple[VariantScore, Markup, list[tuple[str, int]]]]:
@@ -202,6 +207,5 @@ def failure_rows(variants: Sequence[VariantScore]) -> list[tuple[VariantScore, M
 
 
 def kind_of(reason: str) -> str:
-    """A reason without its details: `stage: what went wrong`, with N for numbers."""
-    stage, _, rest = reason.partition(": ")
-    return re.sub(r"\d+(\.\d+)?", "N", f"{stage}: {rest.partition(': ')[0].partition(';')[0]}" if rest else stage)
+    """A reason up to its first semicolon, with N for numbers."""
+    return re.sub(r"(?<!\w)\d+(\.\d+)?", "N", reason.partition(";")[0])

@@ -79,7 +79,7 @@
       const lists = set.variants.map((variant) => variant.sorted).filter((list) => list.length);
       const range = Axes.limits(lists, diagonal);
       Pictures.stripHead(find(".strip.head"), range);
-      for (const row of all("tr[data-variant]", article)) {
+      for (const row of all(".answer tr[data-variant]", article)) {
         Pictures.strip(one(".strip", row), set, set.variants.find((variant) => variant.name === row.dataset.variant), range);
       }
     }
@@ -159,19 +159,21 @@
     /** Table of the chosen variant's errors along each axis. */
     function axes() {
       const errors = state.chosen.errors.filter(Array.isArray);
+      let any = false;
       const rows = [["x", 0], ["y", 1], ["z, up", 2]].map(([name, axis]) => {
         const along = errors.map((error) => error[axis]);
         if (along.length < 2) return html("tr", null, html("th", { scope: "row" }, name), html("td", { colspan: 3 }, "–"));
         const [mean, spread] = [Numbers.mean(along), Numbers.spread(along)];
         // Beyond 2.58 standard errors, 99 %, for each axis by itself.
         const biased = Math.abs(mean) > (2.58 * spread) / Math.sqrt(along.length);
+        any = any || biased;
         const cells = [Numbers.three(inUnit(Numbers.median(along.map(Math.abs)))), `${Numbers.signed(inUnit(mean))}${biased ? " *" : ""}`, Numbers.three(inUnit(spread))];
         return html("tr", null, html("th", { scope: "row" }, name), ...cells.map((cell) => html("td", null, cell)));
       });
       const heads = ["median size", "mean (bias)", "spread (1 σ)"].map((head) => html("th", { scope: "col" }, head));
       const caption = html("caption", { class: "note" }, `Where the error of ${state.chosen.name} lies, ${state.unit}; ${errors.length} frames`);
       find(".axes").replaceChildren(caption, html("thead", null, html("tr", null, html("td", { class: "l" }), ...heads)), html("tbody", null, ...rows));
-      find(".biased").replaceChildren("* further from zero than chance explains (99 %, each axis by itself).");
+      find(".biased").replaceChildren(any ? "* further from zero than chance explains (99 %, each axis by itself)." : "");
     }
 
     const MEASURES = [
@@ -278,7 +280,7 @@
         const drawn = outlines(number, camera);
         const flat = set.spots[number] || [];
         const used = new Map();
-        for (let index = 0; index < flat.length; index += 3) used.set(flat[index], [flat[index + 1] / 100, flat[index + 2] / 100]);
+        for (let index = 0; index < flat.length; index += 3) used.set(flat[index], [flat[index + 1] / 1000, flat[index + 2] / 1000]);
         const overlay = svg("svg", { viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": `LEDs of frame ${number}` });
         drawn.forEach((led, index) => {
           if (!led) return;
@@ -294,7 +296,7 @@
         parts.push(overlay);
       } else {
         const flat = set.spots[number] || [];
-        for (let index = 0; index < flat.length; index += 3) offsets.push([flat[index + 1] / 100, flat[index + 2] / 100]);
+        for (let index = 0; index < flat.length; index += 3) offsets.push([flat[index + 1] / 1000, flat[index + 2] / 1000]);
       }
       box.replaceChildren(...parts);
       const words = [];

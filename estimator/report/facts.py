@@ -9,7 +9,7 @@ from typing import Any
 
 from estimator.evaluate.entry import MadeBy
 from estimator.evaluate.score import Scores
-from estimator.report.numbers import THIN, length, three
+from estimator.report.numbers import THIN, brief, length
 
 DIGEST_DIGITS = 12
 LENS_BLUR = {"none": "no blur", "diffraction": "blurred by diffraction", "measured": "with a measured blur"}
@@ -57,8 +57,8 @@ def digest(folder: Path) -> str:
 
 
 def span(values: Sequence[float], unit: str = "") -> str:
-    """Range of some numbers, three digits: `4 to 16`; one number where they agree."""
-    low, high = three(min(values)), three(max(values))
+    """Range of some numbers, `4 to 16`; one number where they agree."""
+    low, high = brief(min(values)), brief(max(values))
     return f"{low}{unit}" if low == high else f"{low} to {high}{unit}"
 
 
@@ -152,9 +152,9 @@ def _sensor(description: Mapping[str, Any], scores: Scores) -> str:
     one = description["sensor"]
     parts = [f"{one['bits']} bit"]
     if one["gain_e_per_dn"] is not None:
-        parts += [f"{three(one['gain_e_per_dn'])} e⁻/DN", f"full well {three(one['full_well_e'])} e⁻"]
+        parts += [f"{brief(one['gain_e_per_dn'])} e⁻/DN", f"full well {brief(one['full_well_e'])} e⁻"]
     if one["noise"] == "full":
-        parts += [f"read noise {three(one['read_noise_e'])} e⁻", f"uneven response {three(100 * one['prnu'])} %"]
+        parts += [f"read noise {brief(one['read_noise_e'])} e⁻", f"uneven response {brief(100 * one['prnu'])} %"]
     else:
         parts.append({"none": "no noise", "shot": "shot noise alone"}.get(one["noise"], str(one["noise"])))
     rolling = any(camera["shutter"]["kind"] == "rolling" for _, camera in _cameras(description))
@@ -179,7 +179,7 @@ def _accelerometer(description: Mapping[str, Any], scores: Scores) -> str:
     if one is None:
         return "none"
     errors_deg = [error for frame in scores.frames if (error := frame.gravity_error_deg) is not None]
-    mean = f"; here {three(sum(errors_deg) / len(errors_deg))}° off on average" if errors_deg else ""
+    mean = f"; here {brief(sum(errors_deg) / len(errors_deg))}° off on average" if errors_deg else ""
     return f"{one['error_deg']:g}° (1 σ) on each tilt{mean}{_preset(description, 'accelerometer')}"
 
 
@@ -194,14 +194,14 @@ def _told(description: Mapping[str, Any], scores: Scores) -> str:
     sigmas = {name: sigma for one in known for name, sigma in zip(one["parameters"], _rms(one), strict=True)}
     if not any(sigmas.values()) and datum is None and not luminaires:
         return "camera, lens and LED map exactly as rendered; not the brightness of the LEDs"
-    parts = [f"focal length to {three(100 * sigmas['focal'])} %, image centre to {three(sigmas['cx_px'])} px"]
+    parts = [f"focal length to {brief(100 * sigmas['focal'])} %, image centre to {brief(sigmas['cx_px'])} px"]
     if luminaires:
         parts.append(f"luminaires to {length(max(max(one['sigma_m']) for one in luminaires))}")
     within = [max(led.sigma_m) for led in scores.led_map if led.sigma_m is not None]
     if within:
         parts.append(f"LEDs within them to {length(max(within))}")
     if datum is not None:
-        parts.append(f"map as a whole to {length(max(datum['sigma_m']))} and {three(datum['scale_sigma_ppm'])} ppm")
+        parts.append(f"map as a whole to {length(max(datum['sigma_m']))} and {brief(datum['scale_sigma_ppm'])} ppm")
     return "1 σ: " + "; ".join(parts) + preset
 
 

@@ -19,6 +19,12 @@ def three(value: float) -> str:
     return f"{rounded:.{min(2 - decade, MAX_DECIMALS)}f}"
 
 
+def brief(value: float) -> str:
+    """A number to three digits without zeros at its end: `20`, `0.102`."""
+    text = three(value)
+    return text.rstrip("0").rstrip(".") if "." in text else text
+
+
 def length(size_m: float) -> str:
     """A length in its own unit: `2.04 µm`."""
     fitting = [unit for unit, unit_m in UNITS.items() if abs(float(f"{size_m:.2e}")) >= unit_m]

@@ -125,7 +125,7 @@ def _shown(variants: Sequence[VariantScore]) -> list[bool]:
 
 
 def _spots(folder: Path, scores: Scores, dataset: Dataset, frames: Sequence[int]) -> dict[int, list[int]]:
-    """Spots of each frame: index of the LED, and offset (u, v) from the image of its centre, hundredths of a pixel.
+    """Spots of each frame: index of the LED, and offset (u, v) from the image of its centre, thousandths of a pixel.
 
     The image is that by the camera and map of the device at the true pose.
     """
@@ -147,7 +147,7 @@ def _spots(folder: Path, scores: Scores, dataset: Dataset, frames: Sequence[int]
             off_px = np.array([(spot.u_px, spot.v_px) for spot in known]) - camera.to_pixels(image)
             for place, (du_px, dv_px) in zip(places, off_px, strict=True):
                 if np.isfinite(du_px + dv_px):
-                    flat += [place, round(100 * du_px), round(100 * dv_px)]
+                    flat += [place, round(1000 * du_px), round(1000 * dv_px)]
         budget -= len(str(flat))
         if budget < 0:
             break

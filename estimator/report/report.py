@@ -17,7 +17,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from estimator.errors import InputError
-from estimator.evaluate.levels import levels_of, variants_of
+from estimator.evaluate.levels import levels_of
 from estimator.evaluate.score import Scores, VariantScore
 from estimator.evaluate.score_table import (
     GROUP_HEADERS,
@@ -49,7 +49,6 @@ from estimator.report.levels import level_plot
 from estimator.report.looks import look_key
 from estimator.report.numbers import UNITS, three
 from estimator.report.page_data import page_data, script_json
-from estimator.report.svg import style_of_variants
 from estimator.report.thumbnail import thumbnail
 
 SCRIPTS = ("numbers.js", "axes.js", "pictures.js", "browser.js")
@@ -111,12 +110,11 @@ def page(datasets: Sequence[tuple[Path, Scores]]) -> str:
 
     Raises OSError or InputError if a preview cannot be read.
     """
-    plot, level_style = _levels(datasets)
-    style = _file("report.css") + level_style
+    style = _file("report.css")
     script = "\n".join(map(_file, SCRIPTS))
     return TEMPLATES.get_template("report.html").render(
         sections=[_section(f"set{index}", folder, scores) for index, (folder, scores) in enumerate(datasets)],
-        level_plot=Markup(plot),
+        level_plot=Markup(_levels(datasets)),
         style=Markup(style),
         script=Markup(script),
         policy=content_policy(style, script),
@@ -184,10 +182,10 @@ def _tables(variants: Sequence[VariantScore]) -> list[Table]:
     ]
 
 
-def _levels(datasets: Sequence[tuple[Path, Scores]]) -> tuple[str, str]:
-    """Plot of the levels and its style; empty unless there are several datasets and all have a bound."""
+def _levels(datasets: Sequence[tuple[Path, Scores]]) -> str:
+    """Plot of the levels; empty unless there are several datasets and all have a bound."""
     try:
         levels = levels_of(datasets)
     except InputError:
-        return "", ""
-    return (level_plot(levels), style_of_variants(len(variants_of(levels)))) if len(levels) > 1 else ("", "")
+        return ""
+    return level_plot(levels) if len(levels) > 1 else ""
