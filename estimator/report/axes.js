@@ -31,6 +31,12 @@ const Axes = (() => {
   /** Path of a mark of a radius. */
   const markPath = (shape, x, y, radius) => `M${shape.map(([a, b]) => `${fixed(x + a * radius)} ${fixed(y + b * radius)}`).join("L")}z`;
 
+  /** Name of a variant, whose line may break before its options. */
+  function named(name) {
+    const parts = name.split(/(?<=[:,])/).flatMap((part) => [html("wbr"), part]);
+    return html("span", null, ...parts.slice(1));
+  }
+
   /** Mark of a variant before its name. */
   const key = (variant, shapes) =>
     svg("svg", { class: `key ${variant.look}`, viewBox: "0 0 13 13", "aria-hidden": "true" }, svg("path", { class: "mark", d: markPath(shapes[variant.mark], 6.5, 6.5, 4.6) }));
@@ -125,5 +131,5 @@ const Axes = (() => {
     }
   }
 
-  return { svg, html, picture, line, text, markPath, key, axis, decades, steps, plain, limits, canvas, hue, drawMark, fixed };
+  return { svg, html, picture, line, text, markPath, named, key, axis, decades, steps, plain, limits, canvas, hue, drawMark, fixed };
 })();

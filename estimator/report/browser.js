@@ -336,7 +336,7 @@
     function table(number) {
       const heads = ["3D", "horizontal", "height", ...(set.bound ? ["÷ bound"] : []), "ms"];
       const rows = shown().map((variant) => {
-        const name = html("th", { scope: "row" }, Axes.key(variant, set.shapes), variant.name);
+        const name = html("th", { scope: "row" }, Axes.key(variant, set.shapes), Axes.named(variant.name));
         const error = variant.errors[number];
         if (!Array.isArray(error)) {
           return html("tr", null, name, html("td", { class: "failing l wrap", colspan: heads.length }, `failed: ${set.reasons[error]}`));
