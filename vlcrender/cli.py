@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import App, CycloptsError, Parameter
 
 from vlcrender.errors import InputError
+from vlcrender.report.command import report
 
 if TYPE_CHECKING:
     from vlcrender.dataset.error_budget import ErrorBudget
@@ -128,6 +129,9 @@ class _Bar:
         else:
             share = progress.done / progress.total
             self._bar.update(self._light, description=progress.stage, completed=share, visible=share < 1)
+
+
+app.command(report)
 
 
 @app.command
