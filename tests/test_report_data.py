@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from browsing import OVERFLOWING, console, open_browser, show
 from conftest import ROOT, run
 from test_estimator_score import LEDS_M, TRUTH, ok, truths
 
@@ -121,3 +122,16 @@ def test_a_folder_without_a_set_is_refused(tmp_path: Path) -> None:
     finished = run("vlcrender", "report", str(tmp_path))
     assert finished.returncode == 2
     assert "is not a complete dataset" in finished.stderr
+
+
+@pytest.mark.parametrize(("width", "dark"), [(400, False), (1280, True), (1600, False)])
+def test_the_page_of_a_set_is_silent_and_within_the_window(
+    rendered_set: Path, tmp_path: Path, width: int, dark: bool
+) -> None:
+    path = tmp_path / "set.html"
+    path.write_text(page(rendered_set))
+    with open_browser() as browser:
+        show(browser, path, width, dark)
+        assert browser.execute_script(OVERFLOWING) == []
+        assert browser.execute_script("return document.documentElement.scrollWidth") <= width
+        assert console(browser) == []

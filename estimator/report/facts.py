@@ -180,7 +180,7 @@ def _accelerometer(description: Mapping[str, Any], scores: Scores) -> str:
         return "none"
     errors_deg = [error for frame in scores.frames if (error := frame.gravity_error_deg) is not None]
     mean = f"; here {brief(sum(errors_deg) / len(errors_deg))}° off on average" if errors_deg else ""
-    return f"{one['error_deg']:g}° (1 σ) on each tilt{mean}{_preset(description, 'accelerometer')}"
+    return f"{one['error_deg']:.3g}° (1 σ) on each tilt{mean}{_preset(description, 'accelerometer')}"
 
 
 def _told(description: Mapping[str, Any], scores: Scores) -> str:

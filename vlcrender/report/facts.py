@@ -139,7 +139,7 @@ def _accelerometer(contents: Contents) -> str:
     error_deg = contents.dataset.accelerometer.error_deg
     found = contents.gravity_errors_deg()
     here = f"; here {found.mean():.3g}° off on average" if len(found) else ""
-    return f"{error_deg:g}° (1 σ) on each tilt{here}{_preset(contents, 'accelerometer')}"
+    return f"{error_deg:.3g}° (1 σ) on each tilt{here}{_preset(contents, 'accelerometer')}"
 
 
 def _told(contents: Contents) -> str:
