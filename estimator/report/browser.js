@@ -20,6 +20,7 @@
       if (camera.lens) {
         const [k1, k2, k3, p1, p2] = camera.lens;
         const r2 = a * a + b * b;
+        if (camera.fold && r2 >= camera.fold) return null;
         const s = 1 + r2 * (k1 + r2 * (k2 + r2 * k3));
         [a, b] = [a * s + 2 * p1 * a * b + p2 * (r2 + 2 * a * a), b * s + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b];
       }
@@ -28,12 +29,22 @@
     return [fx * a + skew * b + cx, fy * b + cy];
   }
 
+  /** Squared radius at which the image of a lens first folds, infinity if nowhere; nothing beyond it has a pixel. */
+  function foldOf([k1, k2, k3]) {
+    for (let r = 0; r < 20; r += 0.005) {
+      const r2 = r * r;
+      if (1 + r2 * (3 * k1 + r2 * (5 * k2 + r2 * 7 * k3)) <= 0) return r2;
+    }
+    return Infinity;
+  }
+
   const seen = (R, [x, y, z]) => [0, 3, 6].map((row) => R[row] * x + R[row + 1] * y + R[row + 2] * z);
 
   /** Data of a set with what the pictures derive from it. */
   function prepared(article) {
     const set = JSON.parse(one("script.data", article).textContent);
     set.id = article.id;
+    for (const camera of Object.values(set.cameras)) camera.fold = camera.lens ? foldOf(camera.lens) : Infinity;
     set.count = set.frames.true.length;
     for (const variant of set.variants) {
       variant.sizes = variant.errors.map((error) => (Array.isArray(error) ? Math.hypot(...error) : null));

@@ -200,7 +200,7 @@ def _told(description: Mapping[str, Any], scores: Scores) -> str:
     within = [max(led.sigma_m) for led in scores.led_map if led.sigma_m is not None]
     if within:
         parts.append(f"LEDs within them to {length(max(within))}")
-    if datum is not None:
+    if datum is not None and (any(datum["sigma_m"]) or datum["scale_sigma_ppm"]):
         parts.append(f"map as a whole to {length(max(datum['sigma_m']))} and {brief(datum['scale_sigma_ppm'])} ppm")
     return "1 σ: " + "; ".join(parts) + preset
 
