@@ -20,6 +20,7 @@ check: lint
 lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/oxlint --deny-warnings estimator/report
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from html.parser import HTMLParser
@@ -135,7 +136,7 @@ class Page(HTMLParser):
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.sources += [value or "" for name, value in attrs if name in ("src", "href")]
-        if tag not in ("meta", "img"):
+        if tag not in ("meta", "img", "input", "wbr"):
             self.open.append(tag)
 
     def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
@@ -155,15 +156,12 @@ def test_report_is_one_page_that_needs_nothing_else(dataset: Path, tmp_path: Pat
     html = out.read_text()
     page.feed(html)
     assert page.open == []
-    assert len(page.sources) == 6
-    assert all(source.startswith("data:image/png;base64,") for source in page.sources)
-    assert "http" not in html
+    # Pictures are in the data of the scripts; no element of the page itself loads any.
+    assert page.sources == []
+    assert "http" not in re.sub(r"http://www\.w3\.org/2000/svg|http-equiv", "", html)
     assert "synthetic <&>" in page.text
-    assert "synthetic <&>" not in html
-    assert "stereo: no second camera took this shot" in page.text
-    # A dot or a cross for each frame of each variant, in the error plot and in the plans, for both datasets.
-    marks = html.count("<title>") - 1
-    assert marks == 2 * 2 * 3 * len(VARIANTS)
+    assert "synthetic <&>" not in re.sub(r"<script.*?</script>", "", html, flags=re.DOTALL)
+    assert "(needs two cameras)" in page.text
 
 
 def test_a_report_is_the_same_without_the_truth_once_scored(dataset: Path, tmp_path: Path) -> None:

@@ -125,7 +125,7 @@ def first_frame(scores: dict[str, Any]) -> dict[str, Any]:
 SCORES: dict[str, Callable[[dict[str, Any]], Any]] = {
     "not an object": lambda s: [],
     "no version": lambda s: {},
-    "a version to come": lambda s: s | {"version": 5},
+    "a version to come": lambda s: s | {"version": 6},
     "another format": lambda s: s | {"format": "x"},
     "no room": lambda s: s | {"room_m": [0, 1, 1]},
     "frames out of order": lambda s: s["variants"][0]["rows"].reverse(),
@@ -153,7 +153,7 @@ def test_scores_of_an_older_version_are_computed_again(folder: Path) -> None:
     path = folder / "scores.json"
     path.write_text('{"format": "estimator-scores", "version": 3}')
     assert main(["report", str(folder), "--out", str(folder / "x.html")]) == 0
-    assert json.loads(path.read_text())["version"] == 4
+    assert json.loads(path.read_text())["version"] == 5
 
 
 def test_a_missing_row_is_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

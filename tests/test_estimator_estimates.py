@@ -54,6 +54,7 @@ def test_estimates_come_back_as_written_in_the_formats_types(folder: Path) -> No
         "time_s": "double",
         "identities": "list<element: struct<led: int64, u_px: double, v_px: double, correlation: double, "
         "bits: string, position_m: list<element: double>>>",
+        "spots": "list<element: struct<led: int64, u_px: double, v_px: double, snr: double>>",
     }
     assert [entry.name for entry in path.parent.iterdir()] == ["some.parquet"]
 

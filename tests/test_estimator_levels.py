@@ -52,12 +52,17 @@ def test_a_set_without_a_bound_is_refused() -> None:
         levels_of([level("empty")])
 
 
+def place_of(mark: ET.Element) -> tuple[float, float]:
+    x, y = re.findall(r"-?[\d.]+", mark.attrib["transform"])
+    return float(x), float(y)
+
+
 def marks(levels: list[Level]) -> dict[str, tuple[float, float]]:
     """Places of the marks by their titles."""
     root = ET.fromstring(level_picture(levels))
     return {
-        (one.findtext(f"{SVG}title") or ""): (float(one.attrib["cx"]), float(one.attrib["cy"]))
-        for one in root.iter(f"{SVG}circle")
+        (one.findtext(f"{SVG}title") or ""): place_of(one)
+        for one in root.iter(f"{SVG}path")
         if one.find(f"{SVG}title") is not None
     }
 

@@ -1,27 +1,34 @@
-"""The page's parts: marks that tell many variants apart, curves that end where the answers do, the bound in sight."""
+"""The page of scores: its figures are those of the scores, in the order and with the looks that names fix."""
 
+import base64
+import hashlib
+import json
+import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import pytest
+from conftest import ROOT
 from html_text import texts
+from PIL import Image
 from test_estimator_score import LEDS, LEDS_M, TRUTH, failed, ok, truths
 
+from estimator.errors import InputError
+from estimator.evaluate.entry import VariantEntry
+from estimator.evaluate.frame_score import score_frame
 from estimator.evaluate.score import Scores, VariantScore, score_variant
-from estimator.evaluate.score_table import (
-    ERROR_HEADERS,
-    ERROR_NOTE,
-    LOST_HEADERS,
-    LOST_NOTE,
-    error_cells,
-    interval_text,
-)
-from estimator.report.figures import Decades, device_plot, distribution_plot, error_plot
-from estimator.report.report import page
-from estimator.report.svg import COLOURS, DASHES, MARKS, mark, style_of_variants
+from estimator.methods.looks import look_of
+from estimator.report import page_data
+from estimator.report.answer import failure_rows, kind_of, lede, ordered, share_rows
+from estimator.report.numbers import THIN, brief, length, page_unit, three
+from estimator.report.page_data import script_json
+from estimator.report.pictures import frames_first, pictures
+from estimator.report.report import SCRIPTS, page
 
 BOUND = (1e-6, 0.0, 0.0, 0.0, 1e-6, 0.0, 0.0, 0.0, 2e-6)
+FIGURE = re.compile(r'<span class="n" data-m="([^"]+)"><i>([^<]*)</i><b>([^<]*)</b></span>')
 
 
 def scored(
@@ -36,60 +43,118 @@ def scores_of(variants: Sequence[VariantScore]) -> Scores:
     return Scores(dataset="set", room_m=(4.0, 5.0, 3.5), led_map=tuple(LEDS.values()), variants=tuple(variants))
 
 
-def test_28_variants_have_marks_and_curves_of_their_own() -> None:
-    count = len(COLOURS) * len(MARKS)
-    style = style_of_variants(count)
-    looks = set()
-    for index in range(count):
-        (colour,) = re.findall(rf"svg \.v{index} {{ stroke: (#\w+);", style)
-        (dash,) = re.findall(rf"svg \.curve\.v{index} {{ stroke-dasharray: ([^;]+);", style)
-        shape = re.sub(rf"v{index}\b", "", mark(0, 0, 1, index))
-        looks.add((colour, dash, shape))
-        assert (colour, shape) not in [(c, s) for c, d, s in looks if d != dash]
-    assert len(looks) == count
-    assert len(DASHES) == len(MARKS)
+def data_of(html: str) -> dict[str, object]:
+    """The data of the page's first set."""
+    (text, *_) = re.findall(r'<script type="application/json" class="data">(.*?)</script>', html, flags=re.DOTALL)
+    found = json.loads(text)
+    assert isinstance(found, dict)
+    return found
 
 
-def curve_ends(svg: str) -> list[float]:
-    """Shares at which the curves end, from the height of their last step between the first rules (0 and 100 %)."""
-    rules = [float(y) for y in re.findall(r'<line class="rule" x1="72\.0" y1="([\d.]+)"', svg)]
-    bottom, top = max(rules), min(rules)
-    ends = []
-    for path in re.findall(r'<path class="curve v\d+" d="M72 \d+([^"]*)"', svg):
-        steps = [float(y) for y in re.findall(r"V([\d.]+)", path)]
-        ends.append((bottom - steps[-1]) / (bottom - top) if steps else 0.0)
-    return ends
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.0, "0"),
+        (2.0416, "2.04"),
+        (9.996, "10.0"),
+        (99.96, "100"),
+        (999.6, f"1{THIN}000"),
+        (34591.0, f"34{THIN}600"),
+        (-0.01234, "-0.0123"),
+        (1e-12, "0.000000000"),
+    ],
+)
+def test_numbers_have_three_digits(value: float, text: str) -> None:
+    assert three(value) == text
 
 
-def test_a_curve_ends_at_the_success_rate() -> None:
-    """To a tenth of a pixel of 300."""
-    variants = [scored([0.1] * 4), scored([0.1, None, None, 0.2]), scored([None] * 4)]
-    assert curve_ends(distribution_plot(variants)) == pytest.approx([1.0, 0.5, 0.0], abs=1e-3)
+def test_lengths_have_units() -> None:
+    assert [length(size_m) for size_m in (2.04e-6, 9.996e-4, 0.9996, 34.6)] == [
+        f"{number}\u00a0{unit}" for number, unit in (("2.04", "µm"), ("1.00", "mm"), ("1.00", "m"), ("34.6", "m"))
+    ]
+    assert [brief(value) for value in (20.0, 0.102, 100.0)] == ["20", "0.102", "100"]
+    # The largest unit in which the smallest median is 1 or more.
+    assert [page_unit(sizes) for sizes in ([0.5, 3e-3], [3e-6, 1.0], [2.0], [1e-9], [])] == ["mm", "µm", "m", "µm", "m"]
 
 
-def test_the_bound_is_in_both_plots_where_there_is_one() -> None:
-    without, with_bound = scored([0.1, None]), scored([0.1, None], bound_m2=BOUND)
-    assert "bound" not in error_plot([without]) + distribution_plot([without])
-    # A ledge also for the frame that failed: the bound is the frame's.
-    (ledges,) = re.findall(r'<path class="bound" d="([^"]*)"', error_plot([with_bound]))
-    assert ledges.count("h") == 2
-    assert distribution_plot([with_bound]).count('<line class="bound"') == 1
+def test_variants_stand_by_median_then_p95_then_name() -> None:
+    variants = [
+        scored([0.2] * 4, "far"),
+        scored([None] * 3 + [0.1], "failing"),
+        scored([0.1, 0.1, 0.1, 0.9], "wide"),
+        scored([0.1] * 4, "near-b"),
+        scored([0.1] * 4, "near-a"),
+    ]
+    no_sensor = scored([None] * 4, "kim").model_copy(
+        update={"entry": VariantEntry(look=look_of("kim"), inapplicable="needs two cameras")}
+    )
+    first, others = ordered(scores_of([*variants, no_sensor]))
+    assert [one.variant for one in first] == ["near-a", "near-b", "wide", "far", "failing"]
+    assert [one.variant for one in others] == ["kim"]
+    found = texts(page([(Path("a"), scores_of([*variants, no_sensor]))]))
+    assert "(needs two cameras)." in found
 
 
-def test_the_axis_holds_errors_and_bounds_and_no_more_labels_than_fit() -> None:
-    assert Decades.of([scored([0.03, 0.5])]) == Decades(-2, 0)
-    assert Decades.of([scored([0.03, 0.5], bound_m2=BOUND)]) == Decades(-3, 0)
-    assert Decades.of([scored([0.0, None])]) == Decades(-6, -5)
-    assert Decades.of([scored([None])]) == Decades(-3, 0)
-    assert Decades.of([]) == Decades(-3, 0)
-    assert len(Decades(-6, 100).labelled_m()) <= 13
+def test_figures_are_those_of_the_scores() -> None:
+    """In the page's unit, to three digits: median and 95 % of all frames, largest error, shares, bound, NEES."""
+    errors_m = [0.011 * k for k in range(1, 41)]
+    one = scored(errors_m, "x", BOUND)
+    html = page([(Path("a"), scores_of([one, scored([0.5, None] * 20, "y", BOUND)]))])
+    assert one.of_all is not None
+    assert one.error_3d is not None
+    row = html[html.index('<tr role="row" data-variant="x"') :]
+    cells = [(float(m), float(i + b)) for m, i, b in FIGURE.findall(row[: row.index("</tr>")])]
+    expected_m = [one.of_all.median_m, one.of_all.p95_m, one.error_3d.max_m]
+    assert [cell[0] for cell in cells] == expected_m
+    for size_m, shown in cells:
+        assert shown == float(three(size_m / 1e-3))  # the unit is mm: the smallest median is 220 mm
+    assert one.ratio_to_bound is not None
+    assert f">{three(one.ratio_to_bound.rms)}<small>" in row
+    assert one.median_interval is not None
+    assert f'data-lo="{one.median_interval.low_m}" data-hi="{one.median_interval.high_m}"' in row
+    # Of 40 frames, 50, 90 and 99 % are the 20th, 36th and 40th error; of the other variant half failed.
+    shares = {row.name: [cell.size_m for cell in row.sizes] for row in share_rows([one], scores_of([one]))}
+    assert shares["x"] == pytest.approx([errors_m[19], errors_m[35], errors_m[39]])
+    failing = scored([0.5, None] * 20, "y")
+    (of_failing,) = share_rows([failing], scores_of([failing]))
+    assert [cell.size_m for cell in of_failing.sizes] == [pytest.approx(0.5), math.inf, math.inf]
 
 
-@pytest.mark.parametrize(("frames", "step"), [(1, 1), (12, 1), (13, 2), (200, 20), (601, 100)])
-def test_frames_are_numbered_in_round_steps(frames: int, step: int) -> None:
-    svg = error_plot([scored([None] * frames)])
-    numbers = [int(n) for n in re.findall(r'text-anchor="middle">(\d+)</text>', svg)]
-    assert numbers == list(range(0, frames, step))
+def test_errors_beyond_the_room_are_out_and_failed_frames_are_words() -> None:
+    """The diagonal is 7.3 m: 7.2 m is a figure, 7.4 m is out, and no such error has a number in the page's unit."""
+    html = page(
+        [(Path("a"), scores_of([scored([7.2] * 3, "in"), scored([7.4] * 3, "beyond"), scored([None] * 3, "no")]))]
+    )
+    row = {
+        name: html[(start := html.index(f'<tr role="row" data-variant="{name}"')) : html.index("</tr>", start)]
+        for name in ("in", "beyond", "no")
+    }
+    assert len(FIGURE.findall(row["in"])) == 3
+    assert not FIGURE.findall(row["beyond"])
+    assert row["beyond"].count(">out</span>") == 3
+    assert 'title="7.40\u00a0m, more than the room' in row["beyond"]
+    assert row["no"].count(">failed</span>") == 2
+
+
+def test_the_first_sentence_says_who_is_nearest_and_who_failed() -> None:
+    variants = [scored([0.1] * 4, "a"), scored([0.102] * 4, "b"), scored([0.3] * 4, "c"), scored([9.0, None] * 2, "d")]
+    scores = scores_of(variants)
+    text = re.sub("<[^>]*>", "", lede(scores, ordered(scores)[0])).replace("\u00a0", " ")
+    assert text == (
+        "Nearest is a: half of the 4 frames within 100 mm, 95 % within 100 mm. As near: b. Next: c, 300 mm; last: d, "
+        "beyond the room. Failed frames: d 2, of 4."
+    )
+    none = [scored([None, None, 0.1], "a")]
+    assert "No variant answers half of the 3 frames" in lede(scores_of(none), none)
+
+
+def test_reasons_that_differ_in_numbers_are_one() -> None:
+    assert kind_of("identify: no spot within 15.5 px; 3 others") == "identify: no spot within N px"
+    assert kind_of("variant: crashed (up2p)") == "variant: crashed (up2p)"
+    rows = [failed(0, "a: 3 of 4"), failed(1, "a: 2 of 4"), failed(2, "b: x")]
+    one = score_variant("x", rows, truths(3), LEDS_M)
+    ((_, _, kinds),) = failure_rows([one])
+    assert kinds == [("a: N of N", 2), ("b: x", 1)]
 
 
 def test_odd_scores_make_a_page_too(tmp_path: Path) -> None:
@@ -102,139 +167,123 @@ def test_odd_scores_make_a_page_too(tmp_path: Path) -> None:
         [scored([1e99, None]), scored([0.1, 0.1], "y")],
     ):
         html = page([(tmp_path, scores_of(variants))])
-        assert "nan" not in html
-        assert html.count("<table>") == html.count("</table>")
-
-
-def test_the_page_pairs_each_variant_with_the_best_and_says_which(tmp_path: Path) -> None:
-    variants = [scored([0.2, 0.3], "far"), scored([0.1, None], "half"), scored([0.1, 0.1], "near:by=all")]
-    html = page([(tmp_path, scores_of(variants))])
-    assert "Frame by frame against near:by=all" in html
-    (table,) = re.findall(r"Frame by frame.*?<tbody>(.*?)</tbody>", html, flags=re.DOTALL)
-    assert table.count("<tr>") == 2
-    assert "near:" not in table
-
-
-def test_the_table_of_bounds_is_left_out_if_it_is_empty(tmp_path: Path) -> None:
-    title = "Cramér-Rao bound and covariance consistency"
-    assert title not in page([(tmp_path, scores_of([scored([0.1, 0.2])]))])
-    assert title in page([(tmp_path, scores_of([scored([0.1, 0.2], bound_m2=BOUND)]))])
-
-
-def test_the_text_of_a_page_by_hand(tmp_path: Path) -> None:
-    """One frame 100 mm off and one failed, in order: title, scores, failures, the two plots, floor plan."""
-    found = texts(page([(tmp_path, scores_of([scored([0.1, None])]))]))
-    cells = ["1", "1", "50 %", "100 mm", "∞", *["100 mm"] * 6, "0 µm", "–", "100 ms"]
-    row = ["x", *cells]
-    curves = ["x", "0 %", "25 %", "50 %", "75 %", "95 %", "100 %", "100 mm", "1 m", "3D error, share of all frames"]
-    tips = ["frame 0: 100 mm", "frame 1: a: b"]
-    assert found == [
-        "Positioning report: set",
-        "Positioning report",
-        "No frame is dropped: failed frames are counted beside the errors of the others, and count as infinite errors "
-        "in the columns “of all”.",
-        *("set", "2 frames · 1 LEDs · room 4 × 5 × 3.5 m", "Scores", "variant", *ERROR_HEADERS, *row, ERROR_NOTE),
-        *("Failed frames by good LEDs", "variant", *LOST_HEADERS, "x", "1 of 2", *["–"] * 4, LOST_NOTE),
-        *("Failures", "variant", "frames", "reason", "x", "1", "a: b"),
-        *("3D error of each frame", "Crosses: failed frames.", "x", "100 mm", "1 m", "0", "1", "frame", "failed"),
-        *(f"x, {tip}" for tip in tips),
-        *("Distribution of the 3D error", "A curve ends, on the right, at the variant's success rate.", *curves),
-        "Floor plans",
-        "Yellow: LEDs. Rings: true positions. Marks: estimates, joined to the truth. Crosses: failed frames.",
-        *tips,
-        "x",
-    ]
+        body = re.sub(r"<script>.*?</script>", "", html, flags=re.DOTALL)
+        assert not re.findall(r"\b(?:nan|inf|None|Infinity)\b", body)
+        assert html.count("<table") == html.count("</table>")
+        data_of(html)
 
 
 def test_names_and_reasons_are_text_and_never_markup(tmp_path: Path) -> None:
-    """Names of datasets, variants and previews, and reasons, come from files: `<`, `&` and quotes are text."""
-    hostile = """<script>"a"&'b'"""
+    """Names of datasets and variants, and reasons, come from files: `<`, `&` and quotes are text."""
+    hostile = """</script><script>"a"&'b'<!--"""
     variants = [
         score_variant(name, [failed(0, hostile), ok(1, TRUTH)], truths(2), LEDS_M)
         for name in (hostile, f"{hostile}:c,d")
     ]
-    (tmp_path / "previews").mkdir()
-    (tmp_path / "previews/000'<i>.png").write_bytes(b"PNG")
     html = page([(tmp_path, scores_of(variants).model_copy(update={"dataset": hostile}))])
-    assert "<script" not in html
-    assert "<i>" not in html
-    assert """alt="000&#39;&lt;i&gt;" src="data:image/png;base64,UE5H">""" in html
-    found = texts(html)
-    assert f"Positioning report: {hostile}" in found
-    # The set's name once; the first variant's in three tables, two legends and a caption; the reason of either.
-    assert found.count(hostile) == 1 + 6 + 2
-    assert f"Frame by frame against {hostile}" in found
-    assert "frame 000'<i>" in found
-    assert ":<wbr>c,<wbr>d</td>" in html  # lines may break before options
+    # The page's own script elements, the data and the program, and nothing else.
+    assert re.findall(r"<script[^>]*>", html) == ['<script type="application/json" class="data">', "<script>"]
+    assert html.count("</script>") == 2
+    assert "<!--" not in html
+    assert data_of(html)["name"] == hostile
+    assert f"Positioning report: {hostile}" in texts(html)
+    assert ":<wbr>c,<wbr>d" in html  # lines may break before options
 
 
-def test_the_interval_stands_below_its_value(tmp_path: Path) -> None:
-    """Of 20 errors, both median and RMSE have an interval; the cell holds the value and the interval in small type."""
-    variant = scored([0.01 * k for k in range(1, 21)])
-    html = page([(tmp_path, scores_of([variant]))])
-    cells = dict(zip(ERROR_HEADERS, error_cells(variant), strict=True))
-    assert f"<td>{cells['median']}<small>{interval_text(variant.median_interval)}</small></td>" in html
-    assert f"<td>{cells['RMSE']}<small>{interval_text(variant.rmse_interval)}</small></td>" in html
-    assert '<td class="failed">' not in html
+def test_json_in_a_script_element_cannot_end_it() -> None:
+    text = script_json({"a": "</script><!-- & \u2028"})
+    assert not set(text) & set("<>&")
+    assert json.loads(text) == {"a": "</script><!-- & \u2028"}
 
 
-def test_estimates_outside_are_counted_and_previews_limited(tmp_path: Path) -> None:
-    """Of 25 previews 12 are shown, every second. A caption counts the estimates beyond the walls of 4 m x 5 m."""
+def test_the_policy_allows_this_style_and_script_alone() -> None:
+    html = page([(Path("a"), scores_of([scored([0.1])]))])
+    (policy,) = re.findall(r'http-equiv="Content-Security-Policy" content="([^"]*)"', html)
+    policy = policy.replace("&#39;", "'")
+    for name, opening in (("style", "<style>"), ("script", "<script>")):
+        (content,) = re.findall(f"{opening}(.*?)</{name}>", html, flags=re.DOTALL)
+        digest = base64.b64encode(hashlib.sha256(content.encode()).digest()).decode()
+        assert f"{name}-src 'sha256-{digest}'" in policy
+    assert policy.startswith("default-src 'none'")
+    assert "unsafe" not in policy
+    # Nothing that the policy would forbid: no style attribute, no handler, no address.
+    body = re.sub(r"<script>.*?</script>|<style>.*?</style>", "", html, flags=re.DOTALL)
+    assert not re.findall(r"<[^>]*\s(?:style|on\w+|href)=", body)
+    assert "http" not in body.replace("http-equiv", "")
+
+
+def test_more_variants_than_six_show_the_best_of_each_family() -> None:
+    names = ["ml", "gravity-fit", "up2p", "pnp", "ippe", "sqpnp", "huynh2016"]
+    variants = [scored([0.01 * (k + 1)] * 2, name) for k, name in enumerate(names)]
+
+    def shown(some: Sequence[VariantScore]) -> list[str]:
+        data = page_data.page_data(Path("nowhere"), scores_of(some), some, None)
+        return [one["name"] for one in data["variants"] if one["shown"]]
+
+    assert shown(variants) == ["ml", "gravity-fit", "pnp", "huynh2016"]
+    assert shown(variants[:6]) == names[:6]
+
+
+def test_frames_that_a_reader_asks_for_come_first() -> None:
+    """Worst, median and best of each variant: 4, 2, 0 and 0, 3; then the others in halving steps."""
+    a, b = scored([0.1, 0.2, 0.3, 0.4, 0.5, None], "a"), scored([0.9, None, None, 0.1, None, None], "b")
+    first = frames_first([a, b], 6)
+    assert first[:4] == [4, 2, 0, 3]
+    assert sorted(first) == list(range(6))
+
+
+def test_pictures_end_with_their_budget(tmp_path: Path, rng: np.random.Generator) -> None:
     (tmp_path / "previews").mkdir()
-    for k in range(25):
-        (tmp_path / f"previews/{k:06}.png").write_bytes(b"PNG")
-    found = texts(page([(tmp_path, scores_of([scored([0.1, 3.1, -1.1, None])]))]))
-    assert "x · 2 estimates outside the walls" in found
-    assert "12 of 25" in found
-    assert [text for text in found if text.startswith("frame 0000")] == [f"frame {k:06}" for k in range(0, 24, 2)]
+    for k in range(3):
+        noise = rng.integers(0, 255, (90, 120), dtype=np.uint8)
+        Image.fromarray(noise).save(tmp_path / f"previews/{k:06}.png")
+    every = pictures(tmp_path, [2, 0, 1, 7])
+    assert list(every) == [2, 0, 1]
+    assert {aspect for _, aspect in every.values()} == {120 / 90}
+    sizes = [len(text) for text, _ in every.values()]
+    assert list(pictures(tmp_path, [2, 0, 1], sizes[0] + sizes[1])) == [2, 0]
+    assert list(pictures(tmp_path, [2, 0, 1], sizes[0] + sizes[1] - 1)) == [2]
+    (tmp_path / "previews/000000.png").write_bytes(b"PNG")
+    with pytest.raises(InputError, match=r"000000\.png: is no picture"):
+        pictures(tmp_path, [0])
 
 
-def test_failures_stand_out_and_zero_failures_do_not(tmp_path: Path) -> None:
-    """One mark: the cell of the variant that failed once, and neither the header nor the other's 0."""
-    html = page([(tmp_path, scores_of([scored([0.1, None]), scored([0.1, 0.1], "y")]))])
-    assert re.findall(r'<t[dh] class="failed">([^<]*)</t[dh]>', html) == ["1"]
-
-
-def of_devices(errors_m: Sequence[float | None], devices: Sequence[int], name: str = "x") -> VariantScore:
-    """Frames of devices, each in the map of its parity; the covariance is that of 1 mm along each axis."""
-    x, y, z = TRUTH
-    sure = {"covariance_m2": (1e-6, 0.0, 0.0, 0.0, 1e-6, 0.0, 0.0, 0.0, 1e-6)}
-    rows = [
-        failed(k, "a: b") if e is None else ok(k, (x + e, y, z)).model_copy(update=sure) for k, e in enumerate(errors_m)
-    ]
+def thousand_frames(folder: Path, rng: np.random.Generator, variants: int = 3) -> Scores:
+    """Scores of a thousand frames in a room, with pictures of noise, which are large, for a tenth of them."""
+    (folder / "previews").mkdir()
+    for k in range(0, 1000, 10):
+        Image.fromarray(rng.integers(0, 255, (300, 400), dtype=np.uint8)).save(folder / f"previews/{k:06}.png")
     truth = [
-        one.model_copy(update={"map": device % 2})
-        for one, device in zip(truths(len(rows), BOUND), devices, strict=True)
+        row.model_copy(update={"position_m": tuple(rng.uniform(0.5, 3.5, 3).tolist())}) for row in truths(1000, BOUND)
     ]
-    return score_variant(name, rows, truth, LEDS_M, devices)
+    scores = []
+    for k in range(variants):
+        places = [np.array(row.position_m) + rng.normal(0, 0.01 * (k + 1), 3) for row in truth]
+        rows = [ok(frame, tuple(place.tolist())) for frame, place in enumerate(places)]
+        # The summaries are those of the first variant: their bootstraps take most of the time, and no picture has them.
+        first = scores[0] if scores else score_variant("v0", rows, truth, LEDS_M)
+        of_rows = tuple(score_frame(row, true, LEDS_M) for row, true in zip(rows, truth, strict=True))
+        scores.append(first.model_copy(update={"variant": f"v{k}", "rows": of_rows}))
+    return scores_of(scores)
 
 
-def test_devices_are_shown_by_map_with_their_rmse_and_nees() -> None:
-    """Devices 0 and 2 of map 0 stand before device 1 of map 1; a device without an estimate has no mark."""
-    variant = of_devices([1e-3, 2e-3, None, 3e-3], [0, 1, 2, 2])
-    svg = device_plot([variant], nees=False)
-    places = re.findall(r'cx="([\d.]+)"[^>]*><title>x, device (\d), map \d: ([^<]*)<', svg)
-    assert [(device, size) for _, device, size in sorted(places, key=lambda one: float(one[0]))] == [
-        ("0", "1 mm"),
-        ("2", "3 mm"),
-        ("1", "2 mm"),
-    ]
-    assert re.findall(r"device (\d), map \d: ([^<]*)<", device_plot([variant], nees=True)) == [
-        ("0", "1"),
-        ("1", "4"),
-        ("2", "9"),
-    ]
-    assert device_plot([of_devices([None], [0])], nees=True).count("<title>") == 0
-
-
-def test_the_page_shows_devices_levels_and_failures_where_there_are_some() -> None:
-    several = scores_of([of_devices([1e-3, 2e-3, None, 3e-3], [0, 1, 2, 2])])
+def test_the_page_shows_devices_and_levels_where_there_are_some() -> None:
+    x, y, z = TRUTH
+    rows = [ok(k, (x + 1e-3 * (k + 1), y, z)) for k in range(4)]
+    several = scores_of([score_variant("x", rows, truths(4, BOUND), LEDS_M, [0, 1, 2, 2])])
     one = scores_of([scored([0.1, 0.2])])
     html = page([(Path("a"), several)])
-    for title in ("By device and map", "Failed frames by good LEDs"):
-        assert title in html
-        assert title not in page([(Path("a"), one)])
-    assert html.count("device 2, map 0") == 2
-    assert "Error against level" not in html
-    assert "Error against level" in page([(Path("a"), several), (Path("b"), several)])
-    assert "Error against level" not in page([(Path("a"), several), (Path("b"), one)])
+    assert "By device and map" in html
+    assert "By device and map" not in page([(Path("a"), one)])
+    title = "Error against the bound, set by set"
+    assert title not in html
+    assert title in page([(Path("a"), several), (Path("b"), several)])
+    assert title not in page([(Path("a"), several), (Path("b"), one)])
+
+
+def test_the_scripts_and_styles_load_nothing() -> None:
+    for name in (*SCRIPTS, "report.css", "report.html"):
+        text = (ROOT / "estimator/report" / name).read_text()
+        assert not re.findall(r"https?://(?!www\.w3\.org/2000/svg)", text), name
+        assert "innerHTML" not in text, name
+        assert "eval(" not in text, name

@@ -5,7 +5,7 @@ import xml.etree.ElementTree as Tree
 
 import pytest
 
-from estimator.report.svg import COLOURS, MARKS, cross, key, line, mark, picture, text
+from estimator.report.svg import COLOURS, MARKS, cross, line, mark, picture, text
 
 HOSTILE = """<a href="x">&'"""
 
@@ -50,9 +50,3 @@ def test_marks_look_as_large_as_the_disc(shape: int) -> None:
     places = [tuple(map(float, place.split())) for place in drawn.removeprefix("M").removesuffix("z").split("L")]
     expected = [(100 + 10 * x, 50 + 10 * y) for x, y in vertices]
     assert places == [pytest.approx(place) for place in expected]
-
-
-def test_the_key_of_a_variant_is_its_mark() -> None:
-    tree = Tree.fromstring(key(8))
-    assert (tree.get("viewBox"), tree.get("aria-hidden")) == ("0 0 12 12", "true")
-    assert Tree.tostring(tree[0]) == Tree.tostring(Tree.fromstring(mark(6, 6, 4, 8)))

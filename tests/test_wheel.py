@@ -32,7 +32,7 @@ def test_the_wheel_holds_scenes_recipes_format_templates_and_types(wheel: Path) 
             assert {path.suffix for path in files} == set(kinds)  # a file of another kind: has it to be in the wheel?
             for path in files:
                 assert archive.read(f"{PACKAGED}/{folder}/{path.name}") == path.read_bytes()
-    templates = ("estimator/report/report", "vlcrender/emva1288/page")
+    templates = ("estimator/report/report", "vlcrender/emva1288/page", "vlcrender/report/page")
     assert {f"{name}.{kind}" for name in templates for kind in ("html", "css")} <= names
     assert {"vlcrender/py.typed", "estimator/py.typed", "vlcrender/api.py"} <= names
     assert {name.split("/")[0].split("-")[0] for name in names} == {"vlcrender", "estimator"}

@@ -17,6 +17,7 @@ from cyclopts import App, CycloptsError, Parameter
 
 from vlcrender.core.process import INTERRUPTED, ending_at_second_interrupt, prepare_streams
 from vlcrender.errors import InputError
+from vlcrender.report.command import report
 
 if TYPE_CHECKING:
     from vlcrender.dataset.error_budget import ErrorBudget
@@ -110,6 +111,9 @@ def _dry_run(plan: "Plan", workers: int, out: Path) -> None:
     with ProgressDisplay(plan.recipe.name, plan.frame_count) as display:
         found = dry_run(plan, workers, lambda stage, share: display.show(Progress(stage, share, 1.0)))
     print(f"{plan.recipe.name}: dry run, nothing is written in {out}", *found.lines(), sep="\n")
+
+
+app.command(report)
 
 
 @app.command

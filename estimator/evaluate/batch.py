@@ -14,12 +14,13 @@ import numpy as np
 from estimator.errors import EstimationFailure, InputError
 from estimator.io.dataset import Dataset, FrameRecord, read_frame
 from estimator.io.device import DeviceFrame, Identity
-from estimator.io.estimates import EstimateRow, LedRange
+from estimator.io.estimates import EstimateRow, FoundSpot, LedRange
 from estimator.io.led_map import Led
 from estimator.io.records import MAX_NUMBER, is_covariance
 from estimator.io.shared import SharedResults
 from estimator.methods.variant import DeviceMethod, Estimate, Variant
 from estimator.receiver.receive import receive_frames
+from estimator.spots.found import found_spots
 
 ReadFrame = tuple[FrameRecord, DeviceFrame | EstimationFailure]
 """A record, and its frame or why it cannot be used."""
@@ -36,6 +37,7 @@ class Observed:
     value: object | EstimationFailure
     time_s: float
     identities: tuple[Identity, ...] | None = None
+    spots: tuple[FoundSpot, ...] | None = None
     told: Mapping[int, Led] = field(default_factory=dict)
     """LEDs that packets told, where the dataset has no map."""
 
@@ -162,19 +164,32 @@ def _estimate_shot(
         if isinstance(frame, DeviceFrame):
             others = tuple(other for _, other in shot if isinstance(other, DeviceFrame) and other is not frame)
             whole = replace(frame, other_cameras=others)
+        spots = _spots_of(whole)
         for variant in variants:
             if variant.of_device is not None:
                 told = frame.leds if isinstance(frame, DeviceFrame) and not leds else {}
                 observed = _observed(variant.of_device, whole, record)
-                observed = replace(observed, time_s=observed.time_s + received_s, identities=identities, told=told)
+                observed = replace(observed, time_s=observed.time_s + received_s, identities=identities)
+                observed = replace(observed, spots=spots, told=told)
                 result.observed.setdefault(variant.name, []).append(observed)
                 continue
             if isinstance(whole, EstimationFailure):
                 row = _failed(record.frame, whole, leds, time_s=0.0)
             else:
                 row = estimate_frame(variant, whole, record.frame)
-            row = row.model_copy(update={"time_s": row.time_s + received_s, "identities": identities})
+            stated = {"time_s": row.time_s + received_s, "identities": identities, "spots": spots}
+            row = row.model_copy(update=stated)
             result.rows.setdefault(variant.name, []).append(row)
+
+
+def _spots_of(frame: DeviceFrame | EstimationFailure) -> tuple[FoundSpot, ...] | None:
+    """Spots of a frame; None where it cannot be used. A variant that needs them too is charged with their time."""
+    if isinstance(frame, EstimationFailure):
+        return None
+    try:
+        return found_spots(frame)
+    except Exception:  # spots are a statement beside the estimates: no fault in them may end a run
+        return None
 
 
 def estimate_device(dataset: Dataset, observed: Mapping[str, Sequence[Observed]], variants: Sequence[Variant]) -> Rows:
@@ -228,7 +243,7 @@ def _solved(method: DeviceMethod, observed: Sequence[Observed], leds: Mapping[in
             row = _failed(one.frame, failure, known, time_s)
         except (Exception, SystemExit) as error:
             row = _failed(one.frame, _crash(error), known, time_s)
-        rows.append(row.model_copy(update={"identities": one.identities}))
+        rows.append(row.model_copy(update={"identities": one.identities, "spots": one.spots}))
     return rows
 
 

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.errors import InputError
-from estimator.evaluate.score import Position, estimate_paths, read_known, score_frame
+from estimator.evaluate.frame_score import Position, mean_distance_m, score_frame, tilt_deg
+from estimator.evaluate.score import estimate_paths, read_known
 from estimator.io.dataset import Dataset, read_dataset
 from estimator.io.estimates import frames_sha256
 from estimator.io.sweep import dataset_folders
@@ -22,7 +23,7 @@ OF_RECORD = ("shot", "burst", "pose", "device", "camera", "exposure_s", "start_s
 """Columns of frames.parquet that are columns here."""
 OF_SCORE = (
     *("frame", "map", "good_leds", "status", "reason", "error_3d_m", "horizontal_error_m", "vertical_error_m"),
-    *("bound_m", "bound_exact_m", "nees", "ambiguous", "time_s"),
+    *("bound_m", "bound_exact_m", "nees", "ambiguous", "time_s", "spots_found", "snr"),
 )
 """Keys of a frame in scores.json that are columns here."""
 
@@ -115,17 +116,11 @@ def _of_dataset(folder: Path, label: str, variants: Sequence[str] | None) -> dic
 
 def _of_truth(truth: Sequence[TruthRow], leds_m: dict[int, Position]) -> dict[str, Values]:
     positions_m = np.array([row.position_m for row in truth]).reshape(-1, 3)
-    upright = np.array([row.R_cam_world[8] for row in truth])
-    distances_m: Values = []
-    for row in truth:
-        seen_m = [leds_m[led.led] for led in row.leds if led.visible_fraction > 0 and led.led in leds_m]
-        away_m = np.linalg.norm(np.array(seen_m).reshape(-1, 3) - row.position_m, axis=1)
-        distances_m.append(float(away_m.mean()) if seen_m else None)
     return {
         **dict(zip(("x_m", "y_m", "z_m"), positions_m.T.tolist(), strict=True)),
-        "tilt_deg": np.degrees(np.arccos(np.clip(upright, -1, 1))).tolist(),
+        "tilt_deg": [tilt_deg(row) for row in truth],
         "leds": [float(sum(led.visible_fraction > 0 for led in row.leds)) for row in truth],
-        "distance_m": distances_m,
+        "distance_m": [mean_distance_m(row, leds_m) for row in truth],
     }
 
 

@@ -11,6 +11,9 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from estimator.errors import InputError
+from estimator.evaluate.entry import MadeBy, VariantEntry, entry_of
+from estimator.evaluate.frame_score import FrameScore, Position, frame_columns, frame_row, score_frame
+from estimator.evaluate.frames import FramePose, bound_quantiles_m, frame_poses
 from estimator.evaluate.identities import IdentityScore, score_identities
 from estimator.evaluate.sources import sources_of
 from estimator.evaluate.statistics import (
@@ -22,15 +25,16 @@ from estimator.evaluate.statistics import (
     MapScore,
     Nees,
     OfAll,
+    RatioToBound,
     Summary,
     against_bound,
     median_interval,
     nees,
     nees_by_map,
     of_all,
+    ratio_to_bound,
     rmse_interval,
     root_mean_square,
-    squared_in_sigmas,
     summary,
 )
 from estimator.io.atomic import write_atomically
@@ -38,7 +42,7 @@ from estimator.io.dataset import Dataset, read_dataset
 from estimator.io.estimates import EstimateRow, read_estimates
 from estimator.io.led_map import AnyLed
 from estimator.io.lock import locked
-from estimator.io.records import LedId, Number, Positive, Row, Size, Triple
+from estimator.io.records import Positive, Row, Size
 from estimator.io.truth import TruthRow, read_true_map, read_truth
 
 if TYPE_CHECKING:
@@ -46,54 +50,12 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-VERSION = 4
-Position = tuple[float, float, float]
+VERSION = 5
 # Enough for a position without gravity: frames with more are counted with these.
 ENOUGH_LEDS = 4
 
 
 Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
-
-
-class RangeError(Row):
-    """Estimated minus true distance to an LED, metres."""
-
-    led: LedId
-    error_m: Number
-
-
-class FrameScore(Row):
-    """Score of one frame of one variant; positions in world metres. Errors are null for a failed frame.
-
-    `vertical_error_m` is signed, positive is too high. `bound_m` is the root of the trace of the frame's Cramer-Rao
-    bound, null without one, `bound_exact_m` that of a device that knows camera and map exactly; `nees` is `e^T C^-1 e`
-    if the variant reports a covariance C. `good_leds` counts the LEDs whose whole image is on the sensor.
-    """
-
-    frame: int
-    device: int
-    map: int
-    good_leds: int
-    status: Literal["ok", "failed"]
-    reason: str
-    true_m: Triple
-    estimate_m: Triple | None
-    error_3d_m: Size | None
-    horizontal_error_m: Size | None
-    vertical_error_m: Number | None
-    bound_m: Size | None
-    bound_exact_m: Size | None
-    nees: Size | None
-    ambiguous: bool
-    range_errors: tuple[RangeError, ...]
-    time_s: Size
-
-    @model_validator(mode="after")
-    def _status_fits(self) -> "FrameScore":
-        errors = (self.estimate_m, self.error_3d_m, self.horizontal_error_m, self.vertical_error_m)
-        if any((error is None) == (self.status == "ok") for error in errors):
-            raise ValueError("an ok frame has an estimate and errors, a failed one none")
-        return self
 
 
 class VariantScore(Row):
@@ -106,6 +68,7 @@ class VariantScore(Row):
     """
 
     variant: str
+    entry: VariantEntry
     frames: int
     ok: int
     failed: int
@@ -122,6 +85,7 @@ class VariantScore(Row):
     range_error: Summary | None
     against_bound: AgainstBound | None
     against_exact_bound: AgainstBound | None
+    ratio_to_bound: RatioToBound | None
     nees: Nees | None
     nees_by_map: Nees | None
     by_device: tuple[DeviceScore, ...]
@@ -136,12 +100,15 @@ class Scores(Row):
     """Scores of a dataset, the content of scores.json: all that a report needs, including the truth."""
 
     format: Literal["estimator-scores"] = "estimator-scores"
-    version: Literal[4] = 4
+    version: Literal[5] = 5
     sources: dict[str, Sha256] = Field(default_factory=dict)
     """SHA-256 of each file that the scores are made of, by its path below the dataset or its results."""
     dataset: str
     room_m: tuple[Positive, Positive, Positive] | None
     led_map: tuple[AnyLed, ...]
+    made_by: MadeBy | None = None
+    bound_quantiles_m: tuple[Size, ...] | None = None
+    frames: tuple[FramePose, ...] = ()
     variants: tuple[VariantScore, ...]
 
     @model_validator(mode="after")
@@ -187,8 +154,8 @@ class Scores(Row):
             pandas is not installed.
         """
         pd = import_pandas()
-        columns = ["variant", *_frame_columns()]
-        rows = [_frame_row(variant.variant, row) for variant in self.variants for row in variant.rows]
+        columns = ["variant", *frame_columns()]
+        rows = [frame_row(variant.variant, row) for variant in self.variants for row in variant.rows]
         return pd.DataFrame(rows, columns=columns)
 
 
@@ -211,6 +178,7 @@ SUMMARIES: dict[str, type[Row]] = {
     "range_error": Summary,
     "against_bound": AgainstBound,
     "against_exact_bound": AgainstBound,
+    "ratio_to_bound": RatioToBound,
     "nees": Nees,
     "nees_by_map": Nees,
     "downlink": IdentityScore,
@@ -218,7 +186,7 @@ SUMMARIES: dict[str, type[Row]] = {
 """Keys of a variant that hold several values."""
 
 
-LISTS = ("failures", "by_device", "by_map", "by_good_leds", "rows", "by_rows", "by_distance", "by_tilt")
+LISTS = ("entry", "failures", "by_device", "by_map", "by_good_leds", "rows", "by_rows", "by_distance", "by_tilt")
 """Keys of a variant, or of its `downlink`, that hold any number of values, which have no place in a row."""
 
 
@@ -239,28 +207,6 @@ def _summary_row(score: VariantScore | None) -> dict[str, object]:
     return row
 
 
-def _frame_columns() -> list[str]:
-    columns: list[str] = []
-    for field in FrameScore.model_fields:
-        if field in ("true_m", "estimate_m"):
-            columns += [f"{field.removesuffix('_m')}_{axis}_m" for axis in "xyz"]
-        elif field != "range_errors":
-            columns.append(field)
-    return columns
-
-
-def _frame_row(variant: str, row: FrameScore) -> dict[str, object]:
-    values: dict[str, object] = {"variant": variant}
-    for field in FrameScore.model_fields:
-        value = getattr(row, field)
-        if field in ("true_m", "estimate_m"):
-            point = (None, None, None) if value is None else value
-            values |= {f"{field.removesuffix('_m')}_{axis}_m": size for axis, size in zip("xyz", point, strict=True)}
-        elif field != "range_errors":
-            values[field] = value
-    return values
-
-
 def score_variant(
     variant: str,
     estimates: Sequence[EstimateRow],
@@ -268,10 +214,11 @@ def score_variant(
     leds_m: Mapping[int, Position],
     devices: Sequence[int] | None = None,
     downlink: IdentityScore | None = None,
+    entry: VariantEntry | None = None,
 ) -> VariantScore:
     """Score of one variant's rows by the truth of the same frames; all are of one device if `devices` is None.
 
-    `downlink` is the score of its identities.
+    `downlink` is the score of its identities, `entry` what is stated about the variant, by its name if None.
     """
     of_frame = [0] * len(estimates) if devices is None else devices
     rows = tuple(
@@ -288,6 +235,7 @@ def score_variant(
     range_errors_m = [error.error_m for row in rows for error in row.range_errors]
     return VariantScore(
         variant=variant,
+        entry=entry_of(variant) if entry is None else entry,
         frames=len(rows),
         ok=len(good),
         failed=len(rows) - len(good),
@@ -304,6 +252,7 @@ def score_variant(
         range_error=summary(range_errors_m),
         against_bound=_against(good, "bound_m"),
         against_exact_bound=None if _same_bounds(rows) else _against(good, "bound_exact_m"),
+        ratio_to_bound=_ratio_to_bound(good, unsure),
         nees=None if one_device else nees(squares, groups_of(sure)),
         nees_by_map=nees_by_map(squares, groups_of(sure)),
         by_device=_by_device(rows),
@@ -324,6 +273,14 @@ def _against(good: Sequence[FrameScore], field: Literal["bound_m", "bound_exact_
     pairs = [(row.error_3d_m, getattr(row, field)) for row in good]
     both = [(error_m, bound_m) for error_m, bound_m in pairs if error_m is not None and bound_m is not None]
     return against_bound([error_m for error_m, _ in both], [bound_m for _, bound_m in both])
+
+
+def _ratio_to_bound(good: Sequence[FrameScore], unsure: bool) -> RatioToBound | None:
+    """Ratio over the frames with a positive bound; without an interval where none can be made."""
+    some = [row for row in good if row.bound_m]
+    errors_m = [row.error_3d_m for row in some if row.error_3d_m is not None]
+    bounds_m = [row.bound_m for row in some if row.bound_m is not None]
+    return ratio_to_bound(errors_m, bounds_m, None if unsure else groups_of(some))
 
 
 def _same_bounds(rows: Sequence[FrameScore]) -> bool:
@@ -367,45 +324,6 @@ def _by_good_leds(rows: Sequence[FrameScore]) -> tuple[GoodLeds, ...]:
     return tuple(found)
 
 
-def score_frame(estimate: EstimateRow, truth: TruthRow, leds_m: Mapping[int, Position], device: int = 0) -> FrameScore:
-    """Score of one frame: position errors if it has a position, range errors for its ranges to LEDs at `leds_m`."""
-    true_m = np.array(truth.position_m)
-    error = horizontal = vertical = squares = None
-    if estimate.position_m is not None:
-        difference_m = np.array(estimate.position_m) - true_m
-        error, horizontal = float(np.linalg.norm(difference_m)), float(np.linalg.norm(difference_m[:2]))
-        vertical = float(difference_m[2])
-        if estimate.covariance_m2 is not None:
-            squares = squared_in_sigmas(difference_m, estimate.covariance_m2)
-    range_errors = tuple(
-        RangeError(led=r.led, error_m=r.range_m - float(np.linalg.norm(np.array(leds_m[r.led]) - true_m)))
-        for r in estimate.ranges
-    )
-    return FrameScore(
-        frame=estimate.frame,
-        device=device,
-        map=truth.map,
-        good_leds=truth.good_leds,
-        status=estimate.status,
-        reason=estimate.reason,
-        true_m=truth.position_m,
-        estimate_m=estimate.position_m,
-        error_3d_m=error,
-        horizontal_error_m=horizontal,
-        vertical_error_m=vertical,
-        bound_m=_root_of_trace(truth.bound_m2),
-        bound_exact_m=_root_of_trace(truth.bound_exact_m2),
-        nees=squares,
-        ambiguous=estimate.ambiguous,
-        range_errors=range_errors,
-        time_s=estimate.time_s,
-    )
-
-
-def _root_of_trace(covariance_m2: Sequence[float] | None) -> float | None:
-    return None if covariance_m2 is None else float(np.sqrt(covariance_m2[0] + covariance_m2[4] + covariance_m2[8]))
-
-
 def score(directory: str | Path) -> Scores:
     """Compare all estimates of a dataset with the truth, and write scores.json.
 
@@ -445,12 +363,15 @@ def _score(folder: Path) -> Scores:
     for path in paths:
         rows, leds_m = read_known(path, dataset, sources["frames.parquet"])
         downlink = score_identities(rows, truth, dataset, true_map)
-        variants.append(score_variant(path.stem, rows, truth, leds_m, devices, downlink))
+        variants.append(score_variant(path.stem, rows, truth, leds_m, devices, downlink, entry_of(path.stem, dataset)))
     scores = Scores(
         sources=sources,
         dataset=dataset.name,
         room_m=dataset.room_m,
         led_map=tuple(dataset.leds.values()),
+        made_by=MadeBy.here(),
+        bound_quantiles_m=bound_quantiles_m(truth),
+        frames=frame_poses(dataset.frames, truth),
         variants=tuple(variants),
     )
     try:

@@ -60,6 +60,19 @@ class AgainstBound(Row):
     efficiency: Size | None
 
 
+class RatioToBound(Row):
+    """Root mean square of error / bound, frame by frame, over `frames` that succeeded and have a positive bound.
+
+    1 is the bound itself. `low` and `high` are its 95 % interval, null for fewer than two frames. Unlike the efficiency
+    of pooled squares, frames with a large bound do not rule it.
+    """
+
+    frames: int = Field(ge=1)
+    rms: Size
+    low: Size | None
+    high: Size | None
+
+
 class Nees(Row):
     """Covariance consistency: mean of `e^T C^-1 e` over the `frames` that report a covariance C of their error e (3,).
 
@@ -259,6 +272,20 @@ def against_bound(errors_m: Sequence[float], bounds_m: Sequence[float]) -> Again
         bound_rms_m=bound_rms_m,
         rmse_m=rmse_m,
         efficiency=bound_rms_m / rmse_m if rmse_m > 0 else None,
+    )
+
+
+def ratio_to_bound(errors_m: Sequence[float], bounds_m: Sequence[float], groups: Groups | None) -> RatioToBound | None:
+    """Ratio of errors to the positive bounds of the same frames; None without a frame, no interval without groups."""
+    if not errors_m:
+        return None
+    ratios = (np.array(errors_m) / np.array(bounds_m)).tolist()
+    interval = None if groups is None else rmse_interval(ratios, groups)
+    return RatioToBound(
+        frames=len(ratios),
+        rms=float(root_mean_square(np.array(ratios))),
+        low=None if interval is None else interval.low_m,
+        high=None if interval is None else interval.high_m,
     )
 
 

@@ -14,7 +14,7 @@ from pydantic import Field, Strict, model_validator
 from estimator.errors import InputError
 from estimator.io.atomic import write_atomically
 from estimator.io.device import Identity
-from estimator.io.records import Covariance, LedId, Number, Row, Triple, read_metadata, read_rows
+from estimator.io.records import Covariance, LedId, Number, Row, Size, Triple, read_metadata, read_rows
 
 COLUMNS = {
     "frame": pa.int64(),
@@ -39,6 +39,10 @@ COLUMNS = {
     ),
 }
 
+SPOT_COLUMNS = {
+    "spots": pa.list_(pa.struct([("led", pa.int64()), *((name, pa.float64()) for name in ("u_px", "v_px", "snr"))])),
+}
+"""Null where the run states no spots; files without the column are such."""
 FRAMES_SHA256 = "frames_sha256"
 """Key of the file's metadata with the SHA-256 of the dataset's frames.parquet."""
 
@@ -54,11 +58,21 @@ class LedRange(Row):
     range_m: Number
 
 
+class FoundSpot(Row):
+    """Identified spot: centroid, continuous pixels, and signal to noise of its brightest pixel; None where unknown."""
+
+    led: LedId
+    u_px: Number
+    v_px: Number
+    snr: Size | None
+
+
 class EstimateRow(Row):
     """Estimate of one frame: a world position in metres, or `failed` and a reason `stage: what went wrong`.
 
     `covariance_m2` is the covariance of the position, row by row, if the variant reports one. `identities` are the LED
-    images that the receiver found, decoded or not; None where identities are given.
+    images that the receiver found, decoded or not; None where identities are given. `spots` are those that were found
+    and identified, the same for every variant; None where they are not stated.
     """
 
     frame: int = Field(ge=0)
@@ -70,6 +84,7 @@ class EstimateRow(Row):
     covariance_m2: Covariance | None = None
     ambiguous: bool = False
     identities: Annotated[tuple[Identity, ...], Strict(False)] | None = None
+    spots: Annotated[tuple[FoundSpot, ...], Strict(False)] | None = None
 
     @model_validator(mode="after")
     def _status_fits(self) -> "EstimateRow":
@@ -107,7 +122,8 @@ def write_estimates(folder: Path, variant: str, rows: Sequence[EstimateRow], dig
     """
     path = estimates_path(folder, variant)
     path.parent.mkdir(exist_ok=True)
-    schema = pa.schema(list(COLUMNS.items()), {FRAMES_SHA256: digest or frames_sha256(folder)})
+    columns = [*COLUMNS.items(), *SPOT_COLUMNS.items()]
+    schema = pa.schema(columns, {FRAMES_SHA256: digest or frames_sha256(folder)})
     buffer = io.BytesIO()
     pq.write_table(pa.Table.from_pylist([row.model_dump() for row in rows], schema), buffer)
     write_atomically(path, buffer.getvalue())
@@ -130,7 +146,7 @@ def read_estimates(path: Path, frame_count: int, digest: str | None = None) -> t
                 f"{path}: estimates of another dataset: {FRAMES_SHA256} is {stated[:12]}..., but frames.parquet has "
                 f"{digest[:12]}...; run `estimator run` again"
             )
-    rows = read_rows(path, COLUMNS, EstimateRow)
+    rows = read_rows(path, COLUMNS, EstimateRow, SPOT_COLUMNS)
     if [row.frame for row in rows] != list(range(frame_count)):
         raise InputError(f"{path}: {len(rows)} rows, needed one for each of the {frame_count} frames, in order")
     return rows

@@ -71,7 +71,8 @@ class Variant:
     """A positioning method under a name, with a summary of one line; `estimate` raises EstimationFailure.
 
     A variant that uses all frames of a device has them by `of_device`; its `estimate` uses the one frame alone. `needs`
-    is None where they are not stated.
+    is None where they are not stated. `family` and `mark` choose how pages and plots show it
+    (`estimator.methods.looks`); where they are empty, the name does.
     """
 
     name: str
@@ -79,6 +80,8 @@ class Variant:
     estimate: Callable[[DeviceFrame], Estimate]
     of_device: DeviceMethod | None = None
     needs: Needs | None = None
+    family: str = ""
+    mark: str = ""
 
     @classmethod
     def over_device(cls, name: str, summary: str, method: DeviceMethod, needs: Needs | None = None) -> "Variant":

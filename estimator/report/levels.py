@@ -1,16 +1,44 @@
 """Plot of levels: every variant's RMSE against the bound of each of several datasets, as SVG."""
 
+import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from estimator.evaluate.levels import Level, variants_of
 from estimator.evaluate.score_table import length_text
-from estimator.report.figures import Decades
-from estimator.report.svg import line, mark, picture, style_of_variants, svg_file, text
+from estimator.methods.looks import Look, look_of
+from estimator.report.looks import LOOK_STYLE, look_class, look_mark
+from estimator.report.svg import line, picture, svg_file, text
 
 WIDTH, HEIGHT = 560, 420
 LEFT, TOP, BOTTOM = 72, 44, 44
 LEGEND = 250
 LINE = 18
+MIN_SHOWN_M = 1e-6
+MAX_LABELS = 12
+
+
+@dataclass(frozen=True)
+class Decades:
+    """A logarithmic axis from 10**low to 10**high metres."""
+
+    low: int
+    high: int
+
+    @classmethod
+    def around(cls, shown_m: Sequence[float]) -> "Decades":
+        """Axis that contains some lengths, all positive."""
+        low = math.floor(math.log10(min(shown_m, default=1e-3)))
+        return cls(low, max(math.ceil(math.log10(max(shown_m, default=1.0))), low + 1))
+
+    def share(self, size_m: float) -> float:
+        """Position along the axis, 0 to 1."""
+        return (math.log10(max(size_m, MIN_SHOWN_M)) - self.low) / (self.high - self.low)
+
+    def labelled_m(self) -> list[float]:
+        """Decades to label, all of them up to MAX_LABELS."""
+        step = math.ceil((self.high - self.low) / MAX_LABELS)
+        return [10.0**decade for decade in range(self.low, self.high + 1, step)]
 
 
 def level_plot(levels: Sequence[Level]) -> str:
@@ -47,22 +75,29 @@ def level_plot(levels: Sequence[Level]) -> str:
     if last > first:
         parts.append(line(x(first), y(first), x(last), y(last), "bound"))
     for index, variant in enumerate(variants):
+        look = _look(levels, variant)
         places = [(level, size) for level in levels if (size := level.rmse_m(variant)) is not None]
         if len(places) > 1:
             steps = "L".join(f"{x(level.bound_rms_m):.1f} {y(size):.1f}" for level, size in places)
-            parts.append(f'<path class="curve v{index}" d="M{steps}"/>')
+            parts.append(f'<g class="{look_class(look)}"><path class="curve" d="M{steps}"/></g>')
         for level, size in places:
             of_variant = level.variants[variant]
             lost = f", {of_variant.failed} of {of_variant.frames} frames failed" if of_variant.failed else ""
             title = f"{variant}, {level.name}: {length_text(size)}{lost}"
-            parts.append(mark(x(level.bound_rms_m), y(size), 4, index, title))
+            parts.append(look_mark(x(level.bound_rms_m), y(size), 4, look, title))
             if of_variant.failed:
                 parts.append(text(x(level.bound_rms_m) + 8, y(size) - 4, f"{of_variant.failed} failed", "start"))
-        parts.append(mark(LEFT + WIDTH + 40, TOP + LINE * (index + 0.5), 4, index))
+        parts.append(look_mark(LEFT + WIDTH + 40, TOP + LINE * (index + 0.5), 4, look))
         parts.append(text(LEFT + WIDTH + 52, TOP + LINE * (index + 0.5) + 4, variant, "start"))
     return picture(LEFT + WIDTH + LEGEND, TOP + height + BOTTOM, "RMSE of each variant by the datasets' bounds", parts)
 
 
+def _look(levels: Sequence[Level], variant: str) -> Look:
+    """Look of a variant as its scores state it."""
+    found = (one.entry.look for level in levels if (one := level.variants.get(variant)) is not None)
+    return next(found, look_of(variant))
+
+
 def level_picture(levels: Sequence[Level]) -> str:
     """The plot as a file of its own, with its styles."""
-    return svg_file(level_plot(levels), style_of_variants(len(variants_of(levels))))
+    return svg_file(level_plot(levels), LOOK_STYLE)

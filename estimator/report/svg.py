@@ -1,4 +1,4 @@
-"""SVG for the report and for files: lines, text, and the marks and colours of the variants."""
+"""SVG for plots and files: lines, text, and the marks and colours of the variants."""
 
 import hashlib
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ svg path { fill: none; stroke-width: 1.6; }
 svg .rule { stroke: #dde2e6; }
 svg .bound { stroke: #1c2024; stroke-width: 2; }
 svg .mark { stroke: none !important; }"""
-"""Style of a file; the report's page has its own."""
+"""Style of a file; a page has its own."""
 
 
 def slots_of(groups: Sequence[tuple[str, str]], known: Sequence[str]) -> list[int]:
@@ -66,11 +66,6 @@ def svg_file(element: str, style: str) -> str:
     root = f'{head} xmlns="http://www.w3.org/2000/svg" width="{size[0]}" height="{size[1]}"'
     whole = escape(f"{FILE_STYLE}\n{style}", quote=False)
     return f"{root}>\n<style>{whole}</style>{body}\n"
-
-
-def key(index: int) -> str:
-    """Mark of a variant, as an SVG element for running text."""
-    return f'<svg class="key" viewBox="0 0 12 12" aria-hidden="true">{mark(6, 6, 4, index)}</svg>'
 
 
 def mark(x: float, y: float, radius: float, index: int, title: str = "") -> str:

@@ -34,7 +34,14 @@ def preset(kind: str, name: str) -> dict[str, Any]:
 def with_presets(
     tree: Mapping[str, Any], assignments: Iterable[str], source: str, how: str = "--set "
 ) -> dict[str, Any]:
-    """A recipe's tree with presets inserted and `key=value` assignments applied (see `toml_model.override`).
+    """A recipe's tree with presets inserted and `key=value` assignments applied, as `resolved` has it."""
+    return resolved(tree, assignments, source, how)[0]
+
+
+def resolved(
+    tree: Mapping[str, Any], assignments: Iterable[str], source: str, how: str = "--set "
+) -> tuple[dict[str, Any], dict[str, str]]:
+    """The tree with presets inserted and `key=value` assignments applied, and the name of each table's preset.
 
     Keys of the recipe override a preset that it names. A preset named by an assignment replaces the recipe's table; a
     camera's replaces the sensor's table too. Other assignments override everything. Raises InputError that starts with
@@ -43,18 +50,22 @@ def with_presets(
     given = list(assignments)
     chosen = {key: [a for a in given if a.partition("=")[0].strip() == f"{key}.preset"] for key in KINDS}
     tree = dict(tree)
+    names: dict[str, str] = {}
     for key, kind in KINDS.items():
         table = tree.get(key)
         if isinstance(table, dict) and "preset" in table:
+            names[key] = str(table["preset"])
             own = {**tree, key: {name: value for name, value in table.items() if name != "preset"}}
             tree = _merged(_named(kind, key, table["preset"], source), own)
         for assignment in chosen[key]:
             name = override({}, [assignment], how)[key]["preset"]
             named = _named(kind, key, name, source)
+            names[key] = str(name)
             replaced = named if key == "camera" else (key,)
             # No key of another preset remains.
             tree = _merged({**tree, **{table: _kept(tree, table) for table in replaced}}, named)
-    return override(tree, [a for a in given if not any(a in of_key for of_key in chosen.values())], how)
+    rest = [a for a in given if not any(a in of_key for of_key in chosen.values())]
+    return override(tree, rest, how), names
 
 
 def _kept(tree: Mapping[str, Any], key: str) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from vlcrender.config.packaged import find_file
-from vlcrender.config.presets import with_presets
+from vlcrender.config.presets import resolved
 from vlcrender.config.toml_model import check, read_toml
 from vlcrender.dataset.light_checks import check_light
 from vlcrender.dataset.recipe import Recipe, ScaleMode, scaled
@@ -28,6 +28,9 @@ class Plan:
     """The cells of a sweep; None without [[sweep]], and in a cell's own plan."""
     warnings: tuple[str, ...] = ()
     """What is odd in the recipe."""
+
+    presets: Mapping[str, str] = field(default_factory=dict)
+    """Name of the preset of each table that names one; other keys of the recipe may replace its values."""
 
     @property
     def frame_count(self) -> int:
@@ -71,8 +74,11 @@ class RecipeSource:
         """The file, in messages."""
         return f"{self.path} with --set" if self.assignments else str(self.path)
 
-    def tree_with(self, swept: Sequence[str] = (), how: str = "--set ") -> dict[str, Any]:
-        """The recipe's tree with presets and assignments, those of a cell included. `how`: as in `override`."""
+    def tree_with(self, swept: Sequence[str] = (), how: str = "--set ") -> tuple[dict[str, Any], dict[str, str]]:
+        """The recipe's tree with presets and assignments, those of a cell included, and the names of its presets.
+
+        `how`: as in `override`.
+        """
         assignments = [a for a in (*self.assignments, *swept) if not a.lstrip().startswith("scene.")]
         source = f"{self}" if not swept else how.removesuffix(": ")
         tree = dict(self.tree)
@@ -80,18 +86,18 @@ class RecipeSource:
         for way, other in (("exposure", "exposure_s"), ("exposure_s", "exposure")):
             if way in keys and other not in keys:
                 tree.pop(other, None)  # the assigned way to expose replaces the recipe's
-        tree = with_presets(tree, assignments, source, how)
+        tree, names = resolved(tree, assignments, source, how)
         noise = tree.get("added_noise")
         if "added_noise" in keys and isinstance(noise, dict) and noise.get("relative_to") == "photon":
             for way in {"exposure", "exposure_s"} - keys:
                 tree.pop(way, None)
-        return tree
+        return tree, names
 
     def plan(self, cell: Cell | None = None) -> Plan:
         """The plan of the recipe, or of a cell of its sweep. Raises InputError that names file, key and value."""
         source, how = (f"{self}", "--set ") if cell is None else (f"{self}: {cell}", f"{self}: {cell}: ")
         swept = () if cell is None else cell.assignments
-        tree = self.tree_with(swept, how)
+        tree, names = self.tree_with(swept, how)
         tree.pop("sweep", None)
         recipe = check(tree, Recipe, source)
         try:
@@ -111,7 +117,7 @@ class RecipeSource:
         warnings = recipe_warnings(recipe)
         recipe = scaled(recipe, self.scale, self.scale_mode)
         check_light(recipe, scene, source, self.scale)
-        return Plan(recipe, scene, {} if cell is None else cell.values, warnings=warnings)
+        return Plan(recipe, scene, {} if cell is None else cell.values, presets=names, warnings=warnings)
 
 
 def load_plan(path: Path, assignments: Iterable[str] = (), scale: int = 1, scale_mode: ScaleMode = "binned") -> Plan:
@@ -121,7 +127,7 @@ def load_plan(path: Path, assignments: Iterable[str] = (), scale: int = 1, scale
     and value.
     """
     source = RecipeSource(path, read_toml(path), tuple(assignments), scale, scale_mode)
-    tree = source.tree_with()
+    tree, _ = source.tree_with()
     if not tree.get("sweep"):
         return source.plan()
     tables = check({"sweep": tree["sweep"]}, SweepTables, str(source)).sweep

@@ -327,6 +327,15 @@ class MapDatumEntry(Settings):
     scale_sigma_ppm: NotNegative
 
 
+class NamesEntry(Settings):
+    """Names of the presets that the recipe names; None for a table without one."""
+
+    camera: str | None = None
+    sensor: str | None = None
+    accelerometer: str | None = None
+    belief: str | None = None
+
+
 class DatasetFile(Settings):
     """dataset.json. Keys of its outermost object that FORMAT.md does not know are ignored."""
 
@@ -352,6 +361,8 @@ class DatasetFile(Settings):
     """None in sets made before it was stated."""
     licence: str | None = None
     """SPDX licence expression of the recipe; None where not stated."""
+    names: NamesEntry = NamesEntry()
+    """Where not given, no presets: sets made before they were stated."""
     provenance: dict[str, Any]
     manifest_sha256: str | None = None
     """SHA-256 of manifest.json; None in a set that was made before there were manifests."""

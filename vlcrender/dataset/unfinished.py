@@ -35,6 +35,7 @@ from vlcrender.dataset.schema import (
     FrameRecord,
     FrameRow,
     MapTruthRow,
+    NamesEntry,
     TruthRow,
     accelerometer_entry,
     camera_entry,
@@ -360,6 +361,7 @@ def write_dataset(plan: Plan, directory: Path, provenance: dict[str, Any], recor
         files=FilesEntry(format=recipe.files.format),
         summary=summary_of(recipe, records(), directory, plan.warnings),
         licence=recipe.licence,
+        names=NamesEntry.model_validate(plan.presets),
         provenance=provenance,
         manifest_sha256=manifest_sha256,
     )
