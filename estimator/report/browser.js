@@ -314,7 +314,7 @@
       if (!content) words.push(camera ? "Drawn from the map: the page holds no picture of this frame." : "The page holds no picture of this frame.");
       if (fits && camera.outlines && (state.marks || !content)) {
         words.push("Blue: outlines of LEDs at the true pose, a quarter wider.");
-        if (set.spots[number]) words.push("Pink: spots found. Orange, dashed: in view but not used.");
+        if (set.spots[number]) words.push("Pink: spots found. Orange, dashed: in view, not identified.");
       }
       find(".legendary").textContent = words.join(" ");
       find(".offsets").hidden = !offsets.length;
