@@ -21,7 +21,7 @@ from vlcrender.errors import InputError
 
 if TYPE_CHECKING:
     from vlcrender.dataset.error_budget import ErrorBudget
-    from vlcrender.dataset.progress import Progress
+    from vlcrender.dataset.plan import Plan
     from vlcrender.emva1288.datasheet import Datasheet
     from vlcrender.scene.loader import Scene
 
@@ -56,6 +56,7 @@ def generate(
     scale_mode: Literal["binned", "same-photons"] = "binned",
     workers: int = 1,
     scheduler: str | None = None,
+    dry_run: Annotated[bool, Parameter(negative=())] = False,
 ) -> None:
     """Generate the dataset of a recipe, or one for each cell of its sweep; an interrupted run is continued.
 
@@ -77,58 +78,39 @@ def generate(
         Processes that make frames.
     scheduler
         Address of a dask scheduler whose workers see the same folder.
+    dry_run
+        Print what would be made, and estimates of time and size from a few frames; write nothing in the folder.
     """
     from vlcrender import api
+    from vlcrender.dataset.progress_display import ProgressDisplay
 
     if workers < 1:
         raise InputError(f"--workers {workers}: has to be 1 or more")
     plan = api.load_recipe(recipe, set_, scale=scale, scale_mode=scale_mode)
-    with _Bar(plan.recipe.name, plan.frame_count) as bar:
-        made = api.generate(plan, out, workers=workers, scheduler=scheduler, progress=bar.show)
+    if dry_run:
+        _dry_run(plan, workers, out)
+        return
+    with ProgressDisplay(plan.recipe.name, plan.frame_count) as display:
+        made = api.generate(plan, out, workers=workers, scheduler=scheduler, progress=display.show)
     cells = "" if plan.cells is None else f"{len(plan.cells)} cells, "
     print(f"{out}: {cells}{plan.frame_count} frames{'' if made else ' (was already complete and intact)'}")
+    if made and plan.cells is None:
+        from vlcrender.dataset.files import read_dataset_file
+        from vlcrender.dataset.summary import summary_lines
+
+        if (summary := read_dataset_file(out).summary) is not None:
+            print(*summary_lines(summary), sep="\n")
 
 
-class _Bar:
-    """Progress of a dataset on the terminal: a bar of frames, and one of the room's light while it is computed."""
+def _dry_run(plan: "Plan", workers: int, out: Path) -> None:
+    """Print what a plan would make in a folder."""
+    from vlcrender.dataset.dry_run import dry_run
+    from vlcrender.dataset.progress import Progress
+    from vlcrender.dataset.progress_display import ProgressDisplay
 
-    def __init__(self, name: str, frames: int) -> None:
-        from rich.console import Console
-        from rich.progress import (
-            BarColumn,
-            MofNCompleteColumn,
-            Progress,
-            TextColumn,
-            TimeElapsedColumn,
-            TimeRemainingColumn,
-        )
-
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("frames"),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-        )
-        self._bar = Progress(*columns, console=Console(stderr=True))
-        self._light = self._bar.add_task("light", total=1.0, visible=False)
-        self._frames = self._bar.add_task(name, total=frames)
-
-    def __enter__(self) -> "_Bar":
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._bar.stop()
-
-    def show(self, progress: "Progress") -> None:
-        """Draw what `api.generate` reports."""
-        self._bar.start()  # not before the first report: a refusal is one line
-        if progress.stage == "frames":
-            self._bar.update(self._frames, completed=progress.done, total=progress.total)
-        else:
-            share = progress.done / progress.total
-            self._bar.update(self._light, description=progress.stage, completed=share, visible=share < 1)
+    with ProgressDisplay(plan.recipe.name, plan.frame_count) as display:
+        found = dry_run(plan, workers, lambda stage, share: display.show(Progress(stage, share, 1.0)))
+    print(f"{plan.recipe.name}: dry run, nothing is written in {out}", *found.lines(), sep="\n")
 
 
 @app.command
@@ -194,6 +176,7 @@ def show(
     from vlcrender.camera.intrinsics import Camera
     from vlcrender.config.packaged import find_file, is_recipe
     from vlcrender.dataset.progress import Progress
+    from vlcrender.dataset.progress_display import ProgressDisplay
     from vlcrender.scene.visibility import ENOUGH_LEDS, level_visibility, tilted_visibility
 
     shown = recipe or what
@@ -238,7 +221,7 @@ def show(
     _print_flicker(loaded)
     from vlcrender.light.lightmap import bake  # loads Mitsuba: after scene and recipe are known to be good
 
-    with _Bar(loaded.name, 1) as bar:
+    with ProgressDisplay(loaded.name, 1) as bar:
         light = bake(loaded, progress=lambda stage, share: bar.show(Progress(stage, share, 1.0)))
     if plan is None:
         from vlcrender.rendering.scene_plot import draw

@@ -26,6 +26,7 @@ from estimator.io.device import (
     regions_problem,
 )
 from estimator.io.downlink import Downlink, downlink_problem, spots_problem
+from estimator.io.frame_files import FrameFormat, frame_format, numbers_of_exr, numbers_of_png
 from estimator.io.led_map import AnyLed, DeviceNumber, Luminaire, MapDatum, leds_by_id, luminaires_by_id
 from estimator.io.records import (
     INT64_MAX,
@@ -154,6 +155,7 @@ class Dataset:
     map_datum: MapDatum | None
     gyroscope: Gyroscope | None = None
     downlink: Downlink | None = None
+    frame_format: FrameFormat = "exr-uint32"
 
 
 def read_dataset(path: str | Path) -> Dataset:
@@ -190,7 +192,7 @@ def read_dataset(path: str | Path) -> Dataset:
         version = _Format.model_validate_json(content).version
         if version != FORMAT_VERSION:
             raise InputError(f"{description_path}: version {version} of the format, needed {FORMAT_VERSION}")
-        description = _Description.model_validate_json(content)
+        description, form = _Description.model_validate_json(content), frame_format(content)
         if missing := missing_key(description):
             raise InputError(f"{description_path}: {missing}: Field required")
     except ValidationError as error:
@@ -208,6 +210,7 @@ def read_dataset(path: str | Path) -> Dataset:
         map_datum=description.map_datum,
         gyroscope=description.gyroscope,
         downlink=description.downlink,
+        frame_format=form,
     )
     _check_frames(folder / "frames.parquet", dataset, description.frame_count)
     return dataset
@@ -282,7 +285,7 @@ def read_frame(dataset: Dataset, frame: FrameRecord | int, *, with_other_cameras
     else:
         raise InputError(f"{dataset.folder}: no frame {frame}; there are {len(dataset.frames)}, from 0 on")
     camera = dataset.cameras[record.camera]
-    parts = _read_exr(dataset.folder, record, camera)
+    parts = _read_parts(dataset.folder, record, camera, dataset.frame_format)
     if problem := depth_problem(parts, dataset.sensor):
         raise InputError(f"{record.file}: {problem}")
     made = DeviceFrame(
@@ -319,8 +322,10 @@ def _shot(dataset: Dataset, record: FrameRecord) -> tuple[FrameRecord, ...]:
     return dataset.frames[first:end]
 
 
-def _read_exr(folder: Path, record: FrameRecord, camera: Camera) -> tuple[Part, ...]:
+def _read_parts(folder: Path, record: FrameRecord, camera: Camera, form: FrameFormat) -> tuple[Part, ...]:
     data = _file_of(folder, record)
+    if form == "png16":
+        return (Part(0, 0, numbers_of_png(data, (camera.height_px, camera.width_px), record.file)),)
     try:
         with OpenEXR.File(io.BytesIO(data), header_only=True) as file:
             boxes = _check_headers(record, [part.header for part in file.parts], camera)
@@ -336,9 +341,8 @@ def _read_exr(folder: Path, record: FrameRecord, camera: Camera) -> tuple[Part, 
     parts = []
     for box, image in zip(boxes, images, strict=True):
         rows, columns = (box[1] - box[0] + 1)[::-1].tolist()
-        if image is None or image.dtype != np.uint32 or image.shape != (rows, columns):
-            raise InputError(f"{record.file}: channel Y has to hold 32-bit unsigned integers, one a pixel")
-        parts.append(Part(int(box[0, 1]), int(box[0, 0]), np.asarray(image, dtype=np.uint32)))
+        numbers = numbers_of_exr(image, form, (rows, columns), record.file)
+        parts.append(Part(int(box[0, 1]), int(box[0, 0]), numbers))
     return tuple(parts)
 
 

@@ -63,12 +63,19 @@ def _box(roi: Roi) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
 
 @dataclass(frozen=True)
 class ExrPart:
-    """One part of an EXR file: its name, its region, the whole sensor, and the type of its pixels."""
+    """One part of an EXR file: its name, its region, the whole sensor, its header and its pixels."""
 
     name: str
     roi: Roi
     sensor: Roi
-    dtype: np.dtype[Any]
+    attributes: Mapping[str, Any]
+    image: NDArray[Any]
+    """Channel Y, (rows, columns)."""
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """The type of its pixels."""
+        return self.image.dtype
 
 
 def read_exr_parts(path: Path) -> list[ExrPart]:
@@ -80,7 +87,8 @@ def read_exr_parts(path: Path) -> list[ExrPart]:
                     part.header.get("name", ""),
                     _roi(part.header["dataWindow"]),
                     _roi(part.header["displayWindow"]),
-                    part.channels["Y"].pixels.dtype,
+                    dict(part.header),
+                    part.channels["Y"].pixels,
                 )
                 for part in file.parts
             ]

@@ -14,7 +14,9 @@ from vlcrender.core.random_keys import random_key, stream
 from vlcrender.dataset.dependence import Seen, keyed_recipe
 from vlcrender.dataset.downlink import decoded_spots
 from vlcrender.dataset.exr import exr_attributes, write_exr
-from vlcrender.dataset.files import EXPECTED, FRAMES, PREVIEWS, PROCESSED, link_or_copy
+from vlcrender.dataset.files import EXPECTED, PREVIEWS, PROCESSED, link_or_copy
+from vlcrender.dataset.frame_files import frame_file, stored, write_frame
+from vlcrender.dataset.frame_numbers import FrameNumbers
 from vlcrender.dataset.motion import poses_during
 from vlcrender.dataset.plan import Plan
 from vlcrender.dataset.pose_sampling import pose_of_frame
@@ -79,12 +81,13 @@ _loaded: dict[tuple[str, str], Scene] = {}
 
 @dataclass(frozen=True)
 class Files:
-    """The files of a frame: their dataset, and what its row says of the file with its pixels."""
+    """The files of a frame: their dataset, what its row says of the file with its pixels, and its numbers."""
 
     directory: Path
     file: str
     part: int | None
     sha256: str
+    numbers: FrameNumbers | None
 
 
 def make_frames(frames: Sequence[tuple[Job, int]]) -> list[FrameRecord]:
@@ -104,7 +107,7 @@ def made_frames(frames: Iterable[tuple[Job, int]]) -> Iterator[FrameRecord]:
         twins = {n: made.get((job.scene_json, job.scene_folder, files_key, n)) for _, n in of_file}
         for record in _made_file(job, twins):
             row = record.device
-            files = Files(Path(job.directory), row.file, row.part, row.sha256)
+            files = Files(Path(job.directory), row.file, row.part, row.sha256, record.numbers)
             made.setdefault((job.scene_json, job.scene_folder, files_key, record.frame), files)
             yield record
 
@@ -154,8 +157,9 @@ def make_frame(job: Job, frame: int, twin: Files | None = None, shard: Shard | N
     start_s = recipe.start_s(shot, bool(waves))
     exposure = view.exposure(recipe, keyed.files_key)
     exposed = exposure.frame(waves, start_s)
-    file, part, digest = f"{FRAMES}/{frame:06d}.exr", None, ""
+    file, part, digest = frame_file(frame, recipe.files.format), None, ""
     if twin is None:
+        numbers: FrameNumbers | None = FrameNumbers.of(image, exposed.expected, recipe.sensor, exposure.exposure_s)
         of_device = device_sensor(recipe, device)
         dn = expose_regions(
             of_device,
@@ -168,10 +172,10 @@ def make_frame(job: Job, frame: int, twin: Files | None = None, shard: Shard | N
         # Of the told camera: readers see them.
         attributes = exr_attributes(camera, told.name, exposure.exposure_s, frame)
         if shard is None:
-            digest = write_exr(directory / file, dn, sensor, attributes)
+            digest = write_frame(directory / file, dn, sensor, attributes, recipe.files.format)
         else:
             file, part = shard.file, shard.part_count
-            shard.add(frame, dn, sensor, attributes)
+            shard.add(frame, stored(dn, recipe.files.format), sensor, attributes)
         if recipe.expected:
             write_exr(directory / EXPECTED / f"{frame:06d}.exr", exposed.expected, sensor, attributes)
         if recipe.files.has_preview(frame):
@@ -182,7 +186,7 @@ def make_frame(job: Job, frame: int, twin: Files | None = None, shard: Shard | N
             picture = recipe.processed.develop(dn[0][1], recipe.sensor, balance)
             recipe.processed.write(directory / PROCESSED / f"{frame:06d}{recipe.processed.suffix}", picture)
     else:
-        file, part, digest = twin.file, twin.part, twin.sha256
+        file, part, digest, numbers = twin.file, twin.part, twin.sha256, twin.numbers
         if not part:  # once a shard
             link_or_copy(twin.directory / file, directory / file)
         for folder in (EXPECTED, PREVIEWS, PROCESSED):
@@ -238,7 +242,7 @@ def make_frame(job: Job, frame: int, twin: Files | None = None, shard: Shard | N
         bound_m2=bound_m2,
         bound_exact_m2=bound_exact_m2,
     )
-    return FrameRecord(device=known, truth=truth)
+    return FrameRecord(device=known, truth=truth, numbers=numbers)
 
 
 def _led_truth(patch: LedPatch, wave: Wave | None, start_s: float) -> LedTruth:

@@ -3,8 +3,7 @@
 import logging
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from functools import cache, partial
-from itertools import product
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,20 +12,18 @@ import numpy as np
 from vlcrender.core.warn_once import warn_once
 from vlcrender.dataset.dependence import Seen, keyed_recipe
 from vlcrender.dataset.files import write_json
-from vlcrender.dataset.frame_job import Job, poses_of
+from vlcrender.dataset.frame_job import Job
 from vlcrender.dataset.light_checks import light_warnings
 from vlcrender.dataset.plan import Plan, PlannedCells
+from vlcrender.dataset.possible import check_possible
 from vlcrender.dataset.progress import FRAMES_STAGE, Progress, ProgressCallback
 from vlcrender.dataset.sweep import SWEEP_FILE, sweep_tree
-from vlcrender.dataset.true_world import built_leds, device_of_pose, true_camera
 from vlcrender.dataset.unfinished import PLAN, Unfinished, is_complete, prepare_folder, provenance_of
 from vlcrender.dataset.workers import Task, done_frames
 from vlcrender.errors import InputError
-from vlcrender.light.lightmap import Lightmap, bake, room_mesh
+from vlcrender.light.lightmap import Lightmap, bake
 from vlcrender.modulation.flicker import flicker_of, flicker_warning
 from vlcrender.rendering.electron_rates import ElectronRates
-from vlcrender.rendering.readout import RollingPoses
-from vlcrender.rendering.renderer import check_inside
 from vlcrender.sensor.quantisation import MIN_NOISE_STEPS, noise_steps
 from vlcrender.sensor.radiometry import detectors
 
@@ -44,7 +41,8 @@ def generate(
 
     Resumes an interrupted run of the same plan. `workers` is the number of processes; `scheduler` is the address of a
     dask scheduler whose workers share the folder. `progress` is called with each report. Raises InputError where the
-    folder holds anything else, and where a pose, the furniture, or a true camera or LED of the plan is impossible.
+    folder holds anything else, and where a pose, the furniture, or a true camera or LED of the plan is impossible:
+    before the first frame, except for a pose among thousands (`possible`).
     """
     report = progress or (lambda report: None)
     try:
@@ -61,7 +59,7 @@ def generate(
         log.info("%s: complete and intact already", directory)
         return False
     if plan.cells is None:
-        _check_possible(plan)
+        check_possible(plan, lambda share: report(Progress("poses", share, 1.0)))
         datasets = [Unfinished(lambda: plan, Job.of(plan, directory), plan.frame_count)]
         datasets[0].open()
         lit = iter([plan])
@@ -75,7 +73,7 @@ def generate(
         light = bake(of_scene.scene, progress=lambda step, share: report(Progress(step, share, 1.0)))
         _warn_of_coarse_steps(of_scene, light)
         _warn_of_flicker(of_scene)
-        for warning in light_warnings(of_scene.recipe, of_scene.scene):
+        for warning in (*of_scene.warnings, *light_warnings(of_scene.recipe, of_scene.scene)):
             warn_once(log, warning)
     done = total = plan.frame_count
     done -= sum(dataset.frame_count - dataset.done for dataset in datasets)
@@ -110,7 +108,7 @@ def _cells(cells: PlannedCells, directory: Path) -> list[Unfinished]:
         job = replace(job, scene_json=texts.setdefault(job.scene_json, job.scene_json))
         if _view_of(job) not in possible:
             try:
-                _check_possible(plan)
+                check_possible(plan)
             except InputError as error:
                 raise InputError(f"{cells.source}: {cell}: {error}") from None
             possible.add(_view_of(job))
@@ -129,23 +127,6 @@ def _with_each_scene(datasets: list[Unfinished]) -> Iterator[Plan]:
     return (dataset.plan() for dataset in dict.fromkeys([*reversed(first.values()), *datasets[-1:]]))
 
 
-def _check_possible(plan: Plan) -> None:
-    """Raise InputError where a pose, a true camera or LED, or the furniture of a plan is impossible."""
-    mounted_of = cache(partial(true_camera, plan.recipe))
-    numbers = {0} if plan.recipe.motion is None else {0, plan.recipe.burst_frames - 1}
-    for pose_number in plan.recipe.pose_numbers:
-        for which, number in product(range(len(plan.recipe.cameras)), numbers):
-            mounted = mounted_of(which, device_of_pose(plan.recipe, pose_number))
-            *_, during = poses_of(plan.recipe, plan.scene, pose_number, mounted, number)
-            first, last = during.ends if isinstance(during, RollingPoses) else (during[0], during[-1])
-            check_inside(plan.scene, first)
-            check_inside(plan.scene, last)
-    if plan.recipe.belief is not None:
-        for map_number in range(plan.recipe.belief.maps):
-            built_leds(plan.recipe, plan.scene, map_number)
-    room_mesh(plan.scene)
-
-
 def _tasks(datasets: Iterable[Unfinished]) -> tuple[Iterator[Task], int]:
     """The frames that are not made, in the order in which most is shared, and the number of tasks or more.
 
@@ -160,12 +141,12 @@ def _tasks(datasets: Iterable[Unfinished]) -> tuple[Iterator[Task], int]:
             together = recipe.files.frames_per_file
         *scene, seen = _view_of(dataset.job)
         scenes.setdefault((scene[0], scene[1]), {}).setdefault((seen, together), []).append(dataset)
-    shots = [
+    groups = [(group, together) for of_scene in scenes.values() for (_, together), group in of_scene.items()]
+    shots = (
         (group, range(start, start + together))
-        for of_scene in scenes.values()
-        for (_, together), group in of_scene.items()
+        for group, together in groups
         for start in range(0, group[0].frame_count, together)
-    ]
+    )
 
     def tasks() -> Iterator[Task]:
         for group, frames in shots:
@@ -177,7 +158,7 @@ def _tasks(datasets: Iterable[Unfinished]) -> tuple[Iterator[Task], int]:
             if task:
                 yield task
 
-    return tasks(), len(shots)
+    return tasks(), sum(-(-group[0].frame_count // together) for group, together in groups)
 
 
 def _warn_of_coarse_steps(plan: Plan, light: Lightmap) -> None:

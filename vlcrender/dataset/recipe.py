@@ -67,7 +67,7 @@ class Recipe(Settings):
     processed: Processed | None = None
     """Settings of processed pictures, as a phone makes them; none are written where not given."""
     files: FileSettings = FileSettings()
-    """How many frames have previews, and how many share a file."""
+    """The format of frames, how many of them have previews, and how many share a file."""
     bound: bool = False
     """Whether each frame's Cramér-Rao bound is computed: some seconds for a full frame of many LEDs."""
     camera: Camera = Camera()
@@ -138,12 +138,9 @@ class Recipe(Settings):
         return self
 
     @model_validator(mode="after")
-    def _shards_are_of_regions(self) -> Self:
-        if self.files.frames_per_file > 1 and self.regions is None:
-            raise ValueError(
-                f"files.frames_per_file = {self.files.frames_per_file}: files of several frames hold regions; add "
-                "[regions] or remove frames_per_file"
-            )
+    def _files_hold_the_frames(self) -> Self:
+        if problem := self.files.problem(self.sensor.bits, self.regions is not None):
+            raise ValueError(problem)
         return self
 
     @model_validator(mode="after")

@@ -34,7 +34,7 @@ def draw_frame(plan: Plan, frame: int, path: Path) -> str:
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / FRAMES).mkdir()
         record = make_frame(Job.of(Plan(plain, scene), Path(folder)), frame)
-        images = _pixels(Path(folder) / record.device.file)
+        images = [(part.roi, part.image) for part in read_exr_parts(Path(folder) / record.device.file)]
     row, truth, sensor = record.device, record.truth, recipe.sensor
     white = sensor.largest_dn - sensor.black_level_dn
     regions = [

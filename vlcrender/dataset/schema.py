@@ -18,6 +18,8 @@ from vlcrender.camera.shutter import Shutter
 from vlcrender.config.toml_model import Settings
 from vlcrender.dataset.belief import CAMERA_PARAMETERS, EXACT_CAMERA, CameraSigmas, Sigmas
 from vlcrender.dataset.downlink_entry import DownlinkEntry
+from vlcrender.dataset.file_settings import FilesEntry
+from vlcrender.dataset.frame_numbers import FrameNumbers, Summary
 from vlcrender.scene.as_built import Luminaires
 from vlcrender.scene.leds import Leds
 from vlcrender.sensor.accelerometer import Imu, TiltError
@@ -180,6 +182,8 @@ class FrameRecord(Settings):
 
     device: FrameRow
     truth: TruthRow
+    numbers: FrameNumbers | None = None
+    """For the summary of the set; None where they are not known."""
 
     @property
     def frame(self) -> int:
@@ -363,6 +367,10 @@ class DatasetFile(Settings):
     downlink: DownlinkEntry | None
     room_m: Triple
     names: NamesEntry
+    files: FilesEntry = FilesEntry()
+    """Where not given, as the default: sets made before it was stated."""
+    summary: Summary | None = None
+    """None in sets made before it was stated."""
     provenance: dict[str, Any]
 
 

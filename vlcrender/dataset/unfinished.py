@@ -13,6 +13,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from vlcrender.dataset.downlink_entry import downlink_entry
+from vlcrender.dataset.file_settings import FilesEntry
 from vlcrender.dataset.files import FRAMES, sha256_of, whole_file, write_json
 from vlcrender.dataset.frame_job import Job
 from vlcrender.dataset.plan import Plan
@@ -36,6 +37,7 @@ from vlcrender.dataset.schema import (
     map_datum_entry,
 )
 from vlcrender.dataset.shard import incomplete
+from vlcrender.dataset.summary import summary_of
 from vlcrender.dataset.sweep import sweep_columns
 from vlcrender.dataset.tables import write_table
 from vlcrender.dataset.true_world import device_rows, map_rows
@@ -245,6 +247,8 @@ def _finish(plan: Plan, directory: Path, provenance: dict[str, Any], places: dic
         downlink=downlink_entry(scene.leds, recipe.demodulation),
         room_m=scene.settings.room.size_m,
         names=NamesEntry.model_validate(plan.presets),
+        files=FilesEntry(format=recipe.files.format),
+        summary=summary_of(recipe, _recorded(journal, places), directory, plan.warnings),
         provenance=provenance,
     )
     write_json(directory / "dataset.json", dataset.model_dump(mode="json"))

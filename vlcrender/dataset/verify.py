@@ -14,9 +14,10 @@ from vlcrender.camera.distortion import Distortion
 from vlcrender.camera.intrinsics import Camera, transform
 from vlcrender.camera.roi import Roi
 from vlcrender.config.toml_model import check
-from vlcrender.dataset.exr import ExrPart, read_exr_parts
+from vlcrender.dataset.exr import ExrPart
 from vlcrender.dataset.file_settings import FileSettings
 from vlcrender.dataset.files import EXPECTED, PREVIEWS, PROCESSED, read_dataset_file, read_sweep_file, sha256_of
+from vlcrender.dataset.frame_files import DTYPES, read_frame_parts
 from vlcrender.dataset.schema import (
     CameraEntry,
     DatasetFile,
@@ -82,7 +83,7 @@ def _problems(directory: Path) -> list[str]:
     frames = _read_rows(directory / "frames.parquet", FrameRow, dataset.frame_count, problems)
     columns = sweep_columns(dataset.provenance.get("sweep") or {})
     truth = _read_rows(directory / "truth.parquet", TruthRow, dataset.frame_count, problems, columns)
-    digest, parts_of = cache(sha256_of), lru_cache(maxsize=1)(read_exr_parts)  # frames of a shard follow each other
+    digest, parts_of = cache(sha256_of), lru_cache(maxsize=1)(read_frame_parts)  # frames of a shard follow each other
     for row in frames:
         problems += _frame_problems(directory, row, dataset, digest, parts_of)
     recipe = dataset.provenance.get("recipe", {})
@@ -218,8 +219,9 @@ def _frame_problems(
         if not parts:
             return [f"{path}: part {row.part} is not the first one of frame {row.frame}"]
     regions = [part.roi for part in parts]
-    if not parts or any(part.dtype != np.uint32 or part.sensor != sensor for part in parts):
-        return [f"{path}: a part is not uint32 of a sensor of {camera.height_px, camera.width_px} pixels"]
+    dtype = DTYPES[dataset.files.format]
+    if not parts or any(part.dtype != dtype or part.sensor != sensor for part in parts):
+        return [f"{path}: a part is not {dtype} of a sensor of {camera.height_px, camera.width_px} pixels"]
     if any(a.overlaps(b) for i, a in enumerate(regions) for b in regions[:i]):
         return [f"{path}: regions overlap"]
     if row.capturable != all(sensor.contains(roi) for roi in regions):

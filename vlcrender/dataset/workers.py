@@ -8,8 +8,11 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
+from typing import Any
 
+from vlcrender.dataset.files import first_line
 from vlcrender.dataset.frame_job import Job, made_frames, make_frames
 from vlcrender.dataset.schema import FrameRecord
 from vlcrender.errors import InputError
@@ -17,6 +20,8 @@ from vlcrender.rendering.renderer import share_cores
 
 Task = Sequence[tuple[Job, int]]
 """Frames that one process makes, one after another, since they share views or files."""
+TASKS_ON_CLUSTER = 1000
+"""Tasks that a scheduler knows at a time: more than the threads of a cluster, and memory does not grow with the set."""
 Done = tuple[Job, FrameRecord]
 """A frame that is made, with its dataset's job."""
 
@@ -99,7 +104,7 @@ def _exit_with_parent() -> None:
 
 def _on_cluster(tasks: Iterator[Task], address: str) -> Iterator[Done]:
     try:
-        from dask.distributed import Client, as_completed
+        from dask.distributed import Client, KilledWorker, as_completed
     except ImportError:
         raise InputError(f"--scheduler {address}: needs dask.distributed: pip install 'vlcrender[cluster]'") from None
     try:
@@ -107,8 +112,23 @@ def _on_cluster(tasks: Iterator[Task], address: str) -> Iterator[Done]:
     except (OSError, ValueError) as error:
         raise InputError(f"--scheduler {address}: no answer from a scheduler: {error}") from None
     with client:
-        of_future = {client.submit(make_frames, task, pure=False): task for task in tasks}
-        for future in as_completed(list(of_future)):
+        finished, of_future = as_completed(), dict[Any, Task]()
+
+        def submit(count: int) -> None:
+            for task in islice(tasks, count):
+                future = client.submit(make_frames, task, pure=False)
+                of_future[future] = task
+                finished.add(future)
+
+        submit(TASKS_ON_CLUSTER)
+        for future in finished:
             task = of_future.pop(future)
-            yield from zip((job for job, _ in task), future.result(), strict=True)
-            future.release()
+            try:
+                records = future.result()
+            except KilledWorker as error:
+                raise InputError(
+                    f"--scheduler {address}: each worker that took frame {task[0][1]} died (out of memory?): "
+                    f"{first_line(str(error))}; run the same command again to resume"
+                ) from None
+            yield from zip((job for job, _ in task), records, strict=True)
+            submit(1)
