@@ -195,6 +195,8 @@ def show(
         if reference:
             raise InputError("--reference: shows a scene alone, without a recipe")
         loaded = plan.scene
+        if not 0 <= frame < plan.recipe.frame_count:
+            raise InputError(f"--frame {frame}: the recipe has the frames 0 to {plan.recipe.frame_count - 1}")
     elif set_ or frame:
         raise InputError(f"{what}: is a scene; --set and --frame need a recipe")
     else:

@@ -13,7 +13,6 @@ from vlcrender.dataset.files import FRAMES
 from vlcrender.dataset.frame_job import Job, make_frame
 from vlcrender.dataset.plan import Plan
 from vlcrender.dataset.pose_sampling import pose_of_frame
-from vlcrender.errors import InputError
 from vlcrender.rendering.scene_plot import draw_view
 
 MAX_POSES = 400
@@ -23,11 +22,9 @@ MAX_POSES = 400
 def draw_frame(plan: Plan, frame: int, path: Path) -> str:
     """Write a PNG with the poses of a recipe and one frame as `generate` makes it; returns what it shows, as text.
 
-    Of a sweep the frames are those of its first cell. Raises InputError for a frame that the recipe does not have.
+    Of a sweep the frames are those of its first cell.
     """
     recipe, scene = plan.recipe, plan.scene
-    if not 0 <= frame < recipe.frame_count:
-        raise InputError(f"--frame {frame}: the recipe has the frames 0 to {recipe.frame_count - 1}")
     plain = recipe.model_copy(
         update={"files": FileSettings(previews=0), "expected": False, "processed": None, "bound": False}
     )
@@ -54,4 +51,5 @@ def draw_frame(plan: Plan, frame: int, path: Path) -> str:
     places = {led.led: (led.u_px, led.v_px) for led in truth.leds}
     positions_m = np.array([one.position_m for one in poses])
     draw_view(scene, posed, regions, places, title, path, positions_m)
-    return f"frame {frame} of {recipe.frame_count}: {len(truth.leds)} LEDs light {len(regions)} regions"
+    parts = "1 region" if len(regions) == 1 else f"{len(regions)} regions"
+    return f"frame {frame} of {recipe.frame_count}: {len(truth.leds)} LEDs light {parts}"
