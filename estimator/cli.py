@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import os
 import sys
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -19,9 +20,11 @@ from cyclopts import App, CycloptsError, Parameter
 import estimator
 from estimator.errors import InputError
 from estimator.io.process import INTERRUPTED, ending_at_second_interrupt, prepare_streams, progress_console
+from estimator.report.score_commands import score
 from estimator.report.table_commands import plot, table
 
 INTERNAL_ERROR = 1
+NO_ANSWER = 1
 USER_ERROR = 2
 
 app = App(
@@ -60,8 +63,10 @@ def run(
     workers: int = 1,
     centroid_sigma: float | None = None,
     out: Path | None = None,
-) -> None:
+) -> int:
     """Estimate every frame's position and write DATASET/estimates/VARIANT.parquet.
+
+    Exits with 1 where a variant that --variant names answered no frame.
 
     Parameters
     ----------
@@ -107,6 +112,13 @@ def run(
         if unread := [row for row in of_variant if row.reason.startswith("read: ")]:
             why = f"frame {unread[0].frame}: {unread[0].reason.removeprefix('read: ')}"
             raise InputError(f"{dataset}: {len(unread)} of {len(of_variant)} frames could not be read; {why}")
+    silent = [name for name, of_variant in rows.items() if not any(row.status == "ok" for row in of_variant)]
+    if variant is None or not silent:
+        return 0
+    for name in silent:
+        reasons = Counter(row.reason for row in rows[name]).most_common(1)
+        print(f"estimator: {name} answered no frame: {reasons[0][0] if reasons else 'there is none'}", file=sys.stderr)
+    return NO_ANSWER
 
 
 def _with_centroid_sigma(names: list[str] | None, sigma_px: float | None) -> list[str] | None:
@@ -124,36 +136,7 @@ def _with_centroid_sigma(names: list[str] | None, sigma_px: float | None) -> lis
     return [f"{name}:{OPTION}={sigma_px:.10f}".rstrip("0").rstrip(".") if name in able else name for name in chosen]
 
 
-@app.command
-def score(dataset: Path, /, *, json: Annotated[bool, Parameter(negative=())] = False) -> None:
-    """Compare all estimates with the truth, one row a variant, and write DATASET/scores.json.
-
-    Parameters
-    ----------
-    dataset
-        Folder of a dataset with estimates, or of a sweep: each cell gets its scores.json, the table is of all cells.
-    json
-        Print scores.json instead of a table; of a sweep, the table as JSON.
-    """
-    from estimator.evaluate.table import table as table_of
-    from estimator.evaluate.table_text import TABLE_NOTE, table_json, table_text
-    from estimator.io.sweep import read_sweep
-    from estimator.report.terminal import print_scores
-
-    sweep = read_sweep(dataset)
-    if sweep is None:
-        scores = estimator.score(dataset)
-        if json:
-            print(scores.model_dump_json(indent=1))
-        else:
-            print_scores(scores)
-        return
-    for cell in sweep.cells:
-        estimator.score(cell)
-    of_sweep = table_of(dataset, statistics=("success_rate", "of_all", "mean", "median", "p95"))
-    print(table_json(of_sweep) if json else f"{table_text(of_sweep)}\n{TABLE_NOTE}")
-
-
+app.command(score)
 app.command(table)
 app.command(plot)
 
@@ -344,7 +327,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     prepare_streams()
     try:
         with ending_at_second_interrupt(), _log_on_stderr():
-            app(arguments)
+            code = app(arguments)
         sys.stdout.flush()
     except BrokenPipeError:
         # The reader of the output has exited (`| head`): end without a message, and do not flush into the closed pipe.
@@ -359,7 +342,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except Exception as error:
         # A defect of this program: report it in one line as well.
         return _complain(f"internal error, please report it: {type(error).__name__}: {error}", INTERNAL_ERROR)
-    return 0
+    return code if isinstance(code, int) else 0
 
 
 def _complain(message: str, code: int) -> int:

@@ -6,6 +6,7 @@ encoding, its output, and arguments as bytes.
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -132,9 +133,24 @@ def test_verify_accepts_an_intact_data_set_and_names_damage(rendered_set: Path, 
 
 def test_show_refuses(tmp_path: Path) -> None:
     assert_refused(run("vlcrender", "show", "no.toml", cwd=tmp_path), "no.toml")
-    assert_refused(run("vlcrender", "show", RECIPE, cwd=tmp_path), "quickstart.toml", "format")
+    assert_refused(run("vlcrender", "show", "office", "--frame", "1", cwd=tmp_path), "office: is a scene", "--frame")
+    assert_refused(run("vlcrender", "show", RECIPE, "--frame", "8", cwd=tmp_path), "--frame 8", "frames 0 to 7")
+    assert_refused(run("vlcrender", "show", "office", "table2", cwd=tmp_path), "table2: is neither", "recipes")
+    assert_refused(run("vlcrender", "show", RECIPE, "--reference", cwd=tmp_path), "--reference: shows a scene alone")
     assert_refused(run("vlcrender", "show", TABLE1, "--out", "picture.jpg", cwd=tmp_path), "picture.jpg", ".png")
     assert_refused(run("vlcrender", "show", TABLE1, "--out", "no/such/x.png", cwd=tmp_path), "no/such")
+
+
+def test_show_draws_a_frame_of_a_recipe_with_its_camera_in_any_scene(tmp_path: Path) -> None:
+    """Coarse, to be quick. By hand: 4.8 x 3.6 mm at 14.4 mm, 2 atan(1/6) = 18.92 and 2 atan(1/8) = 14.25 deg."""
+    small = ["--set", "camera.width_px=200", "--set", "camera.height_px=150", "--set", "camera.pixel_pitch_um=24"]
+    changes = [*small, "--set", "camera.focal_length_mm=14.4", "--set", "poses.border_px=1"]
+    result = run("vlcrender", "show", TABLE1, RECIPE, "--frame", "2", *changes, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert "table1: poses" in result.stdout
+    assert "(18.92 x 14.25 deg view)" in result.stdout
+    assert re.search(r"frame 2 of 8: \d+ LEDs light 1 region\n", result.stdout)
+    assert (tmp_path / "quickstart.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_show_draws_and_counts(tmp_path: Path) -> None:

@@ -1,10 +1,7 @@
 """Command line and report: output, and every error in one line with exit code 2."""
 
 import json
-import os
 import re
-import subprocess
-import sys
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -75,14 +72,6 @@ def test_score_prints_a_row_a_variant(dataset: Path, capsys: pytest.CaptureFixtu
     out = capsys.readouterr().out
     assert all(name in out for name in VARIANTS)
     assert "synthetic <&>" in out
-
-
-@pytest.mark.slow
-def test_score_prints_to_a_terminal_without_a_micro_sign(dataset: Path) -> None:
-    command = [sys.executable, "-c", "import sys; from estimator.cli import main; sys.exit(main())", "score"]
-    environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
-    result = subprocess.run([*command, str(dataset)], env=environment, capture_output=True, check=False)
-    assert (result.returncode, result.stderr) == (0, b"")
 
 
 def test_a_table_is_split_where_the_terminal_is_narrow() -> None:

@@ -4,6 +4,7 @@ An error is one line. The exit code is 2 for bad input, 130 if interrupted. Each
 so that `--help` loads neither Mitsuba nor SciPy.
 """
 
+import json
 import logging
 import math
 import os
@@ -178,32 +179,69 @@ def export(directory: Path, /, *, to: str, out: Path) -> None:
 
 
 @app.command
-def show(scene: str, /, *, out: Path | None = None, reference: Annotated[bool, Parameter(negative=())] = False) -> None:
-    """Draw a room's floor plan and a camera's view of it; print how many poses see four LEDs or more, and the flicker.
+def show(
+    what: str,
+    recipe: str | None = None,
+    /,
+    *,
+    frame: int = 0,
+    set_: Annotated[list[str] | None, Parameter(name="--set", negative=())] = None,
+    out: Path | None = None,
+    reference: Annotated[bool, Parameter(negative=())] = False,
+) -> None:
+    """Draw a room's floor plan and a view of it; print how many poses see four LEDs or more, and the flicker.
+
+    Of a scene alone the view is that of a level camera on the floor, the default one. With a recipe it is a frame of
+    the recipe as `generate` makes it, with the identities of its LEDs; the plan shows the poses.
 
     Parameters
     ----------
-    scene
-        Scene file (TOML), or the name of a scene that comes with vlcrender, such as office.
+    what
+        Scene or recipe file (TOML), or the name of one that comes with vlcrender, such as office or quickstart.
+    recipe
+        Recipe whose camera and poses are shown in the scene WHAT.
+    frame
+        Number of the recipe's frame.
+    set_
+        key=value that replaces a value of the recipe, as of `generate`. May be repeated.
     out
-        PNG to write; by default the scene's name with .png in the current folder.
+        PNG to write; by default the name of scene or recipe with .png in the current folder.
     reference
-        Render the view with Mitsuba's own path integrator: slow, coarse, noisy, and independent of the fast method.
+        Render the view of a scene alone with Mitsuba's own path integrator: slow, coarse, noisy, and independent.
     """
     from rich.console import Console
     from rich.table import Table
 
-    from vlcrender.api import load_scene
+    from vlcrender import api
     from vlcrender.camera.intrinsics import Camera
+    from vlcrender.config.packaged import find_file, is_recipe
+    from vlcrender.dataset.progress import Progress
+    from vlcrender.dataset.progress_display import ProgressDisplay
     from vlcrender.scene.visibility import ENOUGH_LEDS, level_visibility, tilted_visibility
 
-    loaded = load_scene(scene)
-    path = out or Path(f"{Path(scene).stem}.png")
+    shown = recipe or what
+    path = out or Path(f"{Path(shown).stem}.png")
     if path.suffix.lower() != ".png":
         raise InputError(f"--out {path}: has to end in .png")
     if not path.parent.is_dir():
         raise InputError(f"--out {path}: there is no folder {path.parent}")
-    camera = Camera()
+    plan = None
+    if recipe is not None or is_recipe(what):
+        assignments = list(set_ or ())
+        if recipe is not None:
+            loaded = api.load_scene(what)  # a wrong scene is named as such
+            assignments.append(f"scene={json.dumps(str(find_file('scene', what, Path.cwd()).resolve()))}")
+        plan = api.load_recipe(shown, assignments)
+        if reference:
+            raise InputError("--reference: shows a scene alone, without a recipe")
+        loaded = plan.scene
+        if not 0 <= frame < plan.recipe.frame_count:
+            raise InputError(f"--frame {frame}: the recipe has the frames 0 to {plan.recipe.frame_count - 1}")
+    elif set_ or frame:
+        raise InputError(f"{what}: is a scene; --set and --frame need a recipe")
+    else:
+        loaded = api.load_scene(what)
+    camera = Camera() if plan is None else plan.recipe.camera
     across, down = camera.view_angles_deg()
     table = Table(
         title=f"{loaded.name}: poses that see {ENOUGH_LEDS} LEDs or more ({across:.2f} x {down:.2f} deg view)"
@@ -221,11 +259,20 @@ def show(scene: str, /, *, out: Path | None = None, reference: Annotated[bool, P
         ):
             share = f"{100 * visibility.share:.2f} %"
             table.add_row(f"{height:g}", visibility.attitude, str(visibility.poses), str(visibility.seen), share)
-    from vlcrender.rendering.scene_plot import draw  # loads Mitsuba: after the scene is known to be good
-
-    draw(loaded, camera, path, reference)
     Console(width=max(Console().width, 100)).print(table)
     _print_flicker(loaded)
+    from vlcrender.light.lightmap import bake  # loads Mitsuba: after scene and recipe are known to be good
+
+    with ProgressDisplay(loaded.name, 1) as bar:
+        light = bake(loaded, progress=lambda stage, share: bar.show(Progress(stage, share, 1.0)))
+    if plan is None:
+        from vlcrender.rendering.scene_plot import draw
+
+        draw(loaded, camera, path, reference, light)
+    else:
+        from vlcrender.dataset.recipe_plot import draw_frame
+
+        print(draw_frame(plan, frame, path))
     print(f"{path}: written")
 
 

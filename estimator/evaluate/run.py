@@ -148,6 +148,11 @@ def _chosen(selection: Sequence[str | Variant] | None) -> dict[str, Variant]:
     else:
         registry = Registry.read()
         found = [registry.named(one) if isinstance(one, str) else one for one in selection]
+    for variant in found:
+        if (why := variant.missing()) is not None:
+            if selection is not None:
+                raise InputError(f"variant {variant.name}: {why}")
+            logger.warning("%s will answer no frame: %s", variant.name, why)
     return {variant.name: variant for variant in found}
 
 

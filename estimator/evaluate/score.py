@@ -134,9 +134,11 @@ class Scores(Row):
         InputError
             pandas is not installed.
         """
-        pd = import_pandas()
-        columns = list(_summary_row(None))
-        return pd.DataFrame([_summary_row(variant) for variant in self.variants], columns=columns)
+        return import_pandas().DataFrame(self.summary_rows(), columns=list(_summary_row(None)))
+
+    def summary_rows(self) -> list[dict[str, object]]:
+        """The rows of `to_pandas`, values by column name; None where there is no value."""
+        return [_summary_row(variant) for variant in self.variants]
 
     def frames_to_pandas(self) -> "pd.DataFrame":
         """Table of the frames' scores.

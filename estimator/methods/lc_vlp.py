@@ -97,5 +97,5 @@ LC_VLP = Variant(
     "lc-vlp",
     "Pan et al. 2026: contours as Lamé curves on the LEDs' plane, nonlinear least squares from a pair's pose",
     lc_vlp,
-    needs=Needs(2, sizes=True, sensors=("accelerometer",)),
+    needs=Needs(2, sizes=True, sensors=("accelerometer",), package="poselib"),
 )

@@ -184,5 +184,5 @@ UP2P = over_frames(
     "up2p",
     "PoseLib's upright two-point solver in RANSAC, tilt from gravity, then a fit of the spots that agree",
     judged,
-    Needs(3, sensors=("accelerometer",), optional=("gyroscope",)),
+    Needs(3, sensors=("accelerometer",), optional=("gyroscope",), package="poselib"),
 )

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from typing import Any, Literal
 
 import numpy as np
@@ -64,6 +65,8 @@ class Needs:
     """Sensors whose readings are used where they are there."""
     attitude: Literal["any", "level"] = "any"
     """Attitude of the camera that the method allows."""
+    package: str = ""
+    """Python package that has to be installed, an extra of this distribution; none where empty."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +85,13 @@ class Variant:
     needs: Needs | None = None
     family: str = ""
     mark: str = ""
+
+    def missing(self) -> str | None:
+        """What has to be installed before the variant can answer, as text; None where nothing is missing."""
+        package = "" if self.needs is None else self.needs.package
+        if not package or find_spec(package) is not None:
+            return None
+        return f"{package} is not installed (pip install vlcrender[{package}])"
 
     @classmethod
     def over_device(cls, name: str, summary: str, method: DeviceMethod, needs: Needs | None = None) -> "Variant":

@@ -4,6 +4,7 @@ An installed package has them in `packaged_files/` beside this module; a checkou
 """
 
 import re
+import tomllib
 from pathlib import Path
 from typing import Literal
 
@@ -39,3 +40,17 @@ def find_file(kind: Kind, name_or_path: str | Path, folder: Path = Path()) -> Pa
     if str(name_or_path) not in names:
         raise InputError(f"{name_or_path}: is neither a file nor one of the {kind}s there are: {', '.join(names)}")
     return packaged_folder(kind) / f"{name_or_path}.toml"
+
+
+def is_recipe(name_or_path: str | Path) -> bool:
+    """Whether a packaged name or a path means a recipe; of a name that is a scene's too, the scene is meant.
+
+    A file that cannot be read as TOML counts as a scene: its reader says what is wrong with it.
+    """
+    path = Path(name_or_path)
+    if not path.is_file():
+        return str(name_or_path) in packaged_names("recipe") and str(name_or_path) not in packaged_names("scene")
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8")).get("format") == "vlcrender-recipe"
+    except (OSError, ValueError):
+        return False

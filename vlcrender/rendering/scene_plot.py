@@ -1,19 +1,23 @@
 """Picture of a scene: a floor plan, and the image of a camera on the floor."""
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import EllipseCollection, PolyCollection
+from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
 from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.posed_camera import PosedCamera
+from vlcrender.camera.roi import RegionImage, Roi
 from vlcrender.camera.vignetting import relative_illumination
+from vlcrender.light.lightmap import Lightmap
 from vlcrender.rendering.renderer import Renderer
+from vlcrender.scene.leds import Leds
 from vlcrender.scene.loader import Scene
 from vlcrender.scene.visibility import leds_in_view
 from vlcrender.sensor.radiometry import Silicon, electron_rate_per_cd_m2
@@ -26,6 +30,10 @@ REFERENCE_SAMPLES = 128
 """Samples per pixel of the reference."""
 WHITE_E = 4000.0
 """Electrons that are drawn white."""
+DISC_CORNERS = 16
+"""Corners of a disc's outline on the plan."""
+DRAWN_PX = 1000
+"""Width to which an image is reduced, about."""
 
 
 def show_pose(scene: Scene, camera: Camera) -> PosedCamera:
@@ -54,26 +62,55 @@ def footprint_m(posed: PosedCamera, z_m: float) -> NDArray[np.float64]:
     return np.asarray(posed.position_m[:2] + rays[:, :2] * reach[:, None])
 
 
-def draw(scene: Scene, camera: Camera, path: Path, reference: bool = False) -> None:
+def draw(scene: Scene, camera: Camera, path: Path, reference: bool = False, light: Lightmap | None = None) -> None:
     """Write a PNG with the floor plan and the image from `show_pose`.
 
-    reference: let Mitsuba path-trace the image, slowly and in pixels REFERENCE_SCALE times as large.
+    reference: let Mitsuba path-trace the image, slowly and in pixels REFERENCE_SCALE times as large. light: of the
+    scene, baked here where it is None.
     """
     posed = show_pose(scene, camera)
     electrons: NDArray[Any]
     if reference:
         electrons = _reference_electrons(scene, posed)
     else:
-        electrons = Renderer(scene).expected_image(posed).expected_electrons(EXPOSURE_S)
+        electrons = Renderer(scene, light).expected_image(posed).expected_electrons(EXPOSURE_S)
+    x, y, z = posed.position_m
+    title = (
+        f"level camera at ({x:.2f}, {y:.2f}, {z:.2f}) m, yaw {posed.pose.yaw_deg:g} deg, "
+        f"{EXPOSURE_S * 1e6:g} us at f/{camera.f_number:g}; gamma 2.2"
+    )
+    places = {
+        int(scene.leds.ids[i]): tuple(map(float, posed.project(scene.leds.centers_m[i])))
+        for i in leds_in_view(posed, scene)
+    }
+    sensor = Roi.of_sensor(camera)
+    draw_view(scene, posed, [RegionImage(sensor, electrons / WHITE_E)], places, title, path)
+
+
+def draw_view(
+    scene: Scene,
+    posed: PosedCamera,
+    regions: Sequence[RegionImage],
+    places_px: Mapping[int, tuple[float, ...]],
+    title: str,
+    path: Path,
+    positions_m: NDArray[np.float64] | None = None,
+) -> None:
+    """Write a PNG with the floor plan and an image.
+
+    regions: the image, 1 is white; pixels outside of them are drawn blue. places_px: image (u, v) of LEDs by id, which
+    are named there. positions_m: places of further poses, (n, 3), world, as points of the plan.
+    """
     figure = Figure(figsize=(14, 6.2), layout="constrained")
     plan, image = figure.subplots(1, 2, width_ratios=[1, 1.25])
-    discs = _draw_plan(plan, scene, posed)
-    figure.colorbar(discs, ax=plan, label="LED luminance, cd/m$^2$", shrink=0.8)
-    _draw_view(image, scene, posed, electrons)
+    faces = _draw_plan(plan, scene, posed, positions_m)
+    figure.colorbar(faces, ax=plan, label="LED luminance, cd/m$^2$", shrink=0.8)
+    _draw_image(image, posed.camera, regions, places_px)
+    image.set_title(title)
     figure.savefig(path, dpi=110)
 
 
-def _draw_plan(axes: Axes, scene: Scene, posed: PosedCamera) -> EllipseCollection:
+def _draw_plan(axes: Axes, scene: Scene, posed: PosedCamera, positions_m: NDArray[np.float64] | None) -> PolyCollection:
     x_m, y_m, z_m = scene.room_m
     undersides = [s for s in scene.surfaces if s.name.endswith("underside")]
     axes.add_patch(Rectangle((0, 0), x_m, y_m, fill=False, lw=1.5))
@@ -89,20 +126,13 @@ def _draw_plan(axes: Axes, scene: Scene, posed: PosedCamera) -> EllipseCollectio
         )
     )
     leds = scene.leds
-    widths = np.maximum(2 * leds.half_widths_m, 0.004 * x_m)
-    discs = EllipseCollection(
-        widths,
-        widths,
-        np.zeros(len(leds)),
-        units="x",
-        offsets=leds.centers_m[:, :2],
-        transOffset=axes.transData,
-        cmap="plasma",
-    )
-    discs.set_array(leds.luminances_cd_m2)
-    axes.add_collection(discs)
-    footprint = footprint_m(posed, float(scene.leds.centers_m[:, 2].mean()))
+    faces = PolyCollection(outlines_m(leds, 0.004 * max(x_m, y_m)), cmap="plasma", linewidths=0)
+    faces.set_array(leds.luminances_cd_m2)
+    axes.add_collection(faces)
+    footprint = footprint_m(posed, float(leds.centers_m[:, 2].mean()))
     axes.add_collection(PolyCollection([footprint], facecolors="none", edgecolors="tab:blue", linewidths=1.5))
+    if positions_m is not None:
+        axes.plot(positions_m[:, 0], positions_m[:, 1], ".", color="tab:green", ms=3, alpha=0.6)
     axes.plot(*posed.pose.position_m[:2], "+", color="tab:blue", ms=10)
     axes.set(
         xlim=(-0.02 * x_m, 1.02 * x_m),
@@ -111,8 +141,22 @@ def _draw_plan(axes: Axes, scene: Scene, posed: PosedCamera) -> EllipseCollectio
         ylabel="y, m (down, as in the image)",
     )
     axes.set_aspect("equal")
-    axes.set_title(f"{scene.name}: {x_m:g} x {y_m:g} x {z_m:g} m,\n{len(leds)} LEDs seen from below; blue: the image")
-    return discs
+    others = "" if positions_m is None else f"; green: {len(positions_m)} poses"
+    count = f"{len(leds)} LED{'s' * (len(leds) != 1)}"
+    title = f"{scene.name}: {x_m:g} x {y_m:g} x {z_m:g} m,\n{count} seen from below; blue: the image{others}"
+    axes.set_title(title)
+    return faces
+
+
+def outlines_m(leds: Leds, least_m: float) -> list[NDArray[np.float64]]:
+    """Outlines (n, 2) of the LEDs' faces from below, x and y; those narrower than `least_m` are drawn as wide."""
+    round_angles = np.linspace(0, 2 * np.pi, DISC_CORNERS, endpoint=False)
+    disc = np.stack([np.cos(round_angles), np.sin(round_angles)], axis=1)
+    square = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    return [
+        center[:2] + max(half_m, least_m / 2) * (square if leds.squares[i] else disc)
+        for i, (center, half_m) in enumerate(zip(leds.centers_m, leds.half_widths_m.tolist(), strict=True))
+    ]
 
 
 def _reference_electrons(scene: Scene, posed: PosedCamera) -> NDArray[np.float64]:
@@ -134,33 +178,35 @@ def _reference_electrons(scene: Scene, posed: PosedCamera) -> NDArray[np.float64
     return electrons
 
 
-def _draw_view(axes: Axes, scene: Scene, posed: PosedCamera, electrons: NDArray[Any]) -> None:
-    camera, pose = posed.camera, posed.pose
-    block = max(1, electrons.shape[1] // 1000)
-    rows, columns = (n // block * block for n in electrons.shape)
-    small = electrons[:rows, :columns].reshape(rows // block, block, columns // block, block).mean(axis=(1, 3))
-    axes.imshow(
-        np.clip(small / WHITE_E, 0, 1) ** (1 / 2.2),
-        cmap="gray",
-        vmin=0,
-        vmax=1,
-        extent=(0, camera.width_px, camera.height_px, 0),
-    )
-    for index in leds_in_view(posed, scene):
-        led_id = int(scene.leds.ids[index])
-        center = posed.project(scene.leds.centers_m[index])
+def _draw_image(
+    axes: Axes, camera: Camera, regions: Sequence[RegionImage], places_px: Mapping[int, tuple[float, ...]]
+) -> None:
+    block = max(1, camera.width_px // DRAWN_PX)
+    axes.set_facecolor("#26324a")
+    for roi, light in regions:
+        small = light
+        if min(light.shape) >= 2 * block:
+            rows, columns = (n // block * block for n in light.shape)
+            blocks = light[:rows, :columns].reshape(rows // block, block, columns // block, block)
+            small = blocks.mean(axis=(1, 3))
+        axes.imshow(
+            np.clip(small, 0, 1) ** (1 / 2.2),
+            cmap="gray",
+            vmin=0,
+            vmax=1,
+            extent=(roi.column, roi.column + roi.columns, roi.row + roi.rows, roi.row),
+            interpolation="nearest",
+        )
+    axes.set(xlim=(0, camera.width_px), ylim=(camera.height_px, 0), xlabel="u, px", ylabel="v, px")
+    axes.set_aspect("equal")
+    for led_id, (u, v) in places_px.items():
         axes.annotate(
             str(led_id),
-            (float(center[0]), float(center[1])),
+            (u, v),
             xytext=(0, 9),
             textcoords="offset points",
             color="orange",
             ha="center",
             fontsize=7,
+            annotation_clip=True,
         )
-    x, y, z = pose.position_m
-    axes.set(xlabel="u, px", ylabel="v, px")
-    axes.set_title(
-        f"level camera at ({x:.2f}, {y:.2f}, {z:.2f}) m, yaw {pose.yaw_deg:g} deg, "
-        f"{EXPOSURE_S * 1e6:g} us at f/{camera.f_number:g}; gamma 2.2"
-    )

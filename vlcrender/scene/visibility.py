@@ -105,10 +105,11 @@ def tilted_visibility(camera: Camera, scene: Scene, height_m: float) -> Visibili
         axis=1,
     )
     angles = generator.uniform([0, 0, -180], [TILT_LIMIT_DEG, TILT_LIMIT_DEG, 180], (TILTED_POSES, 3))
-    rotations = np.stack([Pose((0.0, 0.0, 0.0), *map(float, triple)).rotation for triple in angles])
     counts = np.zeros(TILTED_POSES, dtype=np.int64)
-    for center in scene.leds.centers_m:
-        counts += _on_sensor(camera, ((center - positions)[:, None, :] @ rotations.transpose(0, 2, 1))[:, 0])
+    for i, (position, triple) in enumerate(zip(positions.tolist(), angles.tolist(), strict=True)):
+        posed = PosedCamera(camera, Pose(tuple(position), *triple))
+        near = scene.leds.spheres.candidates(posed)
+        counts[i] = _on_sensor(camera, posed.camera_coordinates(scene.leds.centers_m[near])).sum()
     attitude = f"tilted 0 to {TILT_LIMIT_DEG:.0f} deg on both axes, not aimed"
     return Visibility(height_m, attitude, TILTED_POSES, int((counts >= ENOUGH_LEDS).sum()))
 
