@@ -6,7 +6,6 @@ so that `--help` loads neither Mitsuba nor SciPy.
 
 import json
 import logging
-import math
 import os
 import sys
 from collections.abc import Iterator, Sequence
@@ -18,15 +17,13 @@ from cyclopts import App, CycloptsError, Parameter
 
 from vlcrender.core.process import INTERRUPTED, ending_at_second_interrupt, prepare_streams
 from vlcrender.errors import InputError
-from vlcrender.report.command import report
+from vlcrender.report.report_command import report
+from vlcrender.report.show_command import show
 
 if TYPE_CHECKING:
     from vlcrender.dataset.error_budget import ErrorBudget
     from vlcrender.dataset.plan import Plan
     from vlcrender.emva1288.datasheet import Datasheet
-    from vlcrender.scene.loader import Scene
-
-log = logging.getLogger(__name__)
 
 
 def _version() -> str:
@@ -42,7 +39,6 @@ app = App(
     help_format="plaintext",
     suppress_keyboard_interrupt=False,
 )
-HEIGHTS_M = (0.0, 0.75)
 """Floor and desk."""
 
 
@@ -178,129 +174,7 @@ def export(directory: Path, /, *, to: str, out: Path) -> None:
     print(f"{out}: {to} of {count} frames")
 
 
-@app.command
-def show(
-    what: str,
-    recipe: str | None = None,
-    /,
-    *,
-    frame: int = 0,
-    set_: Annotated[list[str] | None, Parameter(name="--set", negative=())] = None,
-    out: Path | None = None,
-    reference: Annotated[bool, Parameter(negative=())] = False,
-) -> None:
-    """Draw a room's floor plan and a view of it; print how many poses see four LEDs or more, and the flicker.
-
-    Of a scene alone the view is that of a level camera on the floor, the default one. With a recipe it is a frame of
-    the recipe as `generate` makes it, with the identities of its LEDs; the plan shows the poses.
-
-    Parameters
-    ----------
-    what
-        Scene or recipe file (TOML), or the name of one that comes with vlcrender, such as office or quickstart.
-    recipe
-        Recipe whose camera and poses are shown in the scene WHAT.
-    frame
-        Number of the recipe's frame.
-    set_
-        key=value that replaces a value of the recipe, as of `generate`. May be repeated.
-    out
-        PNG to write; by default the name of scene or recipe with .png in the current folder.
-    reference
-        Render the view of a scene alone with Mitsuba's own path integrator: slow, coarse, noisy, and independent.
-    """
-    from rich.console import Console
-    from rich.table import Table
-
-    from vlcrender import api
-    from vlcrender.camera.intrinsics import Camera
-    from vlcrender.config.packaged import find_file, is_recipe
-    from vlcrender.dataset.progress import Progress
-    from vlcrender.dataset.progress_display import ProgressDisplay
-    from vlcrender.scene.visibility import ENOUGH_LEDS, level_visibility, tilted_visibility
-
-    shown = recipe or what
-    path = out or Path(f"{Path(shown).stem}.png")
-    if path.suffix.lower() != ".png":
-        raise InputError(f"--out {path}: has to end in .png")
-    if not path.parent.is_dir():
-        raise InputError(f"--out {path}: there is no folder {path.parent}")
-    plan = None
-    if recipe is not None or is_recipe(what):
-        assignments = list(set_ or ())
-        if recipe is not None:
-            loaded = api.load_scene(what)  # a wrong scene is named as such
-            assignments.append(f"scene={json.dumps(str(find_file('scene', what, Path.cwd()).resolve()))}")
-        plan = api.load_recipe(shown, assignments)
-        if reference:
-            raise InputError("--reference: shows a scene alone, without a recipe")
-        loaded = plan.scene
-        if not 0 <= frame < plan.recipe.frame_count:
-            raise InputError(f"--frame {frame}: the recipe has the frames 0 to {plan.recipe.frame_count - 1}")
-    elif set_ or frame:
-        raise InputError(f"{what}: is a scene; --set and --frame need a recipe")
-    else:
-        loaded = api.load_scene(what)
-    camera = Camera() if plan is None else plan.recipe.camera
-    across, down = camera.view_angles_deg()
-    table = Table(
-        title=f"{loaded.name}: poses that see {ENOUGH_LEDS} LEDs or more ({across:.2f} x {down:.2f} deg view)"
-    )
-    table.add_column("height, m", justify="right")
-    table.add_column("attitude")
-    table.add_column("poses", justify="right")
-    table.add_column("see enough", justify="right")
-    table.add_column("share", justify="right")
-    for height in HEIGHTS_M:
-        for visibility in (
-            level_visibility(camera, loaded, height, 0.0),
-            level_visibility(camera, loaded, height, 90.0),
-            tilted_visibility(camera, loaded, height),
-        ):
-            share = f"{100 * visibility.share:.2f} %"
-            table.add_row(f"{height:g}", visibility.attitude, str(visibility.poses), str(visibility.seen), share)
-    Console(width=max(Console().width, 100)).print(table)
-    _print_flicker(loaded)
-    from vlcrender.light.lightmap import bake  # loads Mitsuba: after scene and recipe are known to be good
-
-    with ProgressDisplay(loaded.name, 1) as bar:
-        light = bake(loaded, progress=lambda stage, share: bar.show(Progress(stage, share, 1.0)))
-    if plan is None:
-        from vlcrender.rendering.scene_plot import draw
-
-        draw(loaded, camera, path, reference, light)
-    else:
-        from vlcrender.dataset.recipe_plot import draw_frame
-
-        print(draw_frame(plan, frame, path))
-    print(f"{path}: written")
-
-
-def _print_flicker(scene: "Scene") -> None:
-    """Print how much the LEDs of a scene flicker, and warn where that exceeds low risk; nothing for steady light."""
-    from rich.console import Console
-    from rich.table import Table
-
-    from vlcrender.modulation.flicker import flicker_of, flicker_warning
-
-    found = flicker_of(scene.leds.transmitters)
-    if not found:
-        return
-    table = Table(title=f"{scene.name}: flicker against IEEE 1789, worst line of the spectra of all LEDs")
-    for heading in ("sends", "LEDs", "limit", "modulation", "at", "allowed", "of limit", "LEDs beyond"):
-        table.add_column(heading, justify="left" if heading in ("sends", "limit") else "right")
-    for one in found:
-        for name, line, beyond in (
-            ("low risk", one.worst.low_risk, one.low_risk_exceeded),
-            ("no effect", one.worst.no_effect, one.no_effect_exceeded),
-        ):
-            allowed = "any" if math.isinf(line.limit_percent) else f"{line.limit_percent:.3g} %"
-            own = [f"{line.percent:.3g} %", f"{line.frequency_hz:.5g} Hz", allowed, f"{line.share:.2f}", str(beyond)]
-            table.add_row(one.send, str(one.leds), name, *own)
-    Console(width=max(Console().width, 100)).print(table)
-    warning = flicker_warning(found)
-    if warning is not None:
-        log.warning("%s", warning)
+app.command(show)
 
 
 @app.command
@@ -329,7 +203,6 @@ def datasheet(
     json_
         Print JSON instead of a table.
     """
-    import json
     from dataclasses import asdict
 
     from rich.console import Console
@@ -418,7 +291,6 @@ def budget(
     json_
         Print JSON instead of a table.
     """
-    import json
 
     from rich.console import Console
 
