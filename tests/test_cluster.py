@@ -4,6 +4,7 @@ import os
 import signal
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from conftest import ROOT, SMALL
@@ -74,10 +75,12 @@ def test_a_cluster_is_given_no_more_tasks_than_it_needs(tmp_path: Path, monkeypa
     def tasks(count: int) -> Iterator[workers.Task]:
         for number in range(count):
             waiting.append(number)
-            yield [(Job("", "", "", ""), number)]
+            yield [(Job("", "", "", str(tmp_path)), number)]
 
-    def made(task: workers.Task) -> list[int]:
-        return [number for _, number in task]
+    def made(task: workers.Task) -> list[object]:
+        return [SimpleNamespace(device=SimpleNamespace(file="frame")) for _ in task]
+
+    (tmp_path / "frame").touch()
 
     monkeypatch.setattr(workers, "TASKS_ON_CLUSTER", 3)
     monkeypatch.setattr(workers, "make_frames", made)

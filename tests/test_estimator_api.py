@@ -242,7 +242,7 @@ def test_a_record_that_is_no_mapping_is_refused() -> None:
 def test_a_square_has_its_side() -> None:
     made = record()
     led = made["led_map"][0]
-    led.update(shape="square", side_m=0.03)
+    led.update(shape="square", side_m=0.03, side_sigma_m=led.pop("radius_sigma_m"))
     del led["radius_m"]
     frame = est.frame(made)
     assert frame.leds[10].half_width_m == 0.015

@@ -23,7 +23,7 @@ def camera(**changes: object) -> Camera:
 
 LENSES = {
     "pinhole": {},
-    "skew": {"K": [[1500.0, 3.0, 200.0], [0.0, 1480.0, 150.0], [0.0, 0.0, 1.0]]},
+    "skew": {"K": [[1510.0, 3.0, 200.0], [0.0, 1490.0, 150.0], [0.0, 0.0, 1.0]]},
     "distorted": {"distortion": {"k1": -0.3, "k2": 0.2, "k3": 0.1, "p1": 0.003, "p2": -0.002}},
     "fish-eye": {"projection": "equidistant"},
     "rig": {"R_cam_rig": TURNED},

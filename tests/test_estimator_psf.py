@@ -106,6 +106,7 @@ def test_the_airy_pattern_grows_with_the_image_distance() -> None:
     smaller angle: the pattern is lambda f_i / D, 3.7 % wider than lambda N.
     """
     image_mm = 1 / (1 / 18 - 1 / 500)
-    close = camera(psf="diffraction", f_number=22.0, focus_distance_m=0.5, image_distance_mm=image_mm)
+    K = [[image_mm / 1.2e-3, 0.0, 200.0], [0.0, image_mm / 1.2e-3, 150.0], [0.0, 0.0, 1.0]]
+    close = camera(psf="diffraction", f_number=22.0, focus_distance_m=0.5, image_distance_mm=image_mm, K=K)
     assert airy_scale_px(close) == pytest.approx(0.55 * image_mm / (18 / 22) / 1.2)
     assert airy_scale_px(close) / airy_scale_px(camera(psf="diffraction", f_number=22.0)) > 1.037

@@ -79,7 +79,7 @@ def test_the_light_in_the_test_is_that_of_an_even_image() -> None:
 def test_exact_points_are_fitted_exactly_from_a_rough_start(gravity: bool) -> None:
     leds = grid(5, 4, 0.14, (3, 2, 2.7))
     view = view_of((3, 2, 2.7), 2.6, 30, -20, 140)
-    seen = observe(device(view, 0.1 if gravity else 1e9), simulated(view, leds))
+    seen = observe(device(view, 0.1 if gravity else 180.0), simulated(view, leds))
     start = Pose(np.array(view.position_m) + [0.2, -0.1, 0.3], view_of((3, 2, 2.7), 2.6, 25, -14, 130).R_cam_world)
     found = fit(seen, start)
     # Double precision of 2.6 m, made some thousands of times more by the pattern.

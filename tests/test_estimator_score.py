@@ -30,6 +30,9 @@ def truths(count: int, bound_m2: tuple[float, ...] | None = None) -> list[TruthR
             bound_exact_m2=bound_m2,
             map=0,
             R_cam_world=(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0),
+            tilt_x_deg=0.0,
+            tilt_y_deg=0.0,
+            yaw_deg=0.0,
             leds=(),
         )
         for frame in range(count)

@@ -181,7 +181,7 @@ def test_tables_for_other_programs_have_every_column(
         ("ml:median=1 furlong", "a length needs one of the units"),
         ("ml:median=-1mm", "needed VARIANT:STATISTIC=LIMIT"),
         ("ml:failures=2mm", "failures are a number of frames, or a share with %"),
-        ("nobody:median=1mm", "no estimates of nobody; there are: "),
+        ("other:median=1mm", "no estimates of other; there are: "),
     ],
 )
 def test_a_limit_that_says_nothing_is_refused(scores: Scores, text: str, message: str) -> None:

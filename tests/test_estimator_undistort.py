@@ -89,7 +89,7 @@ def test_a_spot_beyond_the_field_angle_is_refused(theta_deg: float) -> None:
     assert has_pinhole_image(both, camera("equidistant")).tolist() == [True, False]
 
 
-@pytest.mark.parametrize("coefficients", [{"k1": -0.5}, {"k1": 1e100, "k2": -1e100}, {"p2": -0.5}])
+@pytest.mark.parametrize("coefficients", [{"k1": -0.5}, {"k1": -100.0, "k2": 100.0}, {"p2": -0.5}])
 def test_a_spot_beyond_the_fold_is_refused(coefficients: dict[str, float]) -> None:
     """The maximum of r (1 - r^2 / 2) is 0.55."""
     with pytest.raises(EstimationFailure, match=r"^undistort: the distortion cannot be undone at a spot$"):

@@ -193,6 +193,7 @@ def test_each_command_is_refused_while_another_uses_the_folder(scored_set: Path,
 
 def test_generate_holds_the_lock_until_it_ends(tmp_path: Path) -> None:
     """And not beyond: after an interrupt the same run goes on."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
 
     def interrupt(_: object) -> None:
         with pytest.raises(RendererError, match="in use by `vlcrender generate`"):
@@ -203,3 +204,4 @@ def test_generate_holds_the_lock_until_it_ends(tmp_path: Path) -> None:
         generate(small_plan(), tmp_path / "set", progress=interrupt)
     assert not (tmp_path / "set" / FILE).exists()
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    signal.signal(signal.SIGINT, before)

@@ -10,7 +10,6 @@ import pytest
 from conftest import ROOT
 
 import vlcrender as vr
-from vlcrender.cli import _print_flicker
 from vlcrender.config.toml_model import check, read_toml
 from vlcrender.core.warn_once import warn_once
 from vlcrender.dataset.downlink_entry import CodeEntry, PacketEntry, ToneEntry, downlink_entry
@@ -23,6 +22,7 @@ from vlcrender.modulation.flicker import (
 )
 from vlcrender.modulation.keys import KEYS_OF, Downlink
 from vlcrender.modulation.transmission import led_waves, nominal_waves
+from vlcrender.report.show_command import print_flicker
 from vlcrender.scene.loader import build_scene
 from vlcrender.scene.schema import SceneSettings
 
@@ -213,9 +213,6 @@ def test_the_entry_of_tones_and_of_waves_that_identify_nothing() -> None:
     ]
     dimmed = table1_of({"send": "mains"}, {"send": "pwm"}, {"send": "steady"}, None)
     assert downlink_entry(dimmed.leds) is None
-    silent = downlink_entry(dimmed.leds, "pixels")
-    assert silent is not None
-    assert silent.transmitters == ()
     assert downlink_entry(vr.load_scene("office").leds) is None
 
 
@@ -263,7 +260,7 @@ def test_show_prints_the_flicker_and_warns(
     capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
     mains = {"send": "mains", "depth": 0.3}
-    _print_flicker(table1_of(mains, mains, None, {"send": "code"}))
+    print_flicker(table1_of(mains, mains, None, {"send": "code"}))
     rows = [line.split("│")[1:-1] for line in capsys.readouterr().out.splitlines() if line.startswith("│")]
     assert [[cell.strip() for cell in row] for row in rows[:2]] == [
         ["mains", "2", "low risk", "30 %", "100 Hz", "8 %", "3.75", "2"],
@@ -272,7 +269,7 @@ def test_show_prints_the_flicker_and_warns(
     assert [row[0].strip() for row in rows] == ["mains", "mains", "code", "code"]
     (record,) = caplog.records
     assert record.getMessage().startswith("led[0].downlink: 2 of 2 LEDs flicker beyond the low risk of IEEE 1789")
-    _print_flicker(vr.load_scene("office"))
+    print_flicker(vr.load_scene("office"))
     assert capsys.readouterr().out == ""
 
 

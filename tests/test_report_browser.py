@@ -9,7 +9,8 @@ import pytest
 from browsing import OVERFLOWING, console, open_browser, reached_by_tab, show
 from test_estimator_report import BOUND, scored, scores_of, thousand_frames
 
-from estimator.evaluate.score import Scores, read_or_score
+from estimator.evaluate.score import Scores
+from estimator.evaluate.scores_file import read_or_score
 from estimator.report import page_data
 from estimator.report.answer import diagonal_m
 from estimator.report.numbers import UNITS, three

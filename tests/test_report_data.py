@@ -13,7 +13,8 @@ from test_estimator_score import LEDS_M, TRUTH, ok, truths
 import vlcrender as vr
 from estimator.evaluate.entry import entry_of, lacking
 from estimator.evaluate.frames import bound_quantiles_m
-from estimator.evaluate.score import read_or_score, score_variant
+from estimator.evaluate.score import score_variant
+from estimator.evaluate.scores_file import read_or_score
 from estimator.io.dataset import read_dataset
 from estimator.io.estimates import read_estimates
 from estimator.methods.catalogue import OWN

@@ -217,6 +217,7 @@ def test_a_cell_is_the_dataset_of_its_values(made: Path, tmp_path: Path) -> None
     assert told["provenance"].pop("sweep") == {"error_deg": 0.5, "read_noise_e": 3.0}
     for key in ("manifest_sha256", "seal"):  # truth.parquet has the cell's values beside
         assert told.pop(key) != told_alone.pop(key)
+    assert told["summary"].pop("bytes") > told_alone["summary"].pop("bytes")
     assert told == told_alone
 
 
@@ -403,7 +404,7 @@ def test_an_impossible_pose_of_a_cell_is_named(tmp_path: Path) -> None:
     here = "poses={ kind = 'list', pose = [{ position_m = [3.0, 3.0, 1.0] }] }"
     sweep = 'sweep=[{ key = "poses.pose.0.position_m.2", values = [1.0, 9.0] }]'
     plan = load_plan(QUICKSTART, [*SMALL[:4], here, sweep])
-    refused = r"quickstart.toml with --set: sweep cell 1 \(2 = 9.0\): camera position .* is not inside the room"
+    refused = r"--set: sweep cell 1 \(2 = 9.0\): poses: pose 0: camera position .* is not inside the room"
     with pytest.raises(InputError, match=refused):
         vr.generate(plan, tmp_path / "never")
     assert not (tmp_path / "never").exists()

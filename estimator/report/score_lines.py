@@ -20,7 +20,7 @@ FEW_FRAMES = 20
 MAX_REASONS = 4
 """Reasons of failed frames that are told of a variant, the most frequent ones."""
 BARS, PLAIN_BARS = " ▁▂▃▄▅▆▇█", " .:-=+*#@"
-LONGEST_DECADE = 7
+MAX_DECADE_TEXT = 7
 """Characters of the longest name of a decade, `100 µm`, and a space."""
 BINS_A_DECADE = 8
 """Bins of the spread in a decade of errors."""
@@ -200,7 +200,7 @@ def spread_lines(variants: Sequence[VariantScore], diag_m: float, width: int, pl
     first, last = math.floor(math.log10(min(sizes_m))), math.ceil(math.log10(max(sizes_m)) + 1e-12)
     first = max(first, last - MAX_DECADES)
     decade = max(1, min(BINS_A_DECADE, (width - lead) // (last - first)))
-    every = -(-LONGEST_DECADE // decade)
+    every = -(-MAX_DECADE_TEXT // decade)
     marks = "".join(_decade_name(power).ljust(decade * every) for power in range(first, last, every))
     lines = [("spread".ljust(lead) + marks).rstrip()]
     bars = PLAIN_BARS if plain else BARS

@@ -101,7 +101,7 @@ def show(
             share = f"{100 * visibility.share:.2f} %"
             table.add_row(f"{height:g}", visibility.attitude, str(visibility.poses), str(visibility.seen), share)
     Console(width=max(Console().width, 100)).print(table)
-    _print_flicker(loaded)
+    print_flicker(loaded)
     from vlcrender.light.lightmap import bake  # loads Mitsuba: after scene and recipe are known to be good
 
     with ProgressDisplay(loaded.name, 1) as bar:
@@ -117,7 +117,7 @@ def show(
     print(f"{path}: written")
 
 
-def _print_flicker(scene: "Scene") -> None:
+def print_flicker(scene: "Scene") -> None:
     """Print how much the LEDs of a scene flicker, and warn where that exceeds low risk; nothing for steady light."""
     from rich.console import Console
     from rich.table import Table
