@@ -24,6 +24,7 @@ if TYPE_CHECKING:
         generate,
         load_recipe,
         load_scene,
+        release,
         render,
         verify,
     )
@@ -50,6 +51,7 @@ _MODULES = {
     "generate": "vlcrender.api",
     "budget": "vlcrender.api",
     "verify": "vlcrender.api",
+    "release": "vlcrender.api",
     "ExpectedFrame": "vlcrender.api",
     "RawFrame": "vlcrender.api",
     "RawRegion": "vlcrender.api",
@@ -98,6 +100,7 @@ __all__ = [
     "generate",
     "load_recipe",
     "load_scene",
+    "release",
     "render",
     "verify",
 ]

@@ -10,6 +10,7 @@ MAX_RECIPES = 1024
 """Recipes that are kept; the one used longest ago is dropped first."""
 NOT_IN_FILES: dict[str, Any] = {
     **dict.fromkeys(("name", "description", "accelerometer", "gyroscope", "demodulation", "map", "bound"), True),
+    "split": True,
     "belief": {"accelerometer", "stated_factor"},
 }
 """Keys of a recipe without effect on the files of a frame: they act on tables alone."""

@@ -20,6 +20,7 @@ from vlcrender.dataset.progress import FRAMES_STAGE, Progress, ProgressCallback
 from vlcrender.dataset.sweep import SWEEP_FILE, sweep_tree
 from vlcrender.dataset.true_world import built_leds, device_of_pose, true_camera
 from vlcrender.dataset.unfinished import PLAN, Unfinished, is_complete, prepare_folder, provenance_of
+from vlcrender.dataset.withheld import Seal, check_withholdable
 from vlcrender.dataset.workers import Task, done_frames
 from vlcrender.errors import InputError
 from vlcrender.light.lightmap import Lightmap, bake, room_mesh
@@ -39,11 +40,13 @@ def generate(
     workers: int = 1,
     scheduler: str | None = None,
     progress: ProgressCallback | None = None,
+    withhold_truth: Path | None = None,
 ) -> bool:
     """Generate the dataset of a plan in `directory`, or its cells; False where it is already complete and intact.
 
     Resumes an interrupted run of the same plan. `workers` is the number of processes; `scheduler` is the address of a
-    dask scheduler whose workers share the folder. `progress` is called with each report. Raises InputError where the
+    dask scheduler whose workers share the folder. `progress` is called with each report. With `withhold_truth`, a key
+    file that is made where it is missing, the truth is sealed (`withheld.Seal`). Raises InputError where the
     folder holds anything else, and where a pose, the furniture, or a true camera or LED of the plan is impossible.
     """
     report = progress or (lambda report: None)
@@ -51,9 +54,14 @@ def generate(
         str(directory).encode()
     except UnicodeEncodeError:
         raise InputError(f"--out {directory}: not a UTF-8 name; EXR files need one") from None
+    seal = None
+    if withhold_truth is not None:
+        check_withholdable(plan)
+        seal = Seal.of_file(withhold_truth, directory)
+        plan = seal.secret_plan(plan)
     if plan.cells is None:
         file, kind = "dataset.json", "dataset"
-        wanted: dict[str, Any] = {"provenance": provenance_of(plan)}
+        wanted: dict[str, Any] = {"provenance": provenance_of(plan, seal)}
     else:
         file, kind = SWEEP_FILE, "sweep"
         wanted = {**sweep_tree(plan.recipe.name, plan.cells.sweep), "provenance": provenance_of(plan)}
@@ -62,7 +70,7 @@ def generate(
         return False
     if plan.cells is None:
         _check_possible(plan)
-        datasets = [Unfinished(lambda: plan, Job.of(plan, directory), plan.frame_count)]
+        datasets = [Unfinished(lambda: plan, Job.of(plan, directory), plan.frame_count, seal)]
         datasets[0].open()
         lit = iter([plan])
     else:
@@ -144,6 +152,8 @@ def _check_possible(plan: Plan) -> None:
         for map_number in range(plan.recipe.belief.maps):
             built_leds(plan.recipe, plan.scene, map_number)
     room_mesh(plan.scene)
+    if plan.recipe.split is not None:
+        plan.recipe.split.name_at((0.0, 0.0), plan.scene.room_m, plan.recipe.seed)
 
 
 def _tasks(datasets: Iterable[Unfinished]) -> tuple[Iterator[Task], int]:

@@ -98,6 +98,8 @@ class FrameRow(Settings):
     gyro_rad_s: Triple | None
     """Reading of the gyroscope, mean over the readout, in the axes of this frame's camera; None without one."""
     spots: tuple[SpotRow, ...]
+    split: str | None = None
+    """Train, validation or test; None where the frame belongs to none, or the recipe has no [split]."""
 
 
 class LedTruth(Settings):
@@ -336,6 +338,20 @@ class MapDatumEntry(Settings):
     scale_sigma_ppm: float
 
 
+class Withheld(Settings):
+    """What dataset.json says of a truth that is withheld."""
+
+    sha256: str
+    """Digest of truth.sealed, 64 hex digits."""
+    frames: Literal["all"] | tuple[int, ...]
+    """Frames without a row in truth.parquet; with "all" there is no such file."""
+
+    def frames_with_truth(self, count: int) -> list[int]:
+        """Frames of a set of `count` frames that truth.parquet has a row of."""
+        withheld = set(range(count) if self.frames == "all" else self.frames)
+        return [frame for frame in range(count) if frame not in withheld]
+
+
 class DatasetFile(Settings):
     """dataset.json."""
 
@@ -353,6 +369,8 @@ class DatasetFile(Settings):
     map_datum: MapDatumEntry | None
     downlink: DownlinkEntry | None
     room_m: Triple
+    withheld: Withheld | None = None
+    """None where the set has its truth."""
     provenance: dict[str, Any]
 
 

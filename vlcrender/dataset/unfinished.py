@@ -4,7 +4,7 @@ import json
 import logging
 import platform
 from collections.abc import Callable, Iterator, Mapping
-from functools import cache
+from functools import cache, partial
 from importlib.metadata import version
 from itertools import accumulate
 from pathlib import Path
@@ -21,12 +21,9 @@ from vlcrender.dataset.schema import (
     DATA_VERSION,
     FORMAT_VERSION,
     DatasetFile,
-    DeviceTruthRow,
     FrameRecord,
     FrameRow,
-    MapTruthRow,
     SensorEntry,
-    TruthRow,
     accelerometer_entry,
     camera_entry,
     gyroscope_entry,
@@ -35,10 +32,10 @@ from vlcrender.dataset.schema import (
     map_datum_entry,
 )
 from vlcrender.dataset.shard import incomplete
-from vlcrender.dataset.sweep import sweep_columns
 from vlcrender.dataset.tables import write_table
-from vlcrender.dataset.true_world import device_rows, map_rows
+from vlcrender.dataset.truth_tables import write_truth
 from vlcrender.dataset.verify import extra_folders, missing_files, verify
+from vlcrender.dataset.withheld import Seal, same_file_times
 from vlcrender.errors import InputError
 from vlcrender.scene.as_built import luminaires_of
 
@@ -86,8 +83,13 @@ def prepare_folder(directory: Path, wanted: Mapping[str, Any], other: str) -> No
     write_json(plan_file, wanted)
 
 
-def provenance_of(plan: Plan) -> dict[str, Any]:
-    """What a dataset is made of: the resolved recipe and scene, the cell of a sweep, and program versions."""
+def provenance_of(plan: Plan, seal: Seal | None = None) -> dict[str, Any]:
+    """What a dataset states that it is made of: of a withheld set (`seal`), nothing that gives the truth away."""
+    return _whole_provenance(plan) if seal is None else seal.public_provenance(_whole_provenance(plan))
+
+
+def _whole_provenance(plan: Plan) -> dict[str, Any]:
+    """The resolved recipe and scene, the cell of a sweep, and program versions."""
     recipe = plan.recipe.model_dump(mode="json")
     recipe["seed"] = str(plan.recipe.seed)  # JSON readers round integers beyond 2**53
     return {
@@ -108,9 +110,10 @@ def _versions() -> dict[str, str]:
 class Unfinished:
     """A dataset that is being made. `open` its folder before a frame of it is made."""
 
-    def __init__(self, plan: Callable[[], Plan], job: Job, frame_count: int) -> None:
-        """plan: makes or returns its plan, which is not kept."""
+    def __init__(self, plan: Callable[[], Plan], job: Job, frame_count: int, seal: Seal | None = None) -> None:
+        """plan: makes or returns its plan, which is not kept. seal: of a set whose truth is withheld."""
         self.plan = plan
+        self.seal = seal
         self.job = job
         self.frame_count = frame_count
         self._directory = Path(job.directory)
@@ -142,13 +145,13 @@ class Unfinished:
         if self._places is not None:
             return
         plan = self.plan()
-        recipe, wanted = plan.recipe, {"provenance": provenance_of(plan)}
+        recipe, wanted = plan.recipe, {"provenance": provenance_of(plan, self.seal)}
         prepare_folder(self._directory, wanted, "an unfinished dataset of another recipe, scene or version")
         for name in [FRAMES, *extra_folders(recipe.expected, recipe.processed is not None, recipe.files)]:
             (self._directory / name).mkdir(exist_ok=True)
         for leftover in self._directory.rglob("*.partial"):
             leftover.unlink()
-        self._places = _journal(self._directory, recipe)
+        self._places = _journal(self._directory, recipe, self.seal)
 
     def missing(self, frames: range) -> list[int]:
         """Those of some frames that are not done."""
@@ -160,16 +163,16 @@ class Unfinished:
         assert self._places is not None  # opened before its frames are made
         with (self._directory / JOURNAL).open("ab") as journal:
             self._places[record.frame] = journal.tell()
-            journal.write(_line(record))
+            journal.write(_line(record, self.seal))
 
     def finish(self) -> None:
         """Write the tables and dataset.json of a dataset whose frames are all done."""
         assert self._places is not None
         plan = self.plan()
-        _finish(plan, self._directory, provenance_of(plan), self._places)
+        _finish(plan, self._directory, self._places, self.seal)
 
 
-def _journal(directory: Path, recipe: Recipe) -> dict[int, int]:
+def _journal(directory: Path, recipe: Recipe, seal: Seal | None) -> dict[int, int]:
     """Frames that an interrupted run finished and whose files are still intact; the journal then holds these alone.
 
     Each with the place of its line in the journal: the memory of a run does not grow with records of frames.
@@ -182,12 +185,12 @@ def _journal(directory: Path, recipe: Recipe) -> dict[int, int]:
     lines = path.read_text(encoding="utf-8").splitlines()
     for line in lines:
         try:
-            record = FrameRecord.model_validate_json(line)
+            record = _record_of(line.encode(), seal)
         except ValidationError:
             continue  # a line that a crash truncated: its frame is made again
         file = directory / record.device.file
         if file.is_file() and digest(file) == record.device.sha256:
-            done[record.frame] = _line(record)
+            done[record.frame] = _line(record, seal)
     folders = extra_folders(recipe.expected, recipe.processed is not None, recipe.files)
     for frame in missing_files(directory, folders, list(done), recipe.files):
         del done[frame]
@@ -195,37 +198,47 @@ def _journal(directory: Path, recipe: Recipe) -> dict[int, int]:
         del done[frame]
     if len(done) < len(lines):
         log.warning("%s: %d frames are damaged or incomplete and are made again", path, len(lines) - len(done))
-    with whole_file(path) as partial:
-        partial.write_bytes(b"".join(done.values()))
+    with whole_file(path) as file:
+        file.write_bytes(b"".join(done.values()))
     return dict(zip(done, accumulate(map(len, done.values()), initial=0), strict=False))
 
 
-def _line(record: FrameRecord) -> bytes:
+def _line(record: FrameRecord, seal: Seal | None) -> bytes:
     """The journal's line of a frame."""
-    return record.model_dump_json().encode() + b"\n"
+    line = record.model_dump_json().encode()
+    return line + b"\n" if seal is None else seal.line(line)
 
 
-def _recorded(path: Path, places: dict[int, int]) -> Iterator[FrameRecord]:
+def _record_of(line: bytes, seal: Seal | None) -> FrameRecord:
+    """The frame of a line of the journal. Raises ValidationError for a line that is damaged."""
+    return FrameRecord.model_validate_json(line if seal is None else seal.plain_line(line))
+
+
+def _recorded(path: Path, places: dict[int, int], seal: Seal | None) -> Iterator[FrameRecord]:
     """The frames of a journal, of which each has its place, in order of their numbers."""
     with path.open("rb") as journal:
         for frame in sorted(places):
             journal.seek(places[frame])
-            yield FrameRecord.model_validate_json(journal.readline())
+            yield _record_of(journal.readline(), seal)
 
 
-def _finish(plan: Plan, directory: Path, provenance: dict[str, Any], places: dict[int, int]) -> None:
+def _finish(plan: Plan, directory: Path, places: dict[int, int], seal: Seal | None) -> None:
     recipe, scene, journal = plan.recipe, plan.scene, directory / JOURNAL
-    write_table(directory / "frames.parquet", (record.device for record in _recorded(journal, places)), FrameRow)
-    truth, columns = (record.truth for record in _recorded(journal, places)), sweep_columns(plan.values)
-    write_table(directory / "truth.parquet", truth, TruthRow, columns)
+    records = partial(_recorded, journal, places, seal)
+    write_table(directory / "frames.parquet", (record.device for record in records()), FrameRow)
+    withheld = None
+    if seal is None:
+        write_truth(plan, directory, (record.truth for record in records()))
+    else:
+        splits = {record.frame: record.device.split for record in records()}
+        withheld = seal.write_truth(
+            plan, directory, _whole_provenance(plan), lambda: (record.truth for record in records()), splits
+        )
     sigmas = luminaires = None
     told_map = recipe.map == "given"
     if recipe.belief is not None:
         sigmas = recipe.belief.stated_sigmas(recipe.cameras, recipe.accelerometer)
         luminaires = luminaires_of(scene.settings, scene.leds) if told_map else None
-        write_table(directory / "truth_devices.parquet", device_rows(recipe), DeviceTruthRow)
-    if recipe.belief is not None or not told_map:
-        write_table(directory / "truth_map.parquet", map_rows(recipe, scene), MapTruthRow)
     dataset = DatasetFile(
         format="vlcrender-dataset",
         version=FORMAT_VERSION,
@@ -243,8 +256,11 @@ def _finish(plan: Plan, directory: Path, provenance: dict[str, Any], places: dic
         map_datum=None if sigmas is None else map_datum_entry(sigmas),
         downlink=downlink_entry(scene.leds, recipe.demodulation),
         room_m=scene.settings.room.size_m,
-        provenance=provenance,
+        withheld=withheld,
+        provenance=provenance_of(plan, seal),
     )
     write_json(directory / "dataset.json", dataset.model_dump(mode="json"))
     (directory / PLAN).unlink()
     journal.unlink()
+    if seal is not None:
+        same_file_times(directory, directory / "dataset.json")

@@ -30,6 +30,7 @@ from vlcrender.dataset.schema import (
 from vlcrender.dataset.shard import parts_of_frame
 from vlcrender.dataset.sweep import SWEEP_FILE, sweep_columns
 from vlcrender.dataset.tables import Constants, read_table
+from vlcrender.dataset.withheld import withheld_problems
 from vlcrender.errors import InputError
 from vlcrender.modulation.transmission import Transmitter, led_waves
 from vlcrender.modulation.wave import Wave
@@ -79,18 +80,26 @@ def _problems(directory: Path) -> list[str]:
         for name, entry in dataset.cameras.items()
     }
     problems: list[str] = []
-    frames = _read_rows(directory / "frames.parquet", FrameRow, dataset.frame_count, problems)
+    frames = _read_rows(directory / "frames.parquet", FrameRow, range(dataset.frame_count), problems)
     columns = sweep_columns(dataset.provenance.get("sweep") or {})
-    truth = _read_rows(directory / "truth.parquet", TruthRow, dataset.frame_count, problems, columns)
+    problems += withheld_problems(directory, dataset)
+    told: Sequence[int] = range(dataset.frame_count)
+    if dataset.withheld is not None:
+        told = dataset.withheld.frames_with_truth(dataset.frame_count)
+    truth: list[TruthRow] = []
+    if dataset.withheld is None or dataset.withheld.frames != "all":
+        truth = _read_rows(directory / "truth.parquet", TruthRow, told, problems, columns)
     digest, parts_of = cache(sha256_of), lru_cache(maxsize=1)(read_exr_parts)  # frames of a shard follow each other
     for row in frames:
         problems += _frame_problems(directory, row, dataset, digest, parts_of)
     recipe = dataset.provenance.get("recipe", {})
-    maps: dict[int, Positions] = {0: {led.id: np.array(led.position_m) for led in dataset.led_map or ()}}
+    maps: dict[int, Positions] = {}
+    if dataset.led_map is not None:
+        maps[0] = {led.id: np.array(led.position_m) for led in dataset.led_map}
     devices: list[DeviceTruthRow] | None = None
     if recipe.get("belief") is not None:
         devices = _read_sealed(directory / "truth_devices.parquet", DeviceTruthRow, problems)
-    if recipe.get("belief") is not None or dataset.led_map is None:
+    if dataset.withheld is None and (recipe.get("belief") is not None or dataset.led_map is None):
         built = _read_sealed(directory / "truth_map.parquet", MapTruthRow, problems)
         problems += _sealed_problems(devices, built, dataset)
         maps = {}
@@ -102,8 +111,9 @@ def _problems(directory: Path) -> list[str]:
     problems += [f"{path}: is missing" for path in missing.values()]
     problems += _time_problems(frames, dataset)
     waves = cache(partial(_waves_of, dataset))
-    for number, pose in enumerate(truth):
-        if frames:
+    for pose in truth:
+        number = pose.frame
+        if frames and dataset.withheld is None:  # the waves follow from the seed, which is withheld too
             problems += _wave_problems(pose, frames[number].start_s, waves(pose.map))
         name = frames[number].camera if frames else None
         entry = dataset.cameras.get(name) if name is not None else None
@@ -179,7 +189,7 @@ def _true_camera_of(entry: CameraEntry, row: TruthRow) -> Camera:
 
 
 def _read_rows(
-    path: Path, model: type[R], count: int, problems: list[str], constants: Constants | None = None
+    path: Path, model: type[R], numbers: Sequence[int], problems: list[str], constants: Constants | None = None
 ) -> list[R]:
     """Rows of a table; none, and a line in `problems`, where the table is damaged."""
     try:
@@ -187,8 +197,9 @@ def _read_rows(
     except InputError as error:
         problems.append(str(error))
         return []
-    if [row.frame for row in rows] != list(range(count)):
-        problems.append(f"{path}: {len(rows)} rows; frames 0 to {count - 1} in order are expected")
+    if [row.frame for row in rows] != list(numbers):
+        expected = f"frames 0 to {len(numbers) - 1}" if isinstance(numbers, range) else f"{len(numbers)} frames"
+        problems.append(f"{path}: {len(rows)} rows; {expected} in order are expected")
         return []
     return rows
 
