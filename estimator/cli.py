@@ -19,6 +19,7 @@ from cyclopts import App, CycloptsError, Parameter
 
 import estimator
 from estimator.errors import InputError
+from estimator.report.benchmark_commands import leaderboard, print_bundle_scores, submit
 from estimator.report.table_commands import plot, table
 
 INTERNAL_ERROR = 1
@@ -118,13 +119,30 @@ def _with_centroid_sigma(names: list[str] | None, sigma_px: float | None) -> lis
 
 
 @app.command
-def score(dataset: Path, /, *, json: Annotated[bool, Parameter(negative=())] = False) -> None:
+def score(
+    dataset: Annotated[Path, Parameter(name="DATASET")],
+    /,
+    *bundles: Path,
+    of: Annotated[Path | None, Parameter(name="--dataset")] = None,
+    truth: Path | None = None,
+    split: Literal["train", "validation", "test"] = "test",
+    json: Annotated[bool, Parameter(negative=())] = False,
+) -> None:
     """Compare all estimates with the truth, one row a variant, and write DATASET/scores.json.
 
     Parameters
     ----------
     dataset
-        Folder of a dataset with estimates, or of a sweep: each cell gets its scores.json, the table is of all cells.
+        Folder of a dataset with estimates, or of a sweep: each cell gets its scores.json, the table is of all cells. Or
+        a bundle of estimates (.zip), of which no file is written.
+    bundles
+        Further bundles.
+    of
+        Folder of the dataset that bundles are of.
+    truth
+        Key file of a dataset whose truth is withheld, for bundles.
+    split
+        The frames that bundles are scored on, where the dataset has a split.
     json
         Print scores.json instead of a table; of a sweep, the table as JSON.
     """
@@ -133,6 +151,9 @@ def score(dataset: Path, /, *, json: Annotated[bool, Parameter(negative=())] = F
     from estimator.io.sweep import read_sweep
     from estimator.report.terminal import print_scores
 
+    if dataset.suffix == ".zip" or bundles or of is not None:
+        print_bundle_scores([dataset, *bundles], of, truth, split, json)
+        return
     sweep = read_sweep(dataset)
     if sweep is None:
         scores = estimator.score(dataset)
@@ -149,6 +170,8 @@ def score(dataset: Path, /, *, json: Annotated[bool, Parameter(negative=())] = F
 
 app.command(table)
 app.command(plot)
+app.command(submit)
+app.command(leaderboard)
 
 
 @app.command

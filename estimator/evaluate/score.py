@@ -36,6 +36,7 @@ from estimator.io.estimates import EstimateRow, read_estimates
 from estimator.io.led_map import AnyLed
 from estimator.io.records import LedId, Number, Positive, Row, Size, Triple, first_problem
 from estimator.io.truth import TruthRow, read_true_map, read_truth
+from estimator.io.withheld import read_withheld
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -418,6 +419,10 @@ def score(directory: str | Path) -> Scores:
     paths = estimate_paths(folder)
     if not paths:
         raise InputError(f"{folder / 'estimates'}: no estimates to score; make them with `estimator run {folder}`")
+    if read_withheld(folder) is not None:
+        raise InputError(
+            f"{folder}: truth is withheld; score bundles: estimator score BUNDLE.zip --dataset {folder} --truth KEYFILE"
+        )
     truth = read_truth(folder / "truth.parquet", len(dataset.frames))
     devices = [record.device for record in dataset.frames]
     true_map = () if dataset.leds or not dataset.frames else read_true_map(folder / "truth_map.parquet")
