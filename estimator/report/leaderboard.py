@@ -7,6 +7,7 @@ frame without an answer counts as infinite error. leaderboard.html beside this m
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from html import escape
 from typing import Literal
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -117,4 +118,4 @@ def _row(cells: Sequence[str]) -> str:
 
 
 def _escaped(text: str) -> str:
-    return "".join(f"\\{letter}" if letter in "\\`*_[]<>|#&!" else letter for letter in text)
+    return escape("".join(f"\\{letter}" if letter in "\\`*_[]|#!" else letter for letter in text), quote=False)

@@ -121,21 +121,22 @@ class Seal:
             return b""
 
     def secret_plan(self, plan: Plan) -> Plan:
-        """The plan that is made in place of one: its seed and serial numbers follow from the key and the plan's own."""
+        """The plan that is made in place of one: its seed and serial numbers follow from the key and the whole plan.
+
+        Plans that differ in anything share no pose: sets of one key do not show the same places.
+        """
         recipe = plan.recipe
-        changes: dict[str, Any] = {
-            "seed": self._number("seed", recipe.seed, SEED_BITS),
-            "sensor": recipe.sensor.model_copy(
-                update={"serial": self._number("sensor serial", recipe.sensor.serial, SERIAL_BITS)}
-            ),
-        }
+        whole = f"{recipe.model_dump_json()}\0{plan.scene.settings.model_dump_json()}".encode()
+
+        def number(purpose: str, bits: int) -> int:
+            return int.from_bytes(self.derived(purpose, whole), "little") >> (8 * KEY_BYTES - bits)
+
+        sensor = recipe.sensor.model_copy(update={"serial": number("sensor serial", SERIAL_BITS)})
+        changes: dict[str, Any] = {"seed": number("seed", SEED_BITS), "sensor": sensor}
         if isinstance(recipe.accelerometer, Imu):
-            serial = self._number("accelerometer serial", recipe.accelerometer.serial, SERIAL_BITS)
+            serial = number("accelerometer serial", SERIAL_BITS)
             changes["accelerometer"] = recipe.accelerometer.model_copy(update={"serial": serial})
         return replace(plan, recipe=recipe.model_copy(update=changes))
-
-    def _number(self, purpose: str, public: int, bits: int) -> int:
-        return int.from_bytes(self.derived(purpose, str(public).encode()), "little") >> (8 * KEY_BYTES - bits)
 
     def public_provenance(self, provenance: Mapping[str, Any]) -> dict[str, Any]:
         """What a withheld set states of its provenance: nothing of poses, errors, scene or seed, but a commitment.
