@@ -8,7 +8,7 @@ import vlcrender as vr
 from vlcrender.dataset.splits import NAMES, Split, blocks_of
 from vlcrender.errors import InputError
 
-ROOM_M = (7.0, 5.2)
+ROOM_M = np.array([7.0, 5.2])
 
 
 def test_blocks_have_the_shares_and_depend_on_the_seed() -> None:
@@ -58,7 +58,7 @@ def test_impossible_splits_are_refused(assignment: str, problem: str) -> None:
 
 
 def test_a_share_without_a_block_is_refused() -> None:
-    with pytest.raises(InputError, match=r"split: validation = 0.1 of 2 x 2 blocks is none of them"):
+    with pytest.raises(InputError, match=r"split: validation = 0.1 of 2 x 2 blocks is no block"):
         Split(block_m=4.0).name_at((1.0, 1.0), ROOM_M, 1)
 
 

@@ -1,4 +1,4 @@
-"""Submissions: a bundle is what was submitted or is refused by name, and the leaderboard ranks by the third quartile."""
+"""Submissions: a bundle is what was submitted or is refused by name; the leaderboard ranks by the third quartile."""
 
 import hashlib
 import json
@@ -67,7 +67,10 @@ DAMAGES: dict[str, tuple[Callable[[Members], object], str]] = {
     "no description": (lambda m: m.pop("submission.json"), "not a submission"),
     "other version": (lambda m: described(m, version=2), "version"),
     "name of two lines": (lambda m: described(m, name="a\nb"), "name"),
-    "twice": (lambda m: described(m, estimates=json.loads(m["submission.json"])["estimates"] * 2), "variant is there twice"),
+    "twice": (
+        lambda m: described(m, estimates=json.loads(m["submission.json"])["estimates"] * 2),
+        "variant is there twice",
+    ),
     "other frames": (lambda m: described(m, frames_sha256="0" * 64), "estimates of other frames"),
 }
 

@@ -5,13 +5,14 @@ import re
 import stat
 import struct
 from collections.abc import Iterator
+from contextlib import chdir
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from conftest import SMALL, copy_of, run, small_plan, unchanged
+from conftest import ROOT, SMALL, copy_of, run, small_plan, unchanged
 
 import estimator as est
 import vlcrender as vr
@@ -114,8 +115,9 @@ def test_what_the_set_states_is_known_key_by_key(withheld: Path) -> None:
     stated = json.loads((withheld / "dataset.json").read_text())
     assert set(stated["provenance"]) == {"recipe", "data_version", "versions", "commitment"}
     assert set(stated["provenance"]["recipe"]) == {"expected", "processed", "files", "burst"}
-    assert set(content(withheld)) - {f"{folder}/00000{i}.{end}" for folder, end in
-        (("frames", "exr"), ("previews", "png")) for i in range(3)} == {"dataset.json", "frames.parquet", "truth.sealed"}
+    assert set(content(withheld)) - {
+        f"{folder}/00000{i}.{end}" for folder, end in (("frames", "exr"), ("previews", "png")) for i in range(3)
+    } == {"dataset.json", "frames.parquet", "truth.sealed"}
     assert stated["withheld"]["frames"] == "all"
     assert len({path.stat().st_mtime_ns for path in withheld.rglob("*")}) == 1
 
@@ -138,7 +140,9 @@ def test_the_released_set_is_that_of_the_true_seed(released: Path, tmp_path: Pat
 
 
 @pytest.mark.slow
-def test_an_interrupted_run_goes_on_with_its_key_alone(withheld: Path, released: Path, key: Path, tmp_path: Path) -> None:
+def test_an_interrupted_run_goes_on_with_its_key_alone(
+    withheld: Path, released: Path, key: Path, tmp_path: Path
+) -> None:
     def stop(progress: Progress) -> None:
         if progress.stage == FRAMES_STAGE and progress.done == 2:
             raise KeyboardInterrupt
@@ -154,7 +158,7 @@ def test_an_interrupted_run_goes_on_with_its_key_alone(withheld: Path, released:
             other.write_text(f"vlcrender-truth-key-1 {'0' * 64}\n")
         with pytest.raises(InputError, match="an unfinished dataset of another"):
             vr.generate(small_plan(), folder, withhold_truth=other)
-    with pytest.raises(InputError, match="is missing, and .* is not empty; give the key file of that run"):
+    with pytest.raises(InputError, match=r"is missing, and .* is not empty; give the key file of that run"):
         vr.generate(small_plan(), folder, withhold_truth=tmp_path / "lost")
     # A line that a crash damaged is made again.
     lines = (folder / "journal.jsonl").read_bytes().splitlines(keepends=True)
@@ -180,7 +184,9 @@ def test_an_interrupted_run_goes_on_with_its_key_alone(withheld: Path, released:
         (("split.train=0.9", "split.test=0.0"), "split.test = 0"),
     ],
 )
-def test_recipes_that_give_the_truth_away_are_refused(assignments: tuple[str, ...], problem: str, tmp_path: Path) -> None:
+def test_recipes_that_give_the_truth_away_are_refused(
+    assignments: tuple[str, ...], problem: str, tmp_path: Path
+) -> None:
     overrides = [one for one in (*SMALL, *assignments) if "poses={" not in " ".join(assignments) or "poses." not in one]
     plan = vr.load_recipe("quickstart", overrides)
     with pytest.raises(InputError, match=f"--withhold-truth: .*{problem}"):
@@ -231,6 +237,18 @@ def test_release_needs_the_key(withheld: Path, released: Path, key: Path, tmp_pa
         vr.release(released, key)
 
 
+def test_the_key_alone_opens_the_truth_as_the_docs_say(
+    withheld: Path, released: Path, key: Path, tmp_path: Path
+) -> None:
+    """The program in docs/benchmark.md, run as it is printed."""
+    (program,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs/benchmark.md").read_text(encoding="utf-8"), re.DOTALL)
+    (tmp_path / "mine.key").write_bytes(key.read_bytes())
+    (tmp_path / "truth.sealed").write_bytes((withheld / "truth.sealed").read_bytes())
+    with chdir(tmp_path):
+        exec(program, {})
+    assert (tmp_path / "truth/truth.parquet").read_bytes() == (released / "truth.parquet").read_bytes()
+
+
 def test_training_rows_are_there_and_test_rows_are_not(partly: Path, key: Path, tmp_path: Path) -> None:
     splits = pq.read_table(partly / "frames.parquet")["split"].to_pylist()
     test = [frame for frame, split in enumerate(splits) if split == "test"]
@@ -247,7 +265,7 @@ def test_training_rows_are_there_and_test_rows_are_not(partly: Path, key: Path, 
     truth = pq.read_table(folder / "truth.parquet").to_pydict()
     recipe = vr.load_recipe("quickstart", [*SMALL, *REGIONS, *SPLIT, f"seed={seed_of(folder)}"]).recipe
     assert recipe.split is not None
-    assert splits == [recipe.split.name_at(p, (7.0, 7.0), recipe.seed) for p in truth["position_m"]]
+    assert splits == [recipe.split.name_at(p, np.array([7.0, 7.0]), recipe.seed) for p in truth["position_m"]]
 
 
 def estimated(folder: Path, released: Path, error_m: float) -> Path:

@@ -301,9 +301,10 @@ def generate(
 
     `recipe` is a packaged name, the path of a TOML file, or what `load_recipe` returns; `overrides`, `scale` and
     `scale_mode` are those of `load_recipe`. `workers` processes make frames, or the workers of a dask `scheduler` (its
-    address); the bits are the same for any number. `progress` is called with `Progress` reports. `withhold_truth`
-    is a key file, made if missing: the truth of the test frames is sealed with it, or that of all frames without
-    [split], and `release` writes it again. Returns False if the dataset was already complete and intact. Raises InputError for bad input, or if `out` holds anything else.
+    address); the bits are the same for any number. `progress` is called with `Progress` reports. `withhold_truth` is a
+    key file, made if missing: the truth of the test frames is sealed with it, or that of all frames without [split],
+    and `release` writes it again. Returns False if the dataset was already complete and intact. Raises InputError for
+    bad input, or if `out` holds anything else.
     """
     if workers < 1:
         raise InputError(f"workers = {workers}: has to be 1 or more")
@@ -349,8 +350,8 @@ def verify(directory: str | Path) -> list[str]:
 def release(directory: str | Path, key_file: str | Path) -> None:
     """Write the withheld truth of a dataset again: it then is the dataset of the recipe with the true seed.
 
-    `key_file` is that of `generate(..., withhold_truth=...)`. Raises InputError if the dataset has its truth, the key is
-    not its key, or the sealed truth is damaged.
+    `key_file` is that of `generate(..., withhold_truth=...)`. Raises InputError if the dataset has its truth, the key
+    is not its key, or the sealed truth is damaged.
     """
     from vlcrender.dataset.withheld import release as write
 

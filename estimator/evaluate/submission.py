@@ -97,7 +97,9 @@ def submit(folder: Path, out: Path, name: str, author: str | None = None, varian
     files = {}
     for variant in chosen:
         if variant not in paths:
-            raise InputError(f"{folder / 'estimates'}: none of variant {variant}; there are: {', '.join(paths) or 'none'}")
+            raise InputError(
+                f"{folder / 'estimates'}: none of variant {variant}; there are: {', '.join(paths) or 'none'}"
+            )
         read_known(paths[variant], dataset)
         files[variant] = paths[variant].read_bytes()
     try:

@@ -42,17 +42,17 @@ class Split(Settings):
             raise ValueError(f"train + validation + test = {total:g}: has to be 1")
         return self
 
-    def name_at(self, position_m: Sequence[float], room_m: Sequence[float], seed: int) -> SplitName | None:
+    def name_at(self, position_m: Sequence[float], room_m: NDArray[np.float64], seed: int) -> SplitName | None:
         """The split of a position (x, y, ...), world metres; None in the gap between two splits.
 
-        room_m: extent of the room along x and y. Raises InputError as `blocks_of`.
+        room_m: extent of the room along x and y, (2,) or more. Raises InputError as `blocks_of`.
         """
         blocks = blocks_of(self, float(room_m[0]), float(room_m[1]), seed)
         place = np.asarray(position_m[:2], dtype=np.float64)
         own = blocks[_block_at(place, self.block_m, blocks.shape)]
         if self.gap_m > 0 and _distance_m(place, np.argwhere(blocks > own), self.block_m) < self.gap_m:
             return None
-        return NAMES[own]
+        return NAMES[int(own)]
 
 
 def _block_at(place_m: NDArray[np.float64], block_m: float, shape: tuple[int, ...]) -> tuple[int, int]:
@@ -82,7 +82,7 @@ def blocks_of(split: Split, x_m: float, y_m: float, seed: int) -> NDArray[np.int
     for name, share, size in zip(NAMES, (split.train, split.validation, split.test), sizes, strict=True):
         if share > 0 and not size:
             raise InputError(
-                f"split: {name} = {share:g} of {columns} x {rows} blocks is none of them; lower block_m, or raise {name}"
+                f"split: {name} = {share:g} of {columns} x {rows} blocks is no block; lower block_m, or raise {name}"
             )
     blocks = np.empty(count, dtype=np.int64)
     blocks[stream(seed, 0, "split").permutation(count)] = np.repeat(np.arange(len(NAMES)), sizes)
