@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: check demo test lint docs figures paper paper-full bench mutants clean
+.PHONY: check demo test lint docs figures paper paper-full bench mutants damage clean
 
 demo: $(READY)
 	$(BIN)/vlcrender generate datasets/quickstart.toml --out out/quickstart
@@ -48,6 +48,7 @@ bench: $(READY)
 	$(BIN)/python benchmarks/errors.py
 	$(BIN)/python benchmarks/memory.py
 	$(BIN)/python benchmarks/growth.py
+	$(BIN)/python benchmarks/plan.py
 	$(BIN)/python benchmarks/sweep.py
 	$(BIN)/python benchmarks/denoise.py
 	$(BIN)/python benchmarks/shards.py
@@ -69,6 +70,13 @@ mutants: $(READY)
 	test -f out/mutants/branches.sqlite || $(BIN)/python tests/mutation/run.py map
 	$(BIN)/python tests/mutation/run.py chosen
 	$(BIN)/python tests/mutation/run.py sample --count 150 --seed 7
+
+# Not in CI: some minutes. Each prints what came of every flip or run, and exits with 1 where a set is lost or mixed.
+damage: $(READY)
+	$(BIN)/python tests/damage/flips.py --finished 2000 --unfinished 500
+	$(BIN)/python tests/damage/flips.py --finished 1000 --unfinished 200 --sharded
+	$(BIN)/python tests/damage/kills.py --count 50
+	$(BIN)/python tests/damage/races.py --count 20
 
 clean:
 	rm -rf .venv out

@@ -10,8 +10,7 @@ import logging
 import os
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
-from io import TextIOWrapper
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -19,12 +18,12 @@ from cyclopts import App, CycloptsError, Parameter
 
 import estimator
 from estimator.errors import InputError
+from estimator.io.process import INTERRUPTED, ending_at_second_interrupt, prepare_streams, progress_console
 from estimator.report.benchmark_commands import leaderboard, print_bundle_scores, submit
 from estimator.report.table_commands import plot, table
 
 INTERNAL_ERROR = 1
 USER_ERROR = 2
-INTERRUPTED = 130
 
 app = App(
     name="estimator",
@@ -61,6 +60,7 @@ def run(
     variant: Annotated[list[str] | None, Parameter(negative=())] = None,
     workers: int = 1,
     centroid_sigma: float | None = None,
+    out: Path | None = None,
 ) -> None:
     """Estimate every frame's position and write DATASET/estimates/VARIANT.parquet.
 
@@ -76,8 +76,10 @@ def run(
         Standard deviation of each coordinate of a centroid, pixels, beside that by the pixels' noise: the size of the
         errors of camera, map and image that the device does not state. The variants that fit centroids then have the
         name NAME:centroid-sigma=PIXELS; the others do not change.
+    out
+        Folder for the estimates, in place of DATASET, which is then only read; `score`, `report` and the other commands
+        take it as they take a dataset.
     """
-    from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     from estimator.io.estimates import estimates_path
@@ -86,7 +88,7 @@ def run(
     if workers < 1:
         raise InputError(f"--workers {workers}: is not 1 or more")
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    bar = Progress(*columns, console=Console(stderr=True))
+    bar = Progress(*columns, console=progress_console())
     task = bar.add_task("frames", total=None)
     with ExitStack() as stack:
 
@@ -95,12 +97,17 @@ def run(
                 stack.enter_context(bar)  # not before the dataset is read: an error is one line
             bar.update(task, completed=done, total=total)
 
-        rows = estimator.run(dataset, _with_centroid_sigma(variant, centroid_sigma), workers, draw)
+        rows = estimator.run(dataset, _with_centroid_sigma(variant, centroid_sigma), workers, draw, out)
+    home = dataset if out is None else out
     for name, of_variant in rows.items():
         ok = sum(row.status == "ok" for row in of_variant)
         sweep = read_sweep(dataset)
-        where = estimates_path(dataset, name) if sweep is None else f"the {len(sweep.cells)} cells of {dataset}"
+        where = estimates_path(home, name) if sweep is None else f"the {len(sweep.cells)} cells of {home}"
         print(f"{name}: {ok} of {len(of_variant)} frames ok -> {where}")
+    for of_variant in rows.values():
+        if unread := [row for row in of_variant if row.reason.startswith("read: ")]:
+            why = f"frame {unread[0].frame}: {unread[0].reason.removeprefix('read: ')}"
+            raise InputError(f"{dataset}: {len(unread)} of {len(of_variant)} frames could not be read; {why}")
 
 
 def _with_centroid_sigma(names: list[str] | None, sigma_px: float | None) -> list[str] | None:
@@ -190,8 +197,8 @@ def compare(dataset: Path, a: str, b: str, /, *, json: Annotated[bool, Parameter
         Print JSON instead of a table.
     """
     from estimator.evaluate.comparison import compare as compare_variants
-    from estimator.evaluate.score import read_or_score
     from estimator.evaluate.score_table import PAIR_HEADERS, PAIR_NOTE, pair_cells
+    from estimator.evaluate.scores_file import read_or_score
 
     if a == b:
         raise InputError(f"{a} and {b}: needed two different variants")
@@ -221,7 +228,7 @@ def report(*datasets: Annotated[Path, Parameter(required=True)], out: Path) -> N
     out
         The page to write.
     """
-    from estimator.evaluate.score import read_or_score
+    from estimator.evaluate.scores_file import read_or_score
     from estimator.io.atomic import write_atomically
     from estimator.report.report import page
 
@@ -245,7 +252,7 @@ def levels(*datasets: Annotated[Path, Parameter(required=True)], out: Path) -> N
         The SVG to write.
     """
     from estimator.evaluate.levels import LEVEL_NOTE, level_cells, levels_of
-    from estimator.evaluate.score import read_or_score
+    from estimator.evaluate.scores_file import read_or_score
     from estimator.io.atomic import write_atomically
     from estimator.report.levels import level_picture
     from estimator.report.terminal import print_table
@@ -357,12 +364,9 @@ def photo(
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code; an error is one line on stderr, without a traceback."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):
-            # A terminal without a micro sign prints a question mark.
-            stream.reconfigure(errors="replace")
+    prepare_streams()
     try:
-        with _log_on_stderr():
+        with ending_at_second_interrupt(), _log_on_stderr():
             app(arguments)
         sys.stdout.flush()
     except BrokenPipeError:
@@ -382,7 +386,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _complain(message: str, code: int) -> int:
-    print("estimator:", " ".join(message.split()), file=sys.stderr)
+    with suppress(BrokenPipeError):
+        print("estimator:", " ".join(message.split()), file=sys.stderr)
     return code
 
 
@@ -391,7 +396,8 @@ class _LineHandler(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write the record."""
-        print(f"estimator: {record.levelname.lower()}:", " ".join(record.getMessage().split()), file=sys.stderr)
+        with suppress(BrokenPipeError):
+            print(f"estimator: {record.levelname.lower()}:", " ".join(record.getMessage().split()), file=sys.stderr)
 
 
 @contextmanager

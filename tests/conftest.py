@@ -20,6 +20,7 @@ from estimator_synthetic import small_dataset
 import vlcrender as vr
 from estimator.cli import main as estimator_main
 from vlcrender.cli import main as vlcrender_main
+from vlcrender.dataset.manifest import seal_dataset
 
 os.environ.setdefault("VLCRENDER_CACHE", tempfile.mkdtemp(prefix="vlcrender-tests-"))
 # No bake of an earlier run is taken, and processes that tests start share this one's.
@@ -93,6 +94,12 @@ def small_plan(*assignments: str) -> vr.Plan:
     return vr.load_recipe(ROOT / "datasets/quickstart.toml", [*SMALL, "poses.count=3", *assignments])
 
 
+def sealed(dataset: Path) -> Path:
+    """A dataset with a new manifest and seal, after its files were changed on purpose."""
+    seal_dataset(dataset)
+    return dataset
+
+
 def copy_of(dataset: Path, to: Path) -> Path:
     """A copy of a shared dataset that a test may change; `to` may exist."""
     return Path(shutil.copytree(dataset, to, dirs_exist_ok=True))
@@ -115,6 +122,19 @@ def rendered_set(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """The dataset of `small_plan`, with expected images."""
     folder = tmp_path_factory.mktemp("rendered") / "set"
     assert vr.generate(small_plan("expected=true"), folder)
+    with unchanged(folder):
+        yield folder
+
+
+@pytest.fixture(scope="session")
+def rig_set(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Two shots of LED regions: `main` without distortion, and `left`, mounted beside it, with one."""
+    distortion = "{ k1 = -0.05, k2 = 0.01, p1 = 1e-5, p2 = -2e-4 }"
+    camera = f"{{ width_px = 320, height_px = 240, pixel_pitch_um = 12.0, distortion = {distortion} }}"
+    left = f'[{{ name = "left", offset_m = [0.1, 0.02, 0.01], tilt_x_deg = 3.0, yaw_deg = 7.0, camera = {camera} }}]'
+    folder = tmp_path_factory.mktemp("rig") / "set"
+    plan = small_plan("poses.count=2", 'regions={ kind = "leds", margin_px = 2 }', f"rig={left}")
+    assert vr.generate(plan, folder)
     with unchanged(folder):
         yield folder
 

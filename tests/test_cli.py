@@ -175,7 +175,7 @@ def test_the_console_script_generates_a_data_set(tmp_path: Path) -> None:
     out = str(tmp_path / "set")
     made = script("vlcrender", "generate", RECIPE, "--out", out, *SETS, "--set", "poses.count=1")
     assert made.returncode == 0, made.stderr
-    assert made.stdout == f"{out}: 1 frames\n"
+    assert made.stdout.startswith(f"{out}: 1 frames\nLEDs a frame  ")
     verified = run("vlcrender", "verify", out)
     assert (verified.returncode, verified.stderr) == (0, "")
 

@@ -1,19 +1,30 @@
 """A dask cluster makes the same bytes as one process."""
 
+import os
+import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from conftest import ROOT, SMALL
 from distributed import LocalCluster
 
-from vlcrender.dataset.files import sha256_of
+from vlcrender.core.digest import sha256_of
+from vlcrender.dataset import workers
+from vlcrender.dataset.frame_job import Job
 from vlcrender.dataset.generate import generate
 from vlcrender.dataset.plan import load_plan
+from vlcrender.dataset.progress import Progress
+from vlcrender.dataset.verify import verify
 from vlcrender.errors import InputError
 
 
 def digests(directory: Path) -> dict[str, str]:
     return {path.name: sha256_of(path) for path in sorted((directory / "frames").iterdir())}
+
+
+def files_of(directory: Path) -> dict[str, str]:
+    return {str(p.relative_to(directory)): sha256_of(p) for p in sorted(directory.rglob("*")) if p.is_file()}
 
 
 @pytest.mark.slow
@@ -32,3 +43,49 @@ def test_a_missing_scheduler_is_one_line(tmp_path: Path) -> None:
     plan = load_plan(ROOT / "datasets/quickstart.toml", [*SMALL, "poses.count=1"])
     with pytest.raises(InputError, match=r"^--scheduler nonsense://x: no answer from a scheduler: "):
         generate(plan, tmp_path / "set", scheduler="nonsense://x")
+
+
+@pytest.mark.slow
+def test_a_worker_that_is_killed_costs_no_frame(tmp_path: Path) -> None:
+    """Of two worker processes one is killed after the first frame: its tasks go to another, and the set is the same.
+
+    The cluster restarts a worker that dies; a task is lost only if three workers die with it.
+    """
+    plan = load_plan(ROOT / "datasets/quickstart.toml", [*SMALL, "poses.count=6", "expected=true"])
+    generate(plan, tmp_path / "alone")
+    killed: list[int] = []
+    with LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster:
+
+        def kill_one(progress: Progress) -> None:
+            if progress.stage == "frames" and not killed:
+                killed.append(next(iter(cluster.workers.values())).pid)
+                os.kill(killed[0], signal.SIGKILL)
+
+        generate(plan, tmp_path / "cluster", scheduler=cluster.scheduler_address, progress=kill_one)
+    assert killed
+    assert files_of(tmp_path / "cluster") == files_of(tmp_path / "alone")
+    assert verify(tmp_path / "cluster") == []
+
+
+def test_a_cluster_is_given_no_more_tasks_than_it_needs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tasks are submitted as others finish: memory does not grow with the set. Threads of this process make them."""
+    waiting: list[int] = []
+
+    def tasks(count: int) -> Iterator[workers.Task]:
+        for number in range(count):
+            waiting.append(number)
+            yield [(Job("", "", "", ""), number)]
+
+    def made(task: workers.Task) -> list[int]:
+        return [number for _, number in task]
+
+    monkeypatch.setattr(workers, "TASKS_ON_CLUSTER", 3)
+    monkeypatch.setattr(workers, "make_frames", made)
+    with LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None, protocol="tcp"
+    ) as cluster:
+        done = 0
+        for _ in workers.done_frames(tasks(10), 10, 1, cluster.scheduler_address, tmp_path):
+            done += 1
+            assert len(waiting) <= done + 2
+    assert (done, len(waiting)) == (10, 10)

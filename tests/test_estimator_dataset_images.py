@@ -134,7 +134,12 @@ def test_each_frame_of_a_shot_has_all_the_others_and_itself_not(folder: Path) ->
     def mounted(content: dict[str, Any]) -> None:
         main = content["cameras"]["main"]
         content["cameras"] = {
-            name: {**main, "K": [[f, 0.0, 200.0], [0.0, f, 150.0], [0.0, 0.0, 1.0]]} for name, f in focal_px.items()
+            name: {
+                **main,
+                "K": [[f, 0.0, 200.0], [0.0, f, 150.0], [0.0, 0.0, 1.0]],
+                "image_distance_mm": f * main["pixel_pitch_um"] / 1000,
+            }
+            for name, f in focal_px.items()
         }
 
     change_json(folder, mounted)

@@ -10,7 +10,8 @@ import pytest
 from conftest import copy_of
 
 from estimator.errors import InputError
-from estimator.evaluate.score import Scores, read_or_score, score, score_variant
+from estimator.evaluate.score import Scores, score, score_variant
+from estimator.evaluate.scores_file import read_or_score
 from estimator.io.estimates import EstimateRow, LedRange, write_estimates
 from estimator.io.led_map import DiscLed
 from estimator.io.truth import TrueLed, TruthRow
@@ -173,7 +174,7 @@ def test_every_estimates_file_is_scored_also_of_other_programs(dataset: Path) ->
     (dataset / "estimates/one-b.parquet").unlink()
 
 
-def test_scores_are_made_again_only_where_estimates_are_newer_or_other(dataset: Path) -> None:
+def test_scores_are_made_again_only_where_a_file_has_other_bytes(dataset: Path) -> None:
     first = score(dataset)
     truth = (dataset / "truth.parquet").read_bytes()
     (dataset / "truth.parquet").unlink()
@@ -183,13 +184,18 @@ def test_scores_are_made_again_only_where_estimates_are_newer_or_other(dataset: 
     assert len(read_or_score(dataset).variants) == 2
     (dataset / "estimates/two.parquet").unlink()
     assert len(read_or_score(dataset).variants) == 1
-    later = (dataset / "scores.json").stat().st_mtime + 10
     write_estimates(dataset, "one", [ok(0, TRUTH), ok(1, TRUTH), ok(2, TRUTH)])
-    os.utime(dataset / "estimates/one.parquet", (later, later))
+    os.utime(dataset / "estimates/one.parquet", (0, 0))  # as a copy that keeps times
     assert read_or_score(dataset).variants[0].ok == 3
+    written = (dataset / "scores.json").stat().st_mtime_ns
+    later = written / 1e9 + 10
+    for path in (dataset / "estimates/one.parquet", dataset / "truth.parquet"):
+        os.utime(path, (later, later))
+    read_or_score(dataset)
+    assert (dataset / "scores.json").stat().st_mtime_ns == written
 
 
-def test_scores_are_made_again_where_the_truth_is_newer(synthetic_set: Path, tmp_path: Path) -> None:
+def test_scores_are_made_again_where_the_truth_is_another(synthetic_set: Path, tmp_path: Path) -> None:
     """As when a dataset is made again, with bounds."""
     folder = copy_of(synthetic_set, tmp_path)
     write_estimates(folder, "one", [ok(frame, TRUTH) for frame in range(3)])
@@ -198,8 +204,7 @@ def test_scores_are_made_again_where_the_truth_is_newer(synthetic_set: Path, tmp
     bounds = pa.array([[1e-6, 0, 0, 0, 1e-6, 0, 0, 0, 2e-6]] * 3, table.schema.field("bound_m2").type)
     index = table.schema.get_field_index("bound_m2")
     pq.write_table(table.set_column(index, "bound_m2", bounds), folder / "truth.parquet")
-    later = (folder / "scores.json").stat().st_mtime + 10
-    os.utime(folder / "truth.parquet", (later, later))
+    os.utime(folder / "truth.parquet", (0, 0))
     assert read_or_score(folder).variants[0].rows[0].bound_m == pytest.approx(2e-3)
 
 

@@ -55,7 +55,9 @@ def test_cells_have_the_rows_of_each_by_itself(sweep: Path, tmp_path: Path, work
 def test_run_and_score_print_the_sweep_as_a_whole(sweep: Path, tmp_path: Path) -> None:
     folder = copy_of(sweep, tmp_path)
     finished = run("estimator", "run", str(folder), "--variant", "pnp")
-    assert finished.returncode == 0, finished.stderr
+    assert finished.returncode == 2
+    unread = f"{folder}: 1 of 9 frames could not be read; frame 1: frames/000001.exr: No such file or directory"
+    assert finished.stderr.splitlines()[-1] == f"estimator: {unread}"
     assert finished.stdout == f"pnp: 8 of 9 frames ok -> the 3 cells of {folder}\n"
     finished = run("estimator", "score", str(folder))
     assert finished.returncode == 0, finished.stderr

@@ -145,7 +145,7 @@ def test_frames_have_the_scene_that_their_process_has_loaded(monkeypatch: pytest
     """A plan's scene is loaded once in the process that makes the plan; another process builds it from the job."""
     plan = plan_of("poses.count=1")
     job = Job.of(plan, tmp_path)
-    parts = job.scene_json, job.scene_folder, plan.recipe.sensor.spectral_response
+    parts = job.scene_key, plan.recipe.sensor.spectral_response
     frame_job._renderer.cache_clear()  # an earlier test's renderer of the same scene
     assert frame_job._renderer(*parts).scene is plan.scene
     monkeypatch.setattr(frame_job, "_loaded", {})

@@ -20,9 +20,11 @@ import pytest
 from conftest import HANG_S, ROOT, SMALL, small_plan, started, wait_until
 
 from vlcrender.dataset.generate import generate
+from vlcrender.dataset.manifest import read_manifest
 from vlcrender.dataset.plan import load_plan
 from vlcrender.dataset.progress import Progress, ProgressCallback
 from vlcrender.dataset.schema import DATA_VERSION, FrameRecord
+from vlcrender.dataset.unfinished import _line
 from vlcrender.dataset.verify import verify
 from vlcrender.dataset.workers import Done, Task
 from vlcrender.errors import InputError
@@ -178,7 +180,9 @@ def test_a_set_of_another_version_is_left_alone(
 def records_of(directory: Path) -> list[FrameRecord]:
     """The frames of a finished set as its journal had them."""
     tables = [pq.read_table(directory / name).to_pylist() for name in ("frames.parquet", "truth.parquet")]
-    rows = [{"device": device, "truth": truth} for device, truth in zip(*tables, strict=True)]
+    entries = read_manifest(directory)
+    files = [{n: e.model_dump() for n, e in entries.items() if Path(n).stem == f"{k:06d}"} for k in range(3)]
+    rows = [{"device": d, "truth": t, "files": f} for d, t, f in zip(*tables, files, strict=True)]
     return [FrameRecord.model_validate_json(json.dumps(row)) for row in rows]
 
 
@@ -188,7 +192,7 @@ def test_a_frame_is_in_the_journal_before_it_is_reported(
     """A run that is killed then loses no frame that it reported. The frames here are those of another set."""
 
     def done_frames(tasks: Iterable[Task], *_: object) -> Iterator[Done]:
-        return zip((job for task in tasks for job, _ in task), records_of(made), strict=True)
+        yield from zip((job for task in tasks for job, _ in task), records_of(made), strict=True)
 
     monkeypatch.setattr("vlcrender.dataset.generate.done_frames", done_frames)
     lines: list[int] = []
@@ -416,7 +420,7 @@ def test_a_lost_preview_or_expected_image_is_found(made: Path, tmp_path: Path) -
     shutil.copytree(made, tmp_path / "set")
     (tmp_path / "set/expected/000001.exr").unlink()
     (tmp_path / "set/previews/000002.png").unlink()
-    names = ("expected/000001", "previews/000002")
+    names = ("expected/000001.exr", "previews/000002.png")
     assert sorted(verify(tmp_path / "set")) == [f"{tmp_path}/set/{name}: is missing" for name in names]
 
 
@@ -424,7 +428,7 @@ def test_a_lost_preview_or_expected_image_is_found(made: Path, tmp_path: Path) -
 def test_a_frame_whose_preview_was_lost_is_made_again(made: Path, tmp_path: Path) -> None:
     """An unfinished run goes on: a journal of all three frames, and one preview gone."""
     generate(small_plan("expected=true"), tmp_path / "set")
-    lines = [record.model_dump_json() + "\n" for record in records_of(tmp_path / "set")]
+    lines = [_line(record).decode() for record in records_of(tmp_path / "set")]
     provenance = json.loads((tmp_path / "set/dataset.json").read_text())["provenance"]
     (tmp_path / "set/dataset.json").unlink()
     (tmp_path / "set/plan.json").write_text(json.dumps({"provenance": provenance}))

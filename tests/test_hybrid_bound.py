@@ -12,7 +12,8 @@ from vlcrender.camera.distortion import Distortion
 from vlcrender.camera.intrinsics import Camera, Pose, rotation_cam_world
 from vlcrender.camera.rig import Mounted, mounted_cameras
 from vlcrender.camera.roi import LedRegions, RegionImage
-from vlcrender.rendering.crlb import FrameSlopes, face_motions
+from vlcrender.rendering.crlb import FrameSlopes
+from vlcrender.rendering.face_motions import face_motions
 from vlcrender.rendering.renderer import Renderer
 from vlcrender.rendering.spot_errors import SpotErrors
 from vlcrender.rendering.uncertainty import (

@@ -12,7 +12,7 @@ from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.roi import LedRegions
 from vlcrender.light.lightmap import bake
 from vlcrender.rendering.bayer import MosaicRenderer
-from vlcrender.rendering.crlb import moved
+from vlcrender.rendering.face_motions import moved
 from vlcrender.rendering.led_coverage import coverage_of_led
 from vlcrender.rendering.led_radiance import LedImage, face_of_led
 from vlcrender.rendering.led_slopes import led_slopes

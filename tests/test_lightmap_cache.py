@@ -98,6 +98,60 @@ def test_a_full_disk_leaves_no_part_of_a_bake(
     assert "No space left on device" in caplog.text
 
 
+@pytest.mark.usefixtures("no_bakes_in_memory")
+@pytest.mark.parametrize(
+    "error", [OSError(errno.EROFS, "Read-only file system"), MemoryError("no memory"), ValueError("x")]
+)
+def test_a_bake_that_is_done_is_never_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, error: Exception
+) -> None:
+    def fail(self: Path, *arguments: object, **options: object) -> None:
+        raise error
+
+    baked = BakedIlluminance(*np.ones((3, 5)))
+    monkeypatch.setattr(Path, "open", fail)
+    bake_cache.store("key", baked, tmp_path)
+    assert bake_cache.load("key", 5, tmp_path) is baked
+    (record,) = caplog.records
+    assert f"{tmp_path}: cannot keep bakes" in record.getMessage()
+
+
+@pytest.mark.usefixtures("no_bakes_in_memory")
+@pytest.mark.parametrize("values", [np.full(5, np.nan), np.full(5, -1.0), np.ones(4), np.ones(5, dtype=np.float32)])
+def test_a_damaged_bake_is_baked_again_with_one_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, values: np.ndarray
+) -> None:
+    """Numbers that no bake has, with a right checksum; then no file of NumPy's; then a folder in the file's place."""
+    np.savez_compressed(tmp_path / "key.npz", led_lux=np.ones(5), daylight_lux=np.ones(5), sigma_lux=values)
+    assert bake_cache.load("key", 5, tmp_path) is None
+    (tmp_path / "key.npz").write_bytes(b"PK\x03\x04" + bytes(50))
+    assert bake_cache.load("key", 5, tmp_path) is None
+    (record,) = caplog.records
+    assert "key.npz: cannot be read (damaged by a crash or a disk); the light is baked again" in record.getMessage()
+    (tmp_path / "other.npz").mkdir()
+    assert bake_cache.load("other", 5, tmp_path) is None
+    assert bake_cache.load("missing", 5, tmp_path) is None
+    assert len(caplog.records) == 2
+    baked = BakedIlluminance(*np.ones((3, 5)))
+    bake_cache.store("key", baked, tmp_path)
+    assert bake_cache.load("key", 5, tmp_path) is not None
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="XDG folders")
+@pytest.mark.parametrize("value", ["", " ", "cache", "./cache", "../cache"])
+def test_no_bake_is_written_below_the_working_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, value: str
+) -> None:
+    """A relative XDG_CACHE_HOME is invalid, by the XDG base directory specification."""
+    monkeypatch.delenv("VLCRENDER_CACHE")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("XDG_CACHE_HOME", value)
+    assert bake_cache.cache_folder() == tmp_path / ".cache/vlcrender"
+    monkeypatch.setenv("HOME", "home")
+    folder = bake_cache.cache_folder()
+    assert folder is None or folder.is_absolute()
+
+
 def test_the_cache_folder_is_the_chosen_one_else_the_users(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("VLCRENDER_CACHE", str(tmp_path / "own"))
     assert bake_cache.cache_folder() == tmp_path / "own"

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from conftest import ROOT, SMALL
+from conftest import ROOT, SMALL, sealed
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -159,6 +159,7 @@ def test_verify_compares_capturable_with_the_regions(table1_set: Path, tmp_path:
     rows = table.to_pylist()
     rows[2]["capturable"] = True
     pq.write_table(table.from_pylist(rows, schema=table.schema), tmp_path / "set/frames.parquet")
+    sealed(tmp_path / "set")
     (problem,) = verify(tmp_path / "set")
     assert "000002.exr" in problem
     assert "capturable" in problem

@@ -164,6 +164,13 @@ BAD_ADDITIONS: list[tuple[dict[str, object], str]] = [
     ({"glazing": [{**GLAZING, "wall": "north"}]}, r"glazing\[0\]\.wall = \"north\": .*'x=0'"),
     ({"glazing": [{**GLAZING, "refractive_index": 0.5}]}, r"refractive_index = 0\.5"),
     ({"furniture": [{"file": "nowhere.ply"}]}, r"furniture\[0\]\.file = 'nowhere.ply': no such file"),
+    (
+        {"furniture": [{"file": "../chair.ply"}]},
+        r"furniture\[0\]\.file = '\.\./chair.ply': is outside the scene's folder",
+    ),
+    ({"furniture": [{"file": "/etc/chair.ply"}]}, r"file = '/etc/chair.ply': is outside the scene's folder"),
+    ({"furniture": [{"file": "x" * 300 + ".ply"}]}, r"is no path of a file: File name too long"),
+    ({"furniture": [{"file": "\0.ply"}]}, r"is no path of a file"),
     ({"furniture": [{"file": "chair.blend"}]}, r"furniture\[0\]\.file = \"chair.blend\""),
     ({"bake": {"texel_m": 0.0}}, r"bake\.texel_m = 0\.0"),
     ({"bake": {"paths": 2}}, r"bake\.paths = 2"),

@@ -10,7 +10,7 @@ import OpenEXR
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from conftest import ROOT, SMALL, copy_of
+from conftest import ROOT, SMALL, copy_of, sealed
 
 import estimator as est
 import vlcrender as vr
@@ -145,7 +145,7 @@ def test_regions_of_any_height_are_parts(tmp_path: Path, rng: np.random.Generato
         firsts.append(shard.part_count)
         shard.add(20 + frame, regions, sensor, {"expTime": 1e-3})
     assert firsts == [0, 1, 3, 4]
-    digest = shard.write()
+    digest = shard.write().sha256
     found = content(tmp_path / "frames/shard-000007.exr")
     for (_, image_dn), region in zip(found, [region for regions in images for region in regions], strict=True):
         assert np.array_equal(image_dn, region.image)
@@ -236,16 +236,19 @@ def test_the_first_frames_have_previews(single: Path, shards: Path, tmp_path: Pa
     assert verify(none) == []
     folder = copy_of(shards, tmp_path / "shards")
     (folder / "previews/000001.png").unlink()
-    assert verify(folder) == [f"{folder / 'previews/000001'}: is missing"]
+    assert verify(folder) == [f"{folder / 'previews/000001.png'}: is missing"]
 
 
 def test_verify_finds_a_wrong_part_and_a_changed_shard(shards: Path, tmp_path: Path) -> None:
     folder = copy_of(shards, tmp_path / "set")
     change_rows(folder, lambda rows: rows[2].update(part=rows[1]["part"]))
+    sealed(folder)
     (problem,) = verify(folder)
     assert problem.endswith(f"part {rows_of(folder)[2]['part']} is not the first one of frame 2")
     path = folder / "frames/shard-000001.exr"
     path.write_bytes(path.read_bytes()[:-1])
+    assert any(f"{path}: SHA-256 differs from manifest.json" in line for line in verify(folder))
+    sealed(folder)
     assert sum("SHA-256 differs from frames.parquet" in line for line in verify(folder)) == 2
 
 
@@ -306,4 +309,4 @@ def test_shards_of_full_frames_are_refused() -> None:
 
 def test_provenance_says_how_files_are_laid_out(shards: Path) -> None:
     recipe = json.loads((shards / "dataset.json").read_text())["provenance"]["recipe"]
-    assert recipe["files"] == {"previews": 2, "frames_per_file": 4}
+    assert recipe["files"] == {"format": "exr-uint32", "previews": 2, "frames_per_file": 4}

@@ -1,6 +1,7 @@
 """Submissions: a bundle is what was submitted or is refused by name; the leaderboard ranks by the third quartile."""
 
 import hashlib
+import io
 import json
 import zipfile
 from collections.abc import Callable
@@ -55,6 +56,15 @@ def damage(members: Members) -> None:
     members["estimates/pnp.parquet"] = members["estimates/pnp.parquet"][:-1] + b"x"
 
 
+def of_other_frames(members: Members) -> None:
+    """Estimates that say themselves that they are of other frames than their bundle says."""
+    table = pq.read_table(io.BytesIO(members["estimates/pnp.parquet"]))
+    written = io.BytesIO()
+    pq.write_table(table.replace_schema_metadata({"frames_sha256": "0" * 64}), written)
+    members["estimates/pnp.parquet"] = data = written.getvalue()
+    described(members, sha256=hashlib.sha256(data).hexdigest(), bytes=len(data))
+
+
 DAMAGES: dict[str, tuple[Callable[[Members], object], str]] = {
     "outside": (lambda m: m.__setitem__("../../evil.parquet", b"x"), r"'../../evil.parquet' is not in submission.json"),
     "absolute": (lambda m: m.__setitem__("/etc/passwd", b"x"), r"'/etc/passwd' is not in submission.json"),
@@ -72,6 +82,7 @@ DAMAGES: dict[str, tuple[Callable[[Members], object], str]] = {
         "variant is there twice",
     ),
     "other frames": (lambda m: described(m, frames_sha256="0" * 64), "estimates of other frames"),
+    "rows of other frames": (of_other_frames, "estimates/pnp.parquet: estimates of another dataset"),
 }
 
 
@@ -105,7 +116,7 @@ def test_estimates_of_another_set_or_number_of_frames_are_refused(scored_set: Pa
     path = folder / "estimates/pnp.parquet"
     table = pq.read_table(path)
     pq.write_table(table.replace_schema_metadata({"frames_sha256": "0" * 64}), path)
-    with pytest.raises(est.InputError, match="of other frames"):
+    with pytest.raises(est.InputError, match="estimates of another dataset: frames_sha256 is 0000"):
         submit(folder, tmp_path / "a.zip", "A", variants=["pnp"])
     pq.write_table(table.slice(1), path)
     with pytest.raises(est.InputError, match="2 rows, needed one for each of the 3 frames"):

@@ -15,9 +15,9 @@ from conftest import ROOT, SMALL, run, unchanged
 from scipy import stats
 
 import vlcrender as vr
+from vlcrender.core.digest import sha256_of
 from vlcrender.dataset import files, frame_job
 from vlcrender.dataset.dependence import keyed_recipe
-from vlcrender.dataset.files import sha256_of
 from vlcrender.dataset.plan import load_plan
 from vlcrender.dataset.progress import Progress
 from vlcrender.dataset.sweep import SweepTable
@@ -215,6 +215,8 @@ def test_a_cell_is_the_dataset_of_its_values(made: Path, tmp_path: Path) -> None
     assert truth["sweep_read_noise_e"].type == pa.float64()
     told, told_alone = (json.loads((folder / "dataset.json").read_text()) for folder in (cell, tmp_path / "x"))
     assert told["provenance"].pop("sweep") == {"error_deg": 0.5, "read_noise_e": 3.0}
+    for key in ("manifest_sha256", "seal"):  # truth.parquet has the cell's values beside
+        assert told.pop(key) != told_alone.pop(key)
     assert told == told_alone
 
 

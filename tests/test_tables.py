@@ -14,6 +14,7 @@ from vlcrender.dataset.schema import (
     FRAMES_SCHEMA,
     TRUTH_SCHEMA,
     DeviceTruthRow,
+    FileEntry,
     FrameRecord,
     FrameRow,
     LedTruth,
@@ -110,7 +111,7 @@ def record(rng: np.random.Generator, bound: bool) -> FrameRecord:
         "part": 5 if bound else None,
         "sha256": "0" * 64,
         "camera": "main",
-        "exposure_s": exposure,
+        "exposure_s": abs(exposure),
         "capturable": True,
         "accelerometer_m_s2": numbers(3),
         "gyro_rad_s": numbers(3) if bound else None,
@@ -135,7 +136,8 @@ def record(rng: np.random.Generator, bound: bool) -> FrameRecord:
         "bound_exact_m2": numbers(9) if bound else None,
         "added_noise_dn": float(rng.uniform()) if bound else None,
     }
-    return FrameRecord(device=FrameRow.model_validate(device), truth=TruthRow.model_validate(truth))
+    files = {"frames/000003.exr": FileEntry(sha256="0" * 64, bytes=7)}
+    return FrameRecord(device=FrameRow.model_validate(device), truth=TruthRow.model_validate(truth), files=files)
 
 
 def test_rows_survive_journal_and_table_bit_for_bit(tmp_path: Path, rng: np.random.Generator) -> None:
@@ -168,7 +170,7 @@ def test_an_empty_or_infinite_cell_is_named(
 
 def test_other_columns_are_named(tmp_path: Path) -> None:
     pq.write_table(pa.table({"frame": [0]}), tmp_path / "truth.parquet")
-    with pytest.raises(InputError, match=r"columns differ from FORMAT\.md: .*yaw_deg: double"):
+    with pytest.raises(InputError, match=r"columns differ from FORMAT\.md: .*yaw_deg: 0 times, needed once"):
         read_table(tmp_path / "truth.parquet", TruthRow)
     with pytest.raises(InputError, match=r"frames\.parquet: is missing"):
         read_table(tmp_path / "frames.parquet", FrameRow)
@@ -177,17 +179,19 @@ def test_other_columns_are_named(tmp_path: Path) -> None:
 def test_a_table_of_other_names_or_types_is_refused_though_it_has_as_many_columns(
     tmp_path: Path, rng: np.random.Generator
 ) -> None:
-    """A former version may differ in the type of one column, or in the order of two."""
+    """A former version may differ in the name or the type of one column; the order of columns means nothing."""
     path = tmp_path / "truth.parquet"
     write_table(path, [record(rng, bound=True).truth], TruthRow)
     table = pq.read_table(path)
     yaw = table.schema.get_field_index("yaw_deg")
-    pq.write_table(table.set_column(yaw, "yaw_deg", table["yaw_deg"].cast(pa.float32())), path)
-    with pytest.raises(InputError, match=r"columns differ from FORMAT\.md: yaw_deg: double, yaw_deg: float$"):
+    pq.write_table(table.set_column(yaw, "yaw_deg", table["yaw_deg"].cast(pa.string())), path)
+    with pytest.raises(InputError, match=r"columns differ from FORMAT\.md: yaw_deg: string, needed double$"):
+        read_table(path, TruthRow)
+    pq.write_table(table.rename_columns(["yaw" if name == "yaw_deg" else name for name in table.column_names]), path)
+    with pytest.raises(InputError, match=r"columns differ from FORMAT\.md: yaw_deg: 0 times, needed once$"):
         read_table(path, TruthRow)
     pq.write_table(table.select(table.column_names[::-1]), path)
-    with pytest.raises(InputError, match=r"columns differ from FORMAT\.md: their order"):
-        read_table(path, TruthRow)
+    assert len(read_table(path, TruthRow)) == 1
 
 
 def test_a_matrix_is_written_row_by_row() -> None:

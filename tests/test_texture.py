@@ -250,6 +250,18 @@ def _colour(path: Path) -> None:
     Image.new("RGB", (4, 4)).save(path)
 
 
+def _transparent(path: Path) -> None:
+    Image.new("L", (4, 4)).save(path, transparency=0)
+
+
+def _alpha(path: Path) -> None:
+    Image.new("LA", (4, 4)).save(path)
+
+
+def _link(path: Path) -> None:
+    path.symlink_to(Path(__file__).parent.parent / "docs/pictures/nowhere.png")
+
+
 def _large(path: Path) -> None:
     Image.new("L", (2001, 2000)).save(path)
 
@@ -263,6 +275,9 @@ BAD_FILES = {
     "no such file": lambda path: None,
     "no PNG that can be read": lambda path: path.write_bytes(b"P5 1 1 255 x"),
     "no grey image": _colour,
+    "no grey image of 8 or 16 bits without transparency": _transparent,
+    "is no grey image of 8 or 16 bits without": _alpha,
+    "is outside the scene's folder; copy the file there": _link,
     "2001 x 2000 pixels; at most 4000000": _large,
     "is no PNG that can be read: ": _cut,
 }

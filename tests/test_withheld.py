@@ -5,11 +5,12 @@ import re
 import stat
 import struct
 from collections.abc import Iterator
-from contextlib import chdir
+from contextlib import chdir, contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from conftest import ROOT, SMALL, copy_of, run, small_plan, unchanged
@@ -18,6 +19,7 @@ import estimator as est
 import vlcrender as vr
 from estimator.evaluate.submission import score_bundles, submit
 from estimator.io.estimates import EstimateRow, write_estimates
+from vlcrender.dataset.manifest import read_manifest, seal_dataset
 from vlcrender.dataset.progress import FRAMES_STAGE, Progress
 from vlcrender.errors import InputError
 
@@ -113,11 +115,12 @@ def test_no_byte_of_the_set_tells_the_truth(withheld: Path, released: Path) -> N
 def test_what_the_set_states_is_known_key_by_key(withheld: Path) -> None:
     """A new key of the provenance is sealed until it is listed."""
     stated = json.loads((withheld / "dataset.json").read_text())
-    assert set(stated["provenance"]) == {"recipe", "data_version", "versions", "commitment"}
+    assert set(stated["provenance"]) == {"recipe", "program_sha256", "data_version", "versions", "commitment"}
     assert set(stated["provenance"]["recipe"]) == {"expected", "processed", "files", "burst"}
     assert set(content(withheld)) - {
         f"{folder}/00000{i}.{end}" for folder, end in (("frames", "exr"), ("previews", "png")) for i in range(3)
-    } == {"dataset.json", "frames.parquet", "truth.sealed"}
+    } == {"dataset.json", "frames.parquet", "manifest.json", "truth.sealed"}
+    assert set(read_manifest(withheld)) == set(content(withheld)) - {"dataset.json", "manifest.json"}
     assert stated["withheld"]["frames"] == "all"
     assert len({path.stat().st_mtime_ns for path in withheld.rglob("*")}) == 1
 
@@ -218,10 +221,71 @@ def test_verify_says_what_it_does_not_check_and_finds_damage(withheld: Path, tmp
     (folder / "truth.sealed").write_bytes(sealed)
     (folder / "truth_map.parquet").write_bytes(b"")
     problems = "\n".join(vr.verify(folder))
-    assert "truth.sealed: SHA-256 differs from dataset.json" in problems
+    assert problems.count("truth.sealed: SHA-256 differs from manifest.json") == problems.count("truth.sealed") == 1
     assert "truth_map.parquet: is there, but withheld" in problems
+    # One who makes a new manifest has still another truth than dataset.json commits to.
+    (folder / "truth_map.parquet").unlink()
+    seal_dataset(folder)
+    assert vr.verify(folder) == [
+        f"{folder / 'truth.sealed'}: SHA-256 differs from dataset.json: the file was changed or truncated"
+    ]
     (folder / "truth.sealed").unlink()
     assert "truth.sealed: is missing" in "\n".join(vr.verify(folder))
+
+
+def test_verify_checks_rows_and_images_without_the_truth(withheld: Path, partly: Path, tmp_path: Path) -> None:
+    """What is wrong is found behind a new manifest: rows against images, each other and the told rows of the truth."""
+    folder = copy_of(withheld, tmp_path / "set")
+    with changed_table(folder / "frames.parquet") as rows:
+        rows[1]["file"], rows[2]["exposure_s"] = "frames/000009.exr", rows[2]["exposure_s"] * 1.5
+    (folder / "frames/000001.exr").rename(folder / "frames/000009.exr")
+    seal_dataset(folder)
+    problems = "\n".join(vr.verify(folder))
+    assert "frame 1: file is 'frames/000009.exr'; the recipe gives 'frames/000001.exr'" in problems
+    assert "expTime of its header" in problems
+    folder = copy_of(partly, tmp_path / "partly")
+    with changed_table(folder / "truth.parquet") as rows:
+        rows[0]["position_m"][0] += 0.001
+    seal_dataset(folder)
+    (problem,) = vr.verify(folder)
+    assert "is not where the pose puts it" in problem
+
+
+@contextmanager
+def changed_table(path: Path) -> Iterator[list[dict[str, Any]]]:
+    """The rows of a table, which are written at the end as they then are."""
+    table = pq.read_table(path)
+    rows = table.to_pylist()
+    yield rows
+    pq.write_table(pa.Table.from_pylist(rows, table.schema), path)
+
+
+def test_repair_makes_nothing_of_a_withheld_set_but_its_manifest(withheld: Path, tmp_path: Path) -> None:
+    folder = copy_of(withheld, tmp_path / "set")
+    (folder / "manifest.json").unlink()
+    assert vr.repair(folder) == ["manifest.json: made again of the files as they are"]
+    assert content(folder) == content(withheld)
+    assert vr.repair(folder) == []
+    (folder / "frames/000001.exr").unlink()
+    with pytest.raises(InputError, match="its truth is withheld, and with it recipe and seed: nothing can be made again"):
+        vr.repair(folder)
+
+
+def test_the_summary_has_two_digits_until_the_release(withheld: Path, released: Path) -> None:
+    """The median of three frames is one frame's background without noise; so is the brightest pixel."""
+    told, whole = (json.loads((folder / "dataset.json").read_text())["summary"] for folder in (withheld, released))
+    for key in ("brightest_e", "background_e", "saturated_share"):
+        assert told[key] == float(f"{whole[key]:.2g}")
+    assert told["background_e"] != whole["background_e"]
+    assert told["leds"] == whole["leds"]
+
+
+def test_a_release_that_was_killed_is_made_again(withheld: Path, released: Path, key: Path, tmp_path: Path) -> None:
+    folder = copy_of(withheld, tmp_path / "set")
+    for name in ("truth.parquet", "manifest.json"):  # written before dataset.json
+        (folder / name).write_bytes((released / name).read_bytes())
+    vr.release(folder, key)
+    assert content(folder) == content(released)
 
 
 def test_release_needs_the_key(withheld: Path, released: Path, key: Path, tmp_path: Path) -> None:

@@ -135,8 +135,9 @@ class RawFrame:
         region.
         """
         from vlcrender.camera.rig import mounted_cameras
+        from vlcrender.dataset.camera_entries import SensorEntry
         from vlcrender.dataset.downlink_entry import downlink_entry
-        from vlcrender.dataset.schema import SensorEntry, accelerometer_entry, camera_entry, led_map
+        from vlcrender.dataset.schema import accelerometer_entry, camera_entry, led_map
 
         (mounted,) = mounted_cameras(self.camera, ())
         downlink = downlink_entry(self.scene.leds, self.demodulation)
@@ -356,6 +357,32 @@ def release(directory: str | Path, key_file: str | Path) -> None:
     from vlcrender.dataset.withheld import release as write
 
     write(Path(directory), Path(key_file))
+
+
+def repair(directory: str | Path, *, scene_folder: str | Path | None = None, workers: int = 1) -> list[str]:
+    """Make files of a dataset, or of the cells of a sweep, again where they are missing or damaged.
+
+    They are made of the recipe, scene and seed in dataset.json, and take the place of damaged ones only where their
+    digests are those of the manifest: then every bit is as it was. A set that was made before there were manifests gets
+    one if `verify` finds nothing else. `scene_folder` is the folder of the scene file, where the scene has textures or
+    furniture. Returns a line for each file that was made again or could not be. Raises InputError if dataset.json is
+    damaged, which alone says what the set is made of, or if files of the scene are not those of the set.
+    """
+    from vlcrender.dataset.repair import repair as repaired  # loads Mitsuba
+
+    return repaired(Path(directory), None if scene_folder is None else Path(scene_folder), workers)
+
+
+def export_dataset(directory: str | Path, to: str, out: str | Path) -> int:
+    """Export a complete dataset to another tool's format; returns the number of frames.
+
+    `to` is one of png16, csv, tum, opencv-yaml, kalibr, colmap, nerfstudio, bop, webdataset, rosbag2, croissant and
+    card (docs/exporting.md). `out` is a new folder, or a new file for croissant and card; it appears whole or not at
+    all. Raises InputError for bad input, and names what the format cannot express.
+    """
+    from vlcrender.export.registry import export_dataset as export
+
+    return export(Path(directory), to, Path(out))
 
 
 def _plan(

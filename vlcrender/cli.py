@@ -9,18 +9,18 @@ import math
 import os
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from io import TextIOWrapper
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, CycloptsError, Parameter
 
+from vlcrender.core.process import INTERRUPTED, ending_at_second_interrupt, prepare_streams
 from vlcrender.errors import InputError
 
 if TYPE_CHECKING:
     from vlcrender.dataset.error_budget import ErrorBudget
-    from vlcrender.dataset.progress import Progress
+    from vlcrender.dataset.plan import Plan
     from vlcrender.emva1288.datasheet import Datasheet
     from vlcrender.scene.loader import Scene
 
@@ -56,6 +56,7 @@ def generate(
     workers: int = 1,
     scheduler: str | None = None,
     withhold_truth: Path | None = None,
+    dry_run: Annotated[bool, Parameter(negative=())] = False,
 ) -> None:
     """Generate the dataset of a recipe, or one for each cell of its sweep; an interrupted run is continued.
 
@@ -80,70 +81,69 @@ def generate(
     withhold_truth
         Key file, made if missing, with which the truth of the test frames is sealed, or that of all frames without
         [split] (docs/benchmark.md). Keep it; `vlcrender release` needs it.
+    dry_run
+        Print what would be made, and estimates of time and size from a few frames; write nothing in the folder.
     """
     from vlcrender import api
+    from vlcrender.dataset.progress_display import ProgressDisplay
 
     if workers < 1:
         raise InputError(f"--workers {workers}: has to be 1 or more")
     plan = api.load_recipe(recipe, set_, scale=scale, scale_mode=scale_mode)
-    with _Bar(plan.recipe.name, plan.frame_count) as bar:
+    if dry_run:
+        if withhold_truth is not None:
+            from vlcrender.dataset.withheld import check_withholdable
+
+            check_withholdable(plan)
+        _dry_run(plan, workers, out)
+        return
+    with ProgressDisplay(plan.recipe.name, plan.frame_count) as display:
         made = api.generate(
-            plan, out, workers=workers, scheduler=scheduler, progress=bar.show, withhold_truth=withhold_truth
+            plan, out, workers=workers, scheduler=scheduler, progress=display.show, withhold_truth=withhold_truth
         )
     cells = "" if plan.cells is None else f"{len(plan.cells)} cells, "
     print(f"{out}: {cells}{plan.frame_count} frames{'' if made else ' (was already complete and intact)'}")
+    if made and plan.cells is None:
+        from vlcrender.dataset.files import read_dataset_file
+        from vlcrender.dataset.summary import summary_lines
+
+        if (summary := read_dataset_file(out).summary) is not None:
+            print(*summary_lines(summary), sep="\n")
 
 
-class _Bar:
-    """Progress of a dataset on the terminal: a bar of frames, and one of the room's light while it is computed."""
+def _dry_run(plan: "Plan", workers: int, out: Path) -> None:
+    """Print what a plan would make in a folder."""
+    from vlcrender.dataset.dry_run import dry_run
+    from vlcrender.dataset.progress import Progress
+    from vlcrender.dataset.progress_display import ProgressDisplay
 
-    def __init__(self, name: str, frames: int) -> None:
-        from rich.console import Console
-        from rich.progress import (
-            BarColumn,
-            MofNCompleteColumn,
-            Progress,
-            TextColumn,
-            TimeElapsedColumn,
-            TimeRemainingColumn,
-        )
-
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("frames"),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-        )
-        self._bar = Progress(*columns, console=Console(stderr=True))
-        self._light = self._bar.add_task("light", total=1.0, visible=False)
-        self._frames = self._bar.add_task(name, total=frames)
-
-    def __enter__(self) -> "_Bar":
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._bar.stop()
-
-    def show(self, progress: "Progress") -> None:
-        """Draw what `api.generate` reports."""
-        self._bar.start()  # not before the first report: a refusal is one line
-        if progress.stage == "frames":
-            self._bar.update(self._frames, completed=progress.done, total=progress.total)
-        else:
-            share = progress.done / progress.total
-            self._bar.update(self._light, description=progress.stage, completed=share, visible=share < 1)
+    with ProgressDisplay(plan.recipe.name, plan.frame_count) as display:
+        found = dry_run(plan, workers, lambda stage, share: display.show(Progress(stage, share, 1.0)))
+    print(f"{plan.recipe.name}: dry run, nothing is written in {out}", *found.lines(), sep="\n")
 
 
 @app.command
-def verify(directory: Path, /) -> None:
+def verify(
+    directory: Path,
+    /,
+    *,
+    repair: Annotated[bool, Parameter(negative=())] = False,
+    scene_folder: Path | None = None,
+    workers: int = 1,
+) -> None:
     """Check that a dataset, or each cell of a sweep, is complete and intact; the exit code is 0 only then.
 
     Parameters
     ----------
     directory
         Folder of the dataset or sweep.
+    repair
+        Make files that are missing or damaged again, of the recipe, scene and seed in dataset.json, and check then.
+        A file is replaced only by one with the digest that the manifest has.
+    scene_folder
+        With --repair: folder of the scene file, where the scene has textures or furniture.
+    workers
+        With --repair: processes that make frames.
     """
     from vlcrender import api
     from vlcrender.dataset.files import read_dataset_file, read_sweep_file
@@ -157,6 +157,9 @@ def verify(directory: Path, /) -> None:
         if dataset.withheld is not None:
             told = len(dataset.withheld.frames_with_truth(dataset.frame_count))
             unchecked = f" (not checked: the withheld truth of {dataset.frame_count - told} frames)"
+    if repair:
+        for line in api.repair(directory, scene_folder=scene_folder, workers=workers):
+            print(f"{directory}: {line}")
     found = api.verify(directory)
     for problem in found:
         _complain(problem)
@@ -180,6 +183,25 @@ def release(directory: Path, key_file: Path, /) -> None:
 
     api.release(directory, key_file)
     print(f"{directory}: has its truth")
+
+
+@app.command
+def export(directory: Path, /, *, to: str, out: Path) -> None:
+    """Export a dataset to the format of another tool; docs/exporting.md has the conventions of each.
+
+    Parameters
+    ----------
+    directory
+        Folder of a complete dataset.
+    to
+        png16, csv, tum, opencv-yaml, kalibr, colmap, nerfstudio, bop, webdataset, rosbag2, croissant or card.
+    out
+        Folder to write, new or empty; a file for croissant (.json) and card (.md).
+    """
+    from vlcrender import api
+
+    count = api.export_dataset(directory, to, out)
+    print(f"{out}: {to} of {count} frames")
 
 
 @app.command
@@ -442,11 +464,9 @@ def _print_budget(found: "ErrorBudget") -> None:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line, by default with the arguments of this process; exit unless the code is 0."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):
-            stream.reconfigure(errors="replace")  # a terminal without a degree sign gets a question mark, not an error
+    prepare_streams()
     try:
-        with _log_on_stderr():
+        with ending_at_second_interrupt(), _log_on_stderr():
             app(arguments, exit_on_error=False, print_error=False)
         sys.stdout.flush()
     except (CycloptsError, InputError) as error:
@@ -460,7 +480,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sys.exit(2)
     except KeyboardInterrupt:
         _complain("interrupted; run the same command again to go on")
-        sys.exit(130)
+        sys.exit(INTERRUPTED)
     except Exception as error:
         # A fault of this program: one line, without a traceback.
         _complain(f"internal error, please report it: {type(error).__name__}: {error}")
@@ -487,4 +507,5 @@ def _log_on_stderr() -> Iterator[None]:
 
 
 def _complain(message: str) -> None:
-    print("vlcrender:", " ".join(message.split()), file=sys.stderr)
+    with suppress(BrokenPipeError):
+        print("vlcrender:", " ".join(message.split()), file=sys.stderr)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from estimator.errors import InputError
 from estimator.evaluate.score import Position, estimate_paths, read_known, score_frame
 from estimator.io.dataset import Dataset, read_dataset
+from estimator.io.estimates import frames_sha256
 from estimator.io.sweep import dataset_folders
 from estimator.io.truth import SWEPT, TruthRow, read_true_scalars, read_truth
 
@@ -89,12 +90,12 @@ def _of_dataset(folder: Path, label: str, variants: Sequence[str] | None) -> dic
     for name in variants or ():
         if name not in estimates:
             raise InputError(f"{folder / 'estimates'}: none of variant {name}; there are: {', '.join(estimates)}")
-    truth_path = folder / "truth.parquet"
+    truth_path, digest = dataset.folder / "truth.parquet", frames_sha256(dataset.folder)
     truth = read_truth(truth_path, len(dataset.frames))
     scalars = read_true_scalars(truth_path, len(dataset.frames))
     columns: dict[str, Values] = {}
     for name in variants or estimates:
-        rows, leds_m = read_known(estimates[name], dataset)
+        rows, leds_m = read_known(estimates[name], dataset, digest)
         scores = [
             score_frame(row, true, leds_m, record.device)
             for row, true, record in zip(rows, truth, dataset.frames, strict=True)

@@ -1,14 +1,17 @@
 """Run of variants over a dataset or all datasets of a sweep, which writes their estimates."""
 
 import logging
+import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from estimator.errors import InputError
 from estimator.evaluate.batch import estimate_dataset, steps
 from estimator.evaluate.workers import estimate_with_workers
-from estimator.io.dataset import read_dataset
-from estimator.io.estimates import EstimateRow, estimates_path, write_estimates
+from estimator.io.dataset import Dataset, read_dataset
+from estimator.io.estimates import EstimateRow, estimates_path, frames_sha256, write_estimates
+from estimator.io.lock import locked
+from estimator.io.results import dataset_folder, make_results_folder
 from estimator.io.sweep import dataset_folders
 from estimator.methods.registry import Registry, variants
 from estimator.methods.variant import Variant
@@ -21,6 +24,7 @@ def run(
     variants: Sequence[str | Variant] | None = None,
     workers: int = 1,
     progress: Callable[[int, int], None] | None = None,
+    out: str | Path | None = None,
 ) -> dict[str, tuple[EstimateRow, ...]]:
     """Estimate every frame of a dataset, and write estimates/VARIANT.parquet for each variant.
 
@@ -40,6 +44,9 @@ def run(
     progress
         Called with (frames done, frames in all) at the start and after every frame. Where a variant uses all frames
         of a device, each frame counts twice: as its image is done, and as the frames of its device are.
+    out
+        Folder for the estimates where the dataset's own is not to be written: made, or one with results of the same
+        dataset. `score` and the other commands take it in place of the dataset.
 
     Returns
     -------
@@ -50,7 +57,8 @@ def run(
     Raises
     ------
     InputError
-        The dataset cannot be read, a variant is unknown, or a worker process died.
+        The dataset cannot be read, the files of all frames are missing, a variant is unknown, another run uses the
+        folder, or a worker process died.
     OSError
         The estimates cannot be written.
     """
@@ -60,11 +68,34 @@ def run(
     chosen = _chosen(variants)
     for name in chosen:
         estimates_path(folder, name)
+    home = folder if out is None or os.path.realpath(out) == os.path.realpath(folder) else Path(out)
+    if home != folder:
+        dataset_folders(folder)  # refuses a damaged sweep before the folder is made
+        make_results_folder(home, dataset_folder(folder))
+    with locked(home, "estimator run"):
+        return _run(folder, home, chosen, workers, progress)
+
+
+def _run(
+    folder: Path,
+    home: Path,
+    chosen: dict[str, Variant],
+    workers: int,
+    progress: Callable[[int, int], None] | None,
+) -> dict[str, tuple[EstimateRow, ...]]:
+    """`run`, with the estimates in the folder `home`, which is locked."""
     cells = dataset_folders(folder)
+    homes = [home / os.path.relpath(cell, folder) for cell in cells]
     # A cell that cannot be read is refused before the first frame is estimated. Not all are in memory at a time.
     frames = 0
-    for cell in cells:
+    digests = []
+    for cell, of_cell in zip(cells, homes, strict=True):
         dataset = read_dataset(cell)
+        digests.append(frames_sha256(dataset.folder))
+        _check_files(dataset)
+        if of_cell != cell and of_cell != home:
+            make_results_folder(of_cell, dataset.folder)
+        _check_writable(of_cell)
         frames += len(dataset.frames)
     done, total = 0, frames * steps(chosen.values())
 
@@ -84,13 +115,28 @@ def run(
         _check_registered(chosen)
         of_cells = estimate_with_workers(datasets, list(chosen), min(workers, frames), on_frame)
     rows: dict[str, list[EstimateRow]] = {name: [] for name in chosen}
-    for cell, of_cell in zip(cells, of_cells, strict=True):
-        for name, of_variant in of_cell.items():
-            path = write_estimates(cell, name, of_variant)
+    for of_cell, digest, found in zip(homes, digests, of_cells, strict=True):
+        for name, of_variant in found.items():
+            path = write_estimates(of_cell, name, of_variant, digest)
             failed = sum(row.status == "failed" for row in of_variant)
             logger.info("%s: %d of %d frames failed, estimates in %s", name, failed, len(of_variant), path)
             rows[name] += of_variant
     return {name: tuple(of_variant) for name, of_variant in rows.items()}
+
+
+def _check_files(dataset: Dataset) -> None:
+    """Refuse a dataset of which no frame has a file: their loss is no failure of a variant."""
+    if dataset.frames and not any((dataset.folder / record.file).is_file() for record in dataset.frames):
+        raise InputError(
+            f"{dataset.folder}: the files of all {len(dataset.frames)} frames are missing, the first "
+            f"{dataset.frames[0].file}; generate or copy the dataset again"
+        )
+
+
+def _check_writable(folder: Path) -> None:
+    """Refuse a folder that cannot be written before the first frame is estimated."""
+    if not all(os.access(path, os.W_OK) for path in (folder, folder / "estimates") if path.exists()):
+        raise InputError(f"{folder}: cannot be written; choose another folder for the estimates with --out")
 
 
 def _chosen(selection: Sequence[str | Variant] | None) -> dict[str, Variant]:

@@ -1,15 +1,18 @@
 """Scores: estimates compared with the truth, by frame and by variant. Every frame counts, failed or not."""
 
+import errno
+import logging
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
 from estimator.errors import InputError
 from estimator.evaluate.identities import IdentityScore, score_identities
+from estimator.evaluate.sources import sources_of
 from estimator.evaluate.statistics import (
     AgainstBound,
     DeviceScore,
@@ -34,17 +37,23 @@ from estimator.io.atomic import write_atomically
 from estimator.io.dataset import Dataset, read_dataset
 from estimator.io.estimates import EstimateRow, read_estimates
 from estimator.io.led_map import AnyLed
-from estimator.io.records import LedId, Number, Positive, Row, Size, Triple, first_problem
+from estimator.io.lock import locked
+from estimator.io.records import LedId, Number, Positive, Row, Size, Triple
 from estimator.io.truth import TruthRow, read_true_map, read_truth
 from estimator.io.withheld import read_withheld
 
 if TYPE_CHECKING:
     import pandas as pd
 
+logger = logging.getLogger(__name__)
+
 VERSION = 4
 Position = tuple[float, float, float]
 # Enough for a position without gravity: frames with more are counted with these.
 ENOUGH_LEDS = 4
+
+
+Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 
 
 class RangeError(Row):
@@ -129,6 +138,8 @@ class Scores(Row):
 
     format: Literal["estimator-scores"] = "estimator-scores"
     version: Literal[4] = 4
+    sources: dict[str, Sha256] = Field(default_factory=dict)
+    """SHA-256 of each file that the scores are made of, by its path below the dataset or its results."""
     dataset: str
     room_m: tuple[Positive, Positive, Positive] | None
     led_map: tuple[AnyLed, ...]
@@ -402,7 +413,8 @@ def score(directory: str | Path) -> Scores:
     Parameters
     ----------
     directory
-        Folder of a dataset with estimates, as `run` writes them.
+        Folder of a dataset with estimates, or of results, as `run` writes them. Where it cannot be written, as on a
+        read-only file system, scores.json is not written, with a warning.
 
     Returns
     -------
@@ -412,57 +424,47 @@ def score(directory: str | Path) -> Scores:
     Raises
     ------
     InputError
-        There are no estimates, or a file is missing or damaged.
+        There are no estimates, or they are of another dataset; a file is missing or damaged; another run uses the
+        folder.
     """
     folder = Path(directory)
+    with locked(folder, "estimator score"):
+        return _score(folder)
+
+
+def _score(folder: Path) -> Scores:
+    """`score` of a folder that is locked."""
     dataset = read_dataset(folder)
     paths = estimate_paths(folder)
     if not paths:
         raise InputError(f"{folder / 'estimates'}: no estimates to score; make them with `estimator run {folder}`")
-    if read_withheld(folder) is not None:
+    if read_withheld(dataset.folder) is not None:
         raise InputError(
-            f"{folder}: truth is withheld; score bundles: estimator score BUNDLE.zip --dataset {folder} --truth KEYFILE"
+            f"{dataset.folder}: truth is withheld; score bundles: estimator score BUNDLE.zip "
+            f"--dataset {dataset.folder} --truth KEYFILE"
         )
-    truth = read_truth(folder / "truth.parquet", len(dataset.frames))
+    sources = sources_of(folder, paths)
+    truth = read_truth(dataset.folder / "truth.parquet", len(dataset.frames))
     devices = [record.device for record in dataset.frames]
-    true_map = () if dataset.leds or not dataset.frames else read_true_map(folder / "truth_map.parquet")
+    true_map = () if dataset.leds or not dataset.frames else read_true_map(dataset.folder / "truth_map.parquet")
     variants = []
     for path in paths:
-        rows, leds_m = read_known(path, dataset)
+        rows, leds_m = read_known(path, dataset, sources["frames.parquet"])
         downlink = score_identities(rows, truth, dataset, true_map)
         variants.append(score_variant(path.stem, rows, truth, leds_m, devices, downlink))
     scores = Scores(
+        sources=sources,
         dataset=dataset.name,
         room_m=dataset.room_m,
         led_map=tuple(dataset.leds.values()),
         variants=tuple(variants),
     )
-    write_atomically(folder / "scores.json", scores.model_dump_json(indent=1).encode() + b"\n")
-    return scores
-
-
-class _Version(BaseModel):
-    version: int
-
-
-def read_or_score(folder: Path) -> Scores:
-    """Scores of scores.json if it is newer than the truth and all estimates and covers them, else new scores.
-
-    The truth may be missing if scores.json is there. Scores of an older version are computed again. Raises InputError.
-    """
-    path, estimates = folder / "scores.json", estimate_paths(folder)
-    sources = [source for source in (*estimates, folder / "truth.parquet") if source.exists()]
-    if not path.exists() or any(source.stat().st_mtime > path.stat().st_mtime for source in sources):
-        return score(folder)
-    content = path.read_bytes()
     try:
-        if _Version.model_validate_json(content).version < VERSION:
-            return score(folder)
-        scores = Scores.model_validate_json(content)
-    except ValidationError as error:
-        raise InputError(f"{path}: {first_problem(error)}") from None
-    if estimates and [one.variant for one in scores.variants] != [estimate.stem for estimate in estimates]:
-        return score(folder)
+        write_atomically(folder / "scores.json", scores.model_dump_json(indent=1).encode() + b"\n")
+    except OSError as error:
+        if error.errno not in (errno.EROFS, errno.EACCES, errno.EPERM):
+            raise
+        logger.warning("%s: not written: %s", folder / "scores.json", error.strerror)
     return scores
 
 
@@ -475,12 +477,13 @@ def estimate_paths(folder: Path) -> list[Path]:
     return paths
 
 
-def read_known(path: Path, dataset: Dataset) -> tuple[tuple[EstimateRow, ...], dict[int, Position]]:
+def read_known(path: Path, dataset: Dataset, digest: str) -> tuple[tuple[EstimateRow, ...], dict[int, Position]]:
     """Estimates of a file, and positions of LEDs by id: those of the map, or those that packets told.
 
-    Raises InputError for a range to an LED that is in neither.
+    digest: `frames_sha256` of the dataset. Raises InputError for estimates of another dataset, and for a range to an
+    LED that is in neither.
     """
-    rows = read_estimates(path, len(dataset.frames))
+    rows = read_estimates(path, len(dataset.frames), digest)
     leds_m = {led.id: led.position_m for led in dataset.leds.values()}
     if not leds_m:
         told = [one for row in rows for one in row.identities or ()]

@@ -25,7 +25,7 @@ from estimator.evaluate.identities import score_identities
 from estimator.evaluate.score import VariantScore, estimate_paths, read_known, score_variant
 from estimator.io.atomic import write_atomically
 from estimator.io.dataset import Dataset, read_dataset
-from estimator.io.estimates import NAME, NAME_RULE
+from estimator.io.estimates import NAME, NAME_RULE, frames_sha256
 from estimator.io.records import Row, first_line, first_problem
 from estimator.io.withheld import JudgedTruth, SplitName, read_judged_truth
 
@@ -90,6 +90,7 @@ def submit(folder: Path, out: Path, name: str, author: str | None = None, varian
     Raises InputError where there are none, or they are damaged or of other frames.
     """
     dataset = read_dataset(folder)
+    digest = frames_sha256(dataset.folder)
     paths = {path.stem: path for path in estimate_paths(folder)}
     chosen = list(dict.fromkeys(variants)) or list(paths)
     if not chosen:
@@ -100,14 +101,14 @@ def submit(folder: Path, out: Path, name: str, author: str | None = None, varian
             raise InputError(
                 f"{folder / 'estimates'}: none of variant {variant}; there are: {', '.join(paths) or 'none'}"
             )
-        read_known(paths[variant], dataset)
+        read_known(paths[variant], dataset, digest)
         files[variant] = paths[variant].read_bytes()
     try:
         description = Submission(
             name=name,
             author=author,
             dataset=dataset.name,
-            frames_sha256=_frames_sha256(folder),
+            frames_sha256=digest,
             versions={"estimator": version("vlcrender"), "python": platform.python_version()},
             estimates=tuple(
                 SubmittedEstimates(variant=variant, sha256=hashlib.sha256(data).hexdigest(), bytes=len(data))
@@ -118,7 +119,7 @@ def submit(folder: Path, out: Path, name: str, author: str | None = None, varian
         raise InputError(f"submission: {first_problem(error)}") from None
     bundle = Bundle(str(out), description, files)
     for variant, data in files.items():
-        _check_made_for(bundle, variant, data, len(dataset.frames))
+        _check_size(bundle, variant, data, len(dataset.frames))
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
         # ZipInfo's fixed time: the same estimates make the same bundle.
@@ -182,22 +183,22 @@ def score_bundles(
     or of other frames, and as `read_judged_truth`.
     """
     dataset = read_dataset(folder)
-    frames_sha256 = _frames_sha256(folder)
+    digest = frames_sha256(dataset.folder)
     truth = read_judged_truth(dataset, key_file, split)
     entries = []
     for path in bundles:
         bundle = read_bundle(path)
-        if bundle.description.frames_sha256 != frames_sha256:
-            raise InputError(f"{path}: estimates of other frames than {folder / 'frames.parquet'} has")
+        if bundle.description.frames_sha256 != digest:
+            raise InputError(f"{path}: estimates of other frames than {dataset.folder / 'frames.parquet'} has")
         for variant, data in bundle.files.items():
-            _check_made_for(bundle, variant, data, len(dataset.frames))
+            _check_size(bundle, variant, data, len(dataset.frames))
             score = _score(bundle, variant, data, dataset, truth)
             entries.append(Entry(bundle.description.name, bundle.description.author, score))
     return entries
 
 
-def _check_made_for(bundle: Bundle, variant: str, data: bytes, frame_count: int) -> None:
-    """Refuse estimates that their own metadata or number of rows says are of other frames, before rows are read."""
+def _check_size(bundle: Bundle, variant: str, data: bytes, frame_count: int) -> None:
+    """Refuse estimates of another number of frames, or too many bytes, before rows are read."""
     where = f"{bundle.source}: estimates/{variant}.parquet"
     try:
         metadata = pq.read_metadata(io.BytesIO(data))
@@ -208,9 +209,6 @@ def _check_made_for(bundle: Bundle, variant: str, data: bytes, frame_count: int)
     size = sum(metadata.row_group(group).total_byte_size for group in range(metadata.num_row_groups))
     if size > MAX_ESTIMATES_BYTES:
         raise InputError(f"{where}: has more than {MAX_ESTIMATES_BYTES} bytes unpacked")
-    made_for = (metadata.metadata or {}).get(b"frames_sha256")
-    if made_for is not None and made_for.decode(errors="replace") != bundle.description.frames_sha256:
-        raise InputError(f"{where}: estimates of other frames than the submission says")
 
 
 def _score(bundle: Bundle, variant: str, data: bytes, dataset: Dataset, truth: JudgedTruth) -> VariantScore:
@@ -220,14 +218,10 @@ def _score(bundle: Bundle, variant: str, data: bytes, dataset: Dataset, truth: J
         path = Path(opened) / f"{variant}.parquet"
         path.write_bytes(data)
         try:
-            rows, leds_m = read_known(path, dataset)
+            rows, leds_m = read_known(path, dataset, bundle.description.frames_sha256)
         except InputError as error:
             raise InputError(f"{bundle.source}: {str(error).replace(f'{path}', f'estimates/{path.name}')}") from None
     judged = [rows[frame] for frame in truth.frames]
     records = tuple(dataset.frames[frame] for frame in truth.frames)
     downlink = score_identities(judged, truth.rows, replace(dataset, frames=records), truth.true_map)
     return score_variant(variant, judged, truth.rows, leds_m, [record.device for record in records], downlink)
-
-
-def _frames_sha256(folder: Path) -> str:
-    return hashlib.sha256((folder / "frames.parquet").read_bytes()).hexdigest()

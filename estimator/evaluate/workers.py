@@ -66,6 +66,13 @@ def estimate_with_workers(
         raise InputError(
             "a worker process died (out of memory?); the dataset's estimates were not written; try fewer --workers"
         ) from None
+    except BaseException:
+        # No estimate of the dataset in hand will be written: end the workers now, and do not wait for their frames.
+        with _interrupts_deferred():
+            for process in list((getattr(pool, "_processes", None) or {}).values()):
+                process.kill()
+            pool.shutdown(cancel_futures=True)
+        raise
     finally:
         pool.shutdown(cancel_futures=True)
 

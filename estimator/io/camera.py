@@ -1,19 +1,13 @@
 """Cameras as devices know them: intrinsics, distortion, pose on the rig, and their uncertainty (datasets/FORMAT.md)."""
 
 from collections.abc import Mapping
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
-from estimator.io.records import (
-    NotNegative,
-    Number,
-    Positive,
-    Row,
-    Triple,
-)
+from estimator.io.records import Entry, Rotation, Share, Triple
 from estimator.io.shutter import GLOBAL, Shutter
 
 Floats = NDArray[np.float64]
@@ -29,17 +23,26 @@ def to_pixels(image: Floats, K: Floats) -> Floats:
     return np.asarray(image @ K[:2, :2].T + K[:2, 2])
 
 
-class Distortion(Row):
+Length = Annotated[float, Field(gt=0, le=1e6)]
+Coefficient = Annotated[float, Field(ge=-100, le=100)]
+Sigma = Annotated[float, Field(ge=0, le=1e6)]
+MAX_DISTANCE_ERROR = 1e-12
+"""Relative difference of `image_distance_mm` from the mean of fx and fy: rounding of a double."""
+MAX_KERNEL_ERROR = 1e-6
+MAX_SKEW_PX = 1e4
+
+
+class Distortion(Entry):
     """Brown-Conrady coefficients in OpenCV's convention, for normalized image coordinates.
 
     Other keys are refused: without a coefficient of the calibration, undistorted pixels would be wrong.
     """
 
-    k1: Number
-    k2: Number
-    k3: Number
-    p1: Number
-    p2: Number
+    k1: Coefficient
+    k2: Coefficient
+    k3: Coefficient
+    p1: Coefficient
+    p2: Coefficient
 
     @model_validator(mode="before")
     @classmethod
@@ -58,7 +61,7 @@ coefficients of distortion plus k1, p1, p2. `focal` and `aspect` are relative, c
 """
 
 
-class CameraUncertainty(Row):
+class CameraUncertainty(Entry):
     """Standard deviations of the stated intrinsics and mounting of a camera; keys as in dataset.json.
 
     The errors are independent and normal. Those of `device_sigma` are the same in every frame of a device, those of
@@ -67,10 +70,10 @@ class CameraUncertainty(Row):
     """
 
     parameters: tuple[IntrinsicName, ...]
-    device_sigma: tuple[NotNegative, ...]
-    shot_sigma: tuple[NotNegative, ...]
-    offset_sigma_m: NotNegative
-    rotation_sigma_deg: NotNegative
+    device_sigma: tuple[Sigma, ...]
+    shot_sigma: tuple[Sigma, ...]
+    offset_sigma_m: Sigma
+    rotation_sigma_deg: Sigma
 
     @model_validator(mode="after")
     def _one_of_each(self) -> Self:
@@ -93,27 +96,27 @@ class CameraUncertainty(Row):
         return np.array([stated.get(name, 0.0) for name in INTRINSICS])
 
 
-class Camera(Row):
+class Camera(Entry):
     """Camera of a device: intrinsics, lens, and mounting on the rig; keys as in dataset.json.
 
     `K` maps normalized image coordinates to continuous pixels with pixel centres at +0.5. `uncertainty` is None where
     the device does not state how well it knows its camera; deviations of 0 state that the camera is exact.
     """
 
-    width_px: int = Field(ge=1, le=65536)
-    height_px: int = Field(ge=1, le=65536)
+    width_px: int = Field(ge=8, le=20000)
+    height_px: int = Field(ge=8, le=20000)
     K: tuple[Triple, Triple, Triple]
-    pixel_pitch_um: Positive
-    focal_length_mm: Positive
-    image_distance_mm: Positive
-    f_number: Positive
+    pixel_pitch_um: Length
+    focal_length_mm: Length
+    image_distance_mm: Length
+    f_number: Length
     projection: Literal["perspective", "equidistant"]
     distortion: Distortion | None
-    focus_distance_m: Positive | Literal["infinity"] | None
+    focus_distance_m: Length | Literal["infinity"] | None
     psf: Literal["none", "diffraction", "measured"]
-    psf_wavelength_nm: Positive
-    psf_kernel: tuple[tuple[Number, ...], ...] | None
-    R_cam_rig: tuple[Triple, Triple, Triple]
+    psf_wavelength_nm: Length
+    psf_kernel: tuple[tuple[Share, ...], ...] | None
+    R_cam_rig: Rotation
     offset_m: Triple
     uncertainty: CameraUncertainty | None = None
     shutter: Shutter = GLOBAL
@@ -124,6 +127,35 @@ class Camera(Row):
         if k[0][0] <= 0 or k[1][1] <= 0 or k[1][0] != 0 or k[2] != (0.0, 0.0, 1.0):
             raise ValueError("K has to be [[fx, skew, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0")
         return k
+
+    @model_validator(mode="after")
+    def _image_is_near_the_axis(self) -> Self:
+        (fx, skew, u), (_, fy, v), _ = self.K
+        if not (-self.width_px <= u <= 2 * self.width_px and -self.height_px <= v <= 2 * self.height_px):
+            raise ValueError("K: the principal point has to lie at most one image beside the image")
+        if not (0.5 <= fx / fy <= 2 and abs(skew) <= MAX_SKEW_PX):
+            raise ValueError(f"K: fx / fy has to be from 0.5 to 2, and the skew at most {MAX_SKEW_PX:g} px")
+        return self
+
+    @model_validator(mode="after")
+    def _focal_lengths_agree(self) -> Self:
+        in_pixels = (self.K[0][0] + self.K[1][1]) / 2
+        image_distance_px = self.image_distance_mm * 1000 / self.pixel_pitch_um
+        if not abs(image_distance_px - in_pixels) <= MAX_DISTANCE_ERROR * in_pixels:
+            raise ValueError("image_distance_mm over the pixel pitch has to be the mean of fx and fy of K")
+        return self
+
+    @model_validator(mode="after")
+    def _kernel_where_measured(self) -> Self:
+        rows = self.psf_kernel
+        if (rows is None) != (self.psf != "measured"):
+            raise ValueError('psf_kernel has to be given with psf "measured", and only then')
+        if rows is not None:
+            if len(rows) % 2 == 0 or len(rows) > 255 or any(len(row) != len(rows) for row in rows):
+                raise ValueError("psf_kernel has to be square, with an odd number of rows of at most 255")
+            if abs(sum(map(sum, rows)) - 1) > MAX_KERNEL_ERROR:
+                raise ValueError("psf_kernel has to have the sum 1")
+        return self
 
     @model_validator(mode="after")
     def _no_distortion_of_a_fish_eye(self) -> Self:

@@ -26,6 +26,7 @@ from estimator.io.device import (
     regions_problem,
 )
 from estimator.io.downlink import Downlink, downlink_problem, spots_problem
+from estimator.io.frame_files import FrameFormat, frame_format, numbers_of_exr, numbers_of_png
 from estimator.io.led_map import AnyLed, DeviceNumber, Luminaire, MapDatum, leds_by_id, luminaires_by_id
 from estimator.io.records import (
     INT64_MAX,
@@ -38,6 +39,7 @@ from estimator.io.records import (
     missing_key,
     read_rows,
 )
+from estimator.io.results import dataset_folder
 from estimator.io.sensor import Sensor
 from estimator.io.shard import frame_of_shard
 from estimator.io.shutter import Gyroscope
@@ -155,6 +157,7 @@ class Dataset:
     map_datum: MapDatum | None
     gyroscope: Gyroscope | None = None
     downlink: Downlink | None = None
+    frame_format: FrameFormat = "exr-uint32"
 
 
 def read_dataset(path: str | Path) -> Dataset:
@@ -163,7 +166,7 @@ def read_dataset(path: str | Path) -> Dataset:
     Parameters
     ----------
     path
-        Folder of the dataset.
+        Folder of the dataset, or of its results (datasets/FORMAT.md).
 
     Returns
     -------
@@ -175,7 +178,7 @@ def read_dataset(path: str | Path) -> Dataset:
     InputError
         A file is missing, damaged, or of another version of the format; the message names the file and the key.
     """
-    folder = Path(path)
+    folder = dataset_folder(path)
     description_path = folder / "dataset.json"
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder")
@@ -191,7 +194,7 @@ def read_dataset(path: str | Path) -> Dataset:
         version = _Format.model_validate_json(content).version
         if version != FORMAT_VERSION:
             raise InputError(f"{description_path}: version {version} of the format, needed {FORMAT_VERSION}")
-        description = _Description.model_validate_json(content)
+        description, form = _Description.model_validate_json(content), frame_format(content)
         if missing := missing_key(description):
             raise InputError(f"{description_path}: {missing}: Field required")
     except ValidationError as error:
@@ -209,6 +212,7 @@ def read_dataset(path: str | Path) -> Dataset:
         map_datum=description.map_datum,
         gyroscope=description.gyroscope,
         downlink=description.downlink,
+        frame_format=form,
     )
     _check_frames(folder / "frames.parquet", dataset, description.frame_count)
     return dataset
@@ -230,7 +234,10 @@ def _check_frames(path: Path, dataset: Dataset, frame_count: int) -> None:
             raise InputError(f"{path}: frame {index}: unknown camera {record.camera!r}; cameras: {known}")
         problem = spots_problem(dataset.downlink, record.spots) or decoding_problem(record.spots, dataset.leds)
         problem = problem or gravity_problem(record.accelerometer_m_s2, dataset.accelerometer)
-        if problem := problem or gyro_problem(record.gyro_rad_s, dataset.gyroscope):
+        problem = problem or gyro_problem(record.gyro_rad_s, dataset.gyroscope)
+        if problem is None and record.gyro_rad_s is None and dataset.gyroscope is not None:
+            problem = "gyro_rad_s is null, but gyroscope is given"
+        if problem:
             raise InputError(f"{path}: frame {index}: {problem}")
     _check_bursts(path, dataset.frames)
 
@@ -283,7 +290,7 @@ def read_frame(dataset: Dataset, frame: FrameRecord | int, *, with_other_cameras
     else:
         raise InputError(f"{dataset.folder}: no frame {frame}; there are {len(dataset.frames)}, from 0 on")
     camera = dataset.cameras[record.camera]
-    parts = _read_exr(dataset.folder, record, camera)
+    parts = _read_parts(dataset.folder, record, camera, dataset.frame_format)
     if problem := depth_problem(parts, dataset.sensor):
         raise InputError(f"{record.file}: {problem}")
     made = DeviceFrame(
@@ -320,8 +327,10 @@ def _shot(dataset: Dataset, record: FrameRecord) -> tuple[FrameRecord, ...]:
     return dataset.frames[first:end]
 
 
-def _read_exr(folder: Path, record: FrameRecord, camera: Camera) -> tuple[Part, ...]:
+def _read_parts(folder: Path, record: FrameRecord, camera: Camera, form: FrameFormat) -> tuple[Part, ...]:
     data = _file_of(folder, record)
+    if form == "png16":
+        return (Part(0, 0, numbers_of_png(data, (camera.height_px, camera.width_px), record.file)),)
     try:
         with OpenEXR.File(io.BytesIO(data), header_only=True) as file:
             boxes = _check_headers(record, [part.header for part in file.parts], camera)
@@ -337,9 +346,8 @@ def _read_exr(folder: Path, record: FrameRecord, camera: Camera) -> tuple[Part, 
     parts = []
     for box, image in zip(boxes, images, strict=True):
         rows, columns = (box[1] - box[0] + 1)[::-1].tolist()
-        if image is None or image.dtype != np.uint32 or image.shape != (rows, columns):
-            raise InputError(f"{record.file}: channel Y has to hold 32-bit unsigned integers, one a pixel")
-        parts.append(Part(int(box[0, 1]), int(box[0, 0]), np.asarray(image, dtype=np.uint32)))
+        numbers = numbers_of_exr(image, form, (rows, columns), record.file)
+        parts.append(Part(int(box[0, 1]), int(box[0, 0]), numbers))
     return tuple(parts)
 
 
@@ -383,6 +391,8 @@ def _check_headers(record: FrameRecord, headers: list[dict[str, object]], camera
         if record.capturable and ((box[0] < sensor[0]) | (box[1] > sensor[1])).any():
             raise InputError(f"{record.file}: dataWindow {box.tolist()} extends beyond the sensor, but is capturable")
         boxes.append(box)
+    if not record.capturable and all(((box[0] >= sensor[0]) & (box[1] <= sensor[1])).all() for box in boxes):
+        raise InputError(f"{record.file}: every dataWindow lies on the sensor, but capturable is false")
     if problem := regions_problem(boxes, camera):
         raise InputError(f"{record.file}: {problem}")
     return boxes

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol, TypeVar
+from typing import Annotated, Any, Literal, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +15,8 @@ from estimator.io.downlink import Downlink, downlink_problem, spots_problem
 from estimator.io.led_map import AnyLed, DeviceNumber, Led, Luminaire, MapDatum, leds_by_id, luminaires_by_id
 from estimator.io.records import (
     INT64_MAX,
+    Entry,
     LedId,
-    NotNegative,
     Number,
     Positive,
     Row,
@@ -80,7 +80,11 @@ def gravity_problem(reading_m_s2: Sequence[float] | None, accelerometer: "Accele
     return None
 
 
-class Accelerometer(Row):
+TiltSigma = Annotated[float, Field(ge=0, le=180)]
+"""Degrees."""
+
+
+class Accelerometer(Entry):
     """Error of the accelerometer as the device knows it, degrees, one standard deviation.
 
     Of kind "tilt-error" it is the error of each tilt; of kind "imu" the error of the direction of gravity, along each
@@ -89,9 +93,9 @@ class Accelerometer(Row):
     """
 
     kind: Literal["tilt-error", "imu"]
-    error_deg: NotNegative
-    device_error_deg: NotNegative | None = None
-    shot_error_deg: NotNegative | None = None
+    error_deg: TiltSigma
+    device_error_deg: TiltSigma | None = None
+    shot_error_deg: TiltSigma | None = None
 
 
 @dataclass(frozen=True, eq=False)

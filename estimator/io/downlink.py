@@ -5,7 +5,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, Strict, field_validator, model_validator
 
-from estimator.io.records import LedId, Number, Positive, Row
+from estimator.io.records import Entry, LedId, Number, Positive
 
 MAX_CHIPS = 4096
 INDEX_BITS = 13
@@ -19,7 +19,7 @@ Chips = Annotated[str, Field(pattern=f"^[01]{{2,{MAX_CHIPS}}}$")]
 Pair = Annotated[tuple[Number, Number], Strict(False)]
 
 
-class Transmitter(Row):
+class Transmitter(Entry):
     """What LEDs with one clock in common send; keys as in dataset.json. See `Codes`, `Tones`, `Packets`.
 
     `depth` is the share of the light that is switched: 1 switches it off. `clock_error` is the standard deviation of
@@ -70,14 +70,14 @@ class Tones(Transmitter):
         return self
 
 
-class DiscFace(Row):
+class DiscFace(Entry):
     """Face of every LED of a panel that sends packets: a disc."""
 
     shape: Literal["disc"]
     radius_m: Positive
 
 
-class SquareFace(Row):
+class SquareFace(Entry):
     """Face of every LED of a panel that sends packets: a square."""
 
     shape: Literal["square"]
@@ -126,7 +126,7 @@ AnyTransmitter = Annotated[Codes | Tones | Packets, Field(discriminator="send")]
 """An entry of `transmitters`, told apart by `send`."""
 
 
-class Downlink(Row):
+class Downlink(Entry):
     """What the LEDs send; keys as in dataset.json.
 
     `demodulation` is "given" where the identities in a frame's `spots` are handed over, and "pixels" where `spots` is

@@ -1,5 +1,6 @@
 """Estimates of a variant on disk: estimates/VARIANT.parquet, one row a frame (datasets/FORMAT.md)."""
 
+import hashlib
 import io
 import re
 from collections.abc import Sequence
@@ -13,7 +14,7 @@ from pydantic import Field, Strict, model_validator
 from estimator.errors import InputError
 from estimator.io.atomic import write_atomically
 from estimator.io.device import Identity
-from estimator.io.records import Covariance, LedId, Number, Row, Triple, read_rows
+from estimator.io.records import Covariance, LedId, Number, Row, Triple, read_metadata, read_rows
 
 COLUMNS = {
     "frame": pa.int64(),
@@ -37,6 +38,9 @@ COLUMNS = {
         )
     ),
 }
+
+FRAMES_SHA256 = "frames_sha256"
+"""Key of the file's metadata with the SHA-256 of the dataset's frames.parquet."""
 
 # Most file systems allow names of 255 bytes; the name of the temporary file is longer than the variant's.
 NAME = r"[A-Za-z0-9][A-Za-z0-9._:=,+-]{0,199}"
@@ -82,19 +86,50 @@ def estimates_path(folder: Path, variant: str) -> Path:
     return folder / "estimates" / f"{variant}.parquet"
 
 
-def write_estimates(folder: Path, variant: str, rows: Sequence[EstimateRow]) -> Path:
-    """Write a variant's rows, replacing an older file atomically; returns the path. Raises InputError, OSError."""
+def sha256_of(path: Path) -> str:
+    """SHA-256 of a file's bytes, 64 hex digits. Raises InputError where it cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror or error}") from None
+
+
+def frames_sha256(dataset: Path) -> str:
+    """SHA-256 of a dataset's frames.parquet, which says what its estimates are of. Raises InputError."""
+    return sha256_of(dataset / "frames.parquet")
+
+
+def write_estimates(folder: Path, variant: str, rows: Sequence[EstimateRow], digest: str | None = None) -> Path:
+    """Write a variant's rows, replacing an older file atomically; returns the path. Raises InputError, OSError.
+
+    digest: `frames_sha256` of the dataset at the time its frames were read; of `folder` now if None.
+    """
     path = estimates_path(folder, variant)
     path.parent.mkdir(exist_ok=True)
-    schema = pa.schema(list(COLUMNS.items()))
+    schema = pa.schema(list(COLUMNS.items()), {FRAMES_SHA256: digest or frames_sha256(folder)})
     buffer = io.BytesIO()
     pq.write_table(pa.Table.from_pylist([row.model_dump() for row in rows], schema), buffer)
     write_atomically(path, buffer.getvalue())
     return path
 
 
-def read_estimates(path: Path, frame_count: int) -> tuple[EstimateRow, ...]:
-    """Read one variant's rows; raises InputError if they are damaged or not one a frame, in order."""
+def read_estimates(path: Path, frame_count: int, digest: str | None = None) -> tuple[EstimateRow, ...]:
+    """Read one variant's rows; raises InputError if they are damaged or not one a frame, in order.
+
+    digest: `frames_sha256` of the dataset, where estimates of another one are to be refused.
+    """
+    if digest is not None:
+        stated = read_metadata(path).get(FRAMES_SHA256)
+        if stated is None:
+            raise InputError(
+                f"{path}: does not say which frames it is of (no {FRAMES_SHA256}); run `estimator run` again"
+            )
+        if stated.lower() != digest:
+            raise InputError(
+                f"{path}: estimates of another dataset: {FRAMES_SHA256} is {stated[:12]}..., but frames.parquet has "
+                f"{digest[:12]}...; run `estimator run` again"
+            )
     rows = read_rows(path, COLUMNS, EstimateRow)
     if [row.frame for row in rows] != list(range(frame_count)):
         raise InputError(f"{path}: {len(rows)} rows, needed one for each of the {frame_count} frames, in order")

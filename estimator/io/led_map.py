@@ -10,20 +10,21 @@ from pydantic import Field, Strict, model_validator
 
 from estimator.io.records import (
     INT64_MAX,
+    Entry,
     LedId,
     NotNegative,
     NotNegativeTriple,
-    Positive,
-    Row,
 )
 
 Floats = NDArray[np.float64]
 DeviceNumber = Annotated[int, Field(ge=0, le=INT64_MAX)]
 # Within 1000 km of the origin: any range to an LED, even a wrong one, can then be written.
 Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
+LedSize = Annotated[float, Field(ge=1e-6, le=1e3)]
+"""Radius or side, metres."""
 
 
-class Luminaire(Row):
+class Luminaire(Entry):
     """Luminaire of the map: LEDs whose errors of position are common; keys as in dataset.json.
 
     Its LEDs are shifted together by an error of standard deviation `sigma_m` along x, y, z, and turned together about
@@ -40,7 +41,7 @@ class Luminaire(Row):
         return np.array([*self.sigma_m, *np.radians(self.sigma_rotation_deg)])
 
 
-class MapDatum(Row):
+class MapDatum(Entry):
     """Standard deviations of the map's origin, along x, y, z, and of its scale about the origin, parts per million."""
 
     sigma_m: NotNegativeTriple
@@ -51,7 +52,7 @@ class MapDatum(Row):
         return np.array([*self.sigma_m, 1e-6 * self.scale_sigma_ppm])
 
 
-class Led(Row):
+class Led(Entry):
     """LED of the map: identity, and centre of its horizontal face, world metres. See `DiscLed`, `SquareLed`.
 
     `luminaire` is the id of its luminaire, None for none. Standard deviations are None where the device does not state
@@ -120,7 +121,7 @@ class DiscLed(Led):
     """Disc of radius `radius_m`, of standard deviation `radius_sigma_m`; None where the map does not say the radius."""
 
     shape: Literal["disc"] = "disc"
-    radius_m: Positive | None
+    radius_m: LedSize | None
     radius_sigma_m: NotNegative | None = None
 
     @model_validator(mode="before")
@@ -153,7 +154,7 @@ class SquareLed(Led):
     """Square of side `side_m`, of standard deviation `side_sigma_m`; its sides are along x and y of the world."""
 
     shape: Literal["square"] = "square"
-    side_m: Positive
+    side_m: LedSize
     side_sigma_m: NotNegative | None = None
 
     @model_validator(mode="before")

@@ -14,11 +14,19 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, Strict, TypeA
 
 from estimator.errors import InputError
 
+R = TypeVar("R")
+
 
 class Row(BaseModel):
     """Validated, immutable record: types are strict (no "1" for 1), and no number is NaN or infinite."""
 
     model_config = ConfigDict(strict=True, frozen=True, allow_inf_nan=False, extra="ignore")
+
+
+class Entry(Row):
+    """Record of dataset.json: it has exactly its own keys, for a reader must not skip what changes the meaning."""
+
+    model_config = ConfigDict(extra="forbid")
 
 
 INT64_MAX = 2**63 - 1
@@ -28,11 +36,36 @@ MAX_NUMBER = 1e100
 Number = Annotated[float, Field(ge=-MAX_NUMBER, le=MAX_NUMBER)]
 Positive = Annotated[float, Field(gt=0, le=MAX_NUMBER)]
 NotNegative = Annotated[float, Field(ge=0, le=MAX_NUMBER)]
+Share = Annotated[float, Field(ge=0, le=1)]
 Size = Annotated[float, Field(ge=0)]
 """Computed, and so allowed to exceed MAX_NUMBER."""
 # Arrow returns lists: convert the container, keep the numbers strict.
 Triple = Annotated[tuple[Number, Number, Number], Strict(False)]
 NotNegativeTriple = Annotated[tuple[NotNegative, NotNegative, NotNegative], Strict(False)]
+
+MAX_ROTATION_ERROR = 1e-9
+
+
+def is_rotation(values: object) -> bool:
+    """Whether nine numbers, row by row or as three rows, are a rotation matrix, to 1e-9 in each entry of R R^T."""
+    matrix = np.reshape(np.asarray(values, dtype=np.float64), (3, 3))
+    # Also false for NaN.
+    near = np.abs(matrix @ matrix.T - np.eye(3)).max() <= MAX_ROTATION_ERROR
+    return bool(near and np.linalg.det(matrix) > 0)
+
+
+def _check_rotation(values: R) -> R:
+    if not is_rotation(values):
+        raise ValueError("has to be a rotation matrix (orthonormal to 1e-9, determinant +1)")
+    return values
+
+
+Rotation = Annotated[tuple[Triple, Triple, Triple], AfterValidator(_check_rotation)]
+"""Three rows."""
+FlatRotation = Annotated[
+    tuple[Number, ...], Strict(False), Field(min_length=9, max_length=9), AfterValidator(_check_rotation)
+]
+"""Row by row."""
 
 MIN_VARIANCE = 1e-60
 """Smaller variances would overflow in e^T C^-1 e."""
@@ -115,11 +148,19 @@ def read_rows(
     with _parquet(path) as file:
         there = {name: kind for name, kind in optional.items() if name in file.schema_arrow.names}
         _check_columns(path, file.schema_arrow, {**columns, **there})
-        records = file.read(columns=[*columns, *there]).to_pylist()
+        whole = [name for name, kind in {**columns, **there}.items() if pa.types.is_integer(kind)]
+        records = [_with_integers(record, whole) for record in file.read(columns=[*columns, *there]).to_pylist()]
     try:
         return tuple(TypeAdapter(list[row]).validate_python(records))  # type: ignore[valid-type]
     except ValidationError as error:
         raise InputError(f"{path}: row {first_problem(error)}") from None
+
+
+def read_metadata(path: Path) -> dict[str, str]:
+    """Key-value metadata of a Parquet file. Raises InputError if the file is missing or damaged."""
+    with _parquet(path) as file:
+        metadata = file.metadata.metadata or {}
+        return {key.decode(errors="replace"): value.decode(errors="replace") for key, value in metadata.items()}
 
 
 def read_scalars(path: Path) -> dict[str, list[float | str | None]]:
@@ -138,8 +179,8 @@ def read_scalars(path: Path) -> dict[str, list[float | str | None]]:
 
 
 def _is_scalar(kind: pa.DataType) -> bool:
-    number = pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)
-    return bool(number or pa.types.is_string(kind) or pa.types.is_large_string(kind))
+    kind = _plain(kind)
+    return bool(_is_number(kind) or pa.types.is_boolean(kind) or _is_text(kind))
 
 
 @contextmanager
@@ -156,6 +197,15 @@ def _parquet(path: Path) -> Iterator[pq.ParquetFile]:
         raise InputError(f"{path}: not a readable Parquet file ({first_line(error)})") from None
 
 
+def _with_integers(record: dict[str, object], names: Sequence[str]) -> dict[str, object]:
+    """A record whose whole floats in some columns are integers: pandas has floats where a column has nulls."""
+    for name in names:
+        value = record[name]
+        if isinstance(value, float) and value.is_integer():
+            record[name] = int(value)
+    return record
+
+
 def _check_columns(path: Path, schema: pa.Schema, columns: Mapping[str, pa.DataType]) -> None:
     for name, wanted in columns.items():
         found = schema.get_all_field_indices(name)
@@ -163,22 +213,50 @@ def _check_columns(path: Path, schema: pa.Schema, columns: Mapping[str, pa.DataT
             has = ", ".join(schema.names) or "none"
             raise InputError(f"{path}: column {name!r} is there {len(found)} times, needed once; columns: {has}")
         actual = schema.field(found[0]).type
-        if not _same_type(actual, wanted):
+        is_real = pa.types.is_integer(wanted) and pa.types.is_floating(actual)
+        if not (is_real or _same_type(actual, wanted)):
             raise InputError(f"{path}: column {name!r} has type {actual}, needed {wanted}")
 
 
+def _plain(kind: pa.DataType) -> pa.DataType:
+    """The type of a dictionary's values; any other type itself."""
+    return kind.value_type if pa.types.is_dictionary(kind) else kind
+
+
+def _is_number(kind: pa.DataType) -> bool:
+    return bool(pa.types.is_integer(kind) or pa.types.is_floating(kind))
+
+
+def _is_text(kind: pa.DataType) -> bool:
+    return bool(pa.types.is_string(kind) or pa.types.is_large_string(kind) or pa.types.is_string_view(kind))
+
+
+def _is_list(kind: pa.DataType) -> bool:
+    return bool(pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind))
+
+
 def _same_type(actual: pa.DataType, wanted: pa.DataType) -> bool:
-    """Whether two Arrow types hold the same values: fixed-size and large lists are lists, large strings strings."""
+    """Whether an Arrow type can hold the values of a wanted one, by check 2 of datasets/FORMAT.md.
+
+    Integers, floats, texts and lists are such in every width and layout. The null type has nulls alone, which the rows'
+    model allows or not.
+    """
+    actual = _plain(actual)
+    if pa.types.is_null(actual):
+        return True
     if pa.types.is_list(wanted):
-        is_list = pa.types.is_list(actual) or pa.types.is_large_list(actual) or pa.types.is_fixed_size_list(actual)
-        return is_list and _same_type(actual.value_type, wanted.value_type)
+        return _is_list(actual) and _same_type(actual.value_type, wanted.value_type)
     if pa.types.is_struct(wanted):
         if not pa.types.is_struct(actual):
             return False
         fields = {field.name: field.type for field in actual}
         return all(field.name in fields and _same_type(fields[field.name], field.type) for field in wanted)
     if pa.types.is_string(wanted):
-        return bool(pa.types.is_string(actual) or pa.types.is_large_string(actual))
+        return _is_text(actual)
+    if pa.types.is_integer(wanted):
+        return bool(pa.types.is_integer(actual))
+    if pa.types.is_floating(wanted):
+        return _is_number(actual)
     return bool(actual == wanted)
 
 

@@ -1,24 +1,24 @@
 """Sensors as devices know them: digital numbers, full well and noise (datasets/FORMAT.md)."""
 
 import math
-from typing import Literal
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from estimator.io.records import (
-    NotNegative,
-    Positive,
-    Row,
-)
+from estimator.io.records import Entry, Share
 
 Floats = NDArray[np.float64]
 # Pixels within this many standard deviations of the full well count as possibly full.
 FULL_SIGMA = 4.0
 
 
-class Sensor(Row):
+Electrons = Annotated[float, Field(ge=1e-9, le=1e12)]
+Spread = Annotated[float, Field(ge=0, le=1e12)]
+
+
+class Sensor(Entry):
     """Sensor of a device; keys as in dataset.json: `dn = round(min(e, full_well_e) / gain_e_per_dn) + black_level_dn`.
 
     Gain and full well are None where the device does not know them, as of a photograph: electrons are then digital
@@ -27,19 +27,27 @@ class Sensor(Row):
     """
 
     bits: int = Field(ge=1, le=32)
-    gain_e_per_dn: Positive | None
-    full_well_e: Positive | None
-    black_level_dn: float = Field(ge=0, le=2**32)
+    gain_e_per_dn: Electrons | None
+    full_well_e: Electrons | None
+    black_level_dn: float = Field(ge=0)
     noise: Literal["shot", "none", "full"]
-    crosstalk: float = Field(default=0.0, ge=0, le=1)
-    prnu: NotNegative
-    dark_current_e_s: NotNegative
-    dsnu_e: NotNegative
-    read_noise_e: NotNegative
-    adc_noise_dn: NotNegative
-    row_offset_e: NotNegative
-    column_offset_e: NotNegative
-    mosaic: str
+    crosstalk: Share = 0.0
+    hot_pixel_share: Share = 0.0
+    hot_pixel_e_s: Spread = 0.0
+    prnu: Spread
+    dark_current_e_s: Spread
+    dsnu_e: Spread
+    read_noise_e: Spread
+    adc_noise_dn: Spread
+    row_offset_e: Spread
+    column_offset_e: Spread
+    mosaic: Literal["none", "rggb", "bggr", "grbg", "gbrg"]
+
+    @model_validator(mode="after")
+    def _black_is_a_code(self) -> Self:
+        if not (self.black_level_dn.is_integer() and self.black_level_dn <= 2**self.bits - 1):
+            raise ValueError(f"black_level_dn {self.black_level_dn}: has to be whole, up to {2**self.bits - 1}")
+        return self
 
     @property
     def gain(self) -> float:

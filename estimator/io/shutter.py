@@ -7,14 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from estimator.io.records import NotNegative, Row
+from estimator.io.records import Entry, NotNegative
 
 Floats = NDArray[np.float64]
 
-MAX_ROW_TIME_US = 1e6
+MAX_ROW_TIME_US = 1e4
 
 
-class Shutter(Row):
+class Shutter(Entry):
     """Shutter of a camera; keys as in dataset.json.
 
     Kind "rolling": line i = 0, 1, ... in readout order, over the whole sensor, is exposed from `start_s` of the frame
@@ -30,8 +30,11 @@ class Shutter(Row):
     @classmethod
     def _all_at_once(cls, entry: Any) -> Any:
         """A global shutter has its kind alone."""
+        alone = {"kind": "global", "row_time_us": 0.0, "direction": "down"}
         if isinstance(entry, Mapping) and entry.get("kind") == "global":
-            return {"kind": "global", "row_time_us": 0.0, "direction": "down"}
+            if entry != alone and (unknown := entry.keys() - {"kind"}):
+                raise ValueError(f"unknown key {min(unknown)!r}; a global shutter has its kind alone")
+            return alone
         return entry
 
     @model_validator(mode="after")
@@ -74,7 +77,7 @@ GLOBAL = Shutter(kind="global", row_time_us=0.0, direction="down")
 """Shutter of a camera that states none."""
 
 
-class Gyroscope(Row):
+class Gyroscope(Entry):
     """Errors of the gyroscope on each axis, standard deviations, rad/s; keys as in dataset.json.
 
     `noise_rad_s` is new in every frame, `bias_rad_s` the same in every frame of a device.

@@ -8,6 +8,7 @@ from pydantic import Field, Strict, ValidationError, field_validator
 
 from estimator.errors import InputError
 from estimator.io.records import Row, first_problem
+from estimator.io.results import dataset_folder
 
 SWEEP = "sweep.json"
 """File that makes a folder a sweep; written last, so that it marks a complete one."""
@@ -35,16 +36,16 @@ class _SweepFile(Row):
 
 @dataclass(frozen=True)
 class Sweep:
-    """A sweep: its folder, and the folders of its cells, each a dataset, in order."""
+    """A sweep, or results of one: its folder, and the folders of its cells, each a dataset or results, in order."""
 
     folder: Path
     cells: tuple[Path, ...]
 
 
 def read_sweep(path: str | Path) -> Sweep | None:
-    """Read sweep.json of a folder; None where there is none. Raises InputError if it is damaged."""
+    """Read sweep.json of a folder, or of its results; None where there is none. Raises InputError if it is damaged."""
     folder = Path(path)
-    file = folder / SWEEP
+    file = dataset_folder(folder) / SWEEP
     try:
         content = file.read_bytes()
     except (FileNotFoundError, NotADirectoryError):

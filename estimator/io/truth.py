@@ -7,7 +7,8 @@ import pyarrow as pa
 from pydantic import Field, Strict
 
 from estimator.errors import InputError
-from estimator.io.records import Covariance, LedId, Number, Positive, Row, Size, Triple, read_rows, read_scalars
+from estimator.io.led_map import LedSize
+from estimator.io.records import Covariance, FlatRotation, LedId, Number, Row, Triple, read_rows, read_scalars
 
 COLUMNS = {
     "frame": pa.int64(),
@@ -16,6 +17,9 @@ COLUMNS = {
     "bound_exact_m2": pa.list_(pa.float64()),
     "map": pa.int64(),
     "R_cam_world": pa.list_(pa.float64()),
+    "tilt_x_deg": pa.float64(),
+    "tilt_y_deg": pa.float64(),
+    "yaw_deg": pa.float64(),
     "leds": pa.list_(
         pa.struct(
             [
@@ -31,6 +35,11 @@ MAP_COLUMNS = {
 
 # An LED whose image is on the sensor but for rounding.
 WHOLE = 1 - 1e-6
+WHOLE_AND_ROUNDING = 1 + 1e-6
+
+
+Angle = Annotated[float, Field(ge=-360, le=360)]
+"""Degrees."""
 
 
 class TrueLed(Row):
@@ -42,7 +51,7 @@ class TrueLed(Row):
     led: LedId
     u_px: Number
     v_px: Number
-    visible_fraction: Size
+    visible_fraction: float = Field(ge=0, le=WHOLE_AND_ROUNDING)
     bits: str | None
 
 
@@ -54,12 +63,15 @@ class TruthRow(Row):
     building as built that the device is in.
     """
 
-    frame: int
+    frame: int = Field(ge=0)
     position_m: Triple
     bound_m2: Covariance | None
     bound_exact_m2: Covariance | None
     map: int = Field(ge=0)
-    R_cam_world: Annotated[tuple[Number, ...], Strict(False), Field(min_length=9, max_length=9)]
+    R_cam_world: FlatRotation
+    tilt_x_deg: Angle
+    tilt_y_deg: Angle
+    yaw_deg: Angle
     leds: Annotated[tuple[TrueLed, ...], Strict(False)]
 
     @property
@@ -74,7 +86,7 @@ class TrueMapLed(Row):
     map: int = Field(ge=0)
     led: LedId
     position_m: Triple
-    size_m: Positive
+    size_m: LedSize
 
 
 def read_true_map(path: Path) -> tuple[TrueMapLed, ...]:

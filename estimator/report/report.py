@@ -36,6 +36,7 @@ from estimator.evaluate.score_table import (
     lost_cells,
     pair_cells,
 )
+from estimator.io.results import dataset_folder
 from estimator.report.figures import device_plot, distribution_plot, error_plot, frames_with_bound
 from estimator.report.floor_plan import estimates_outside, floor_plan
 from estimator.report.levels import level_plot
@@ -130,7 +131,7 @@ def _section(folder: Path, scores: Scores) -> Section:
     variants = scores.variants
     room_m = scores.room_m
     leds_m = [led.position_m for led in scores.led_map]
-    previews = sorted((folder / "previews").glob("*.png"))
+    previews = sorted((dataset_folder(folder) / "previews").glob("*.png"))
     return Section(
         name=scores.dataset,
         frames=variants[0].frames if variants else 0,

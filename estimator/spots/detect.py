@@ -24,6 +24,7 @@ from estimator.spots.led_light import (
     RING_PX,
     SMOOTHING_PX,
     Ellipse,
+    Light,
     Moments,
     Pixels,
     Readout,
@@ -86,11 +87,16 @@ class Spot:
 
 @dataclass(frozen=True, eq=False)
 class _Measured:
-    """A spot before the correction for sampling; second moments along u and v, (2,), and their standard deviations."""
+    """A spot before the correction for sampling, and its light with the centroid in its region."""
 
     spot: Spot
-    moments_px2: NDArray[np.float64]
-    moment_sigmas_px2: NDArray[np.float64]
+    light: Light
+    centroid_px: NDArray[np.float64]
+
+    @property
+    def moments_px2(self) -> NDArray[np.float64]:
+        """Second moments along u and v, (2,)."""
+        return np.diag(self.light.moments_px2(self.centroid_px))
 
 
 def detect(
@@ -323,7 +329,7 @@ def _corrected_for_sampling(
     matters = (added_px2 >= MIN_SAMPLING_SHARE * noise_px2).any(axis=1)
     added_px2[~matters] = 0.0
     if lens.sharp and not any_square and matters.any():
-        sigmas = np.array([one.moment_sigmas_px2 for one in spots])
+        sigmas = np.array([one.light.moment_sigmas_px2(one.centroid_px, one.moments_px2) for one in spots])
         found = sampling_error(centroids[matters].ravel(), moments[matters].ravel(), sigmas[matters].ravel())
         slope = found.slope.reshape(-1, 2)
         centroids[matters] -= found.error_px.reshape(-1, 2)
@@ -343,7 +349,6 @@ def _measure(readout: Readout, ellipse: Ellipse, others: list[Ellipse], denoise_
     if light.signal_to_noise <= MIN_SIGNAL_TO_NOISE:
         return None
     centroid, u_px, v_px = light.centroid_px(), light.u_px, light.v_px
-    moments = np.diag(light.moments_px2(centroid))
 
     inside = ellipse.distance2(u_px, v_px, 0.0) <= 1
     brightest = np.unravel_index(np.argmax(np.where(inside, light.electrons, -np.inf)), inside.shape)
@@ -362,4 +367,4 @@ def _measure(readout: Readout, ellipse: Ellipse, others: list[Ellipse], denoise_
         saturated=bool(clipped.any() and clipped[inside].any()),
         flux_e=light.flux_e,
     )
-    return _Measured(spot, moments, light.moment_sigmas_px2(centroid, moments))
+    return _Measured(spot, light, centroid)

@@ -174,8 +174,9 @@ class Light:
         levers = self.support * (du / self.flux_e), self.support * (dv / self.flux_e)[:, None]
         along_u, along_v = (cv2.blur(lever, box, borderType=cv2.BORDER_CONSTANT) for lever in levers)
         of_u, of_v = self.variance_e2 * along_u, self.variance_e2 * along_v
-        mixed = np.vdot(of_u, along_v)
-        return np.array([[np.vdot(of_u, along_u), mixed], [mixed, np.vdot(of_v, along_v)]])
+        # Not np.vdot: the BLAS shares its sums among threads, which cost far more than these.
+        mixed = np.einsum("ij,ij", of_u, along_v)
+        return np.array([[np.einsum("ij,ij", of_u, along_u), mixed], [mixed, np.einsum("ij,ij", of_v, along_v)]])
 
     def moment_sigmas_px2(self, centroid_px: NDArray[np.float64], moments: NDArray[np.float64]) -> NDArray[np.float64]:
         """Standard deviations (2,) of the second moments (2,) along u and v by the pixels' noise."""
@@ -195,9 +196,10 @@ def light_of(readout: Readout, ellipse: Ellipse, others: list[Ellipse], denoise_
     roi = np.s_[top:bottom, left:right]
     u_px, v_px = _centres_px(left, right)[None, :], _centres_px(top, bottom)[:, None]
     electrons = readout.image_e[roi].astype(np.float64)
-    fall_off = np.ones(electrons.shape)
+    fall_off: Pixels | float = 1.0
+    distance2 = ellipse.distance2(u_px, v_px, margin_px)
     if ellipse.core is None:
-        support = ellipse.distance2(u_px, v_px, margin_px) <= 1
+        support = distance2 <= 1
         ring = ellipse.distance2(u_px, v_px, margin_px + RING_PX) <= 1
     else:
         face = np.zeros(electrons.shape, dtype=bool)
@@ -207,7 +209,6 @@ def light_of(readout: Readout, ellipse: Ellipse, others: list[Ellipse], denoise_
         fall_off = _relative_fall_off(electrons, inside)
         support, ring = _within(face, margin_px), _within(face, margin_px + RING_PX)
     ring &= ~support
-    distance2 = ellipse.distance2(u_px, v_px, margin_px) if others else fall_off
     for other in others:
         # A pixel in two supports belongs to the nearer spot.
         other_distance2 = other.distance2(u_px, v_px, MARGIN_PX + max(denoise_radius_px, other.fringe_px))
@@ -215,13 +216,15 @@ def light_of(readout: Readout, ellipse: Ellipse, others: list[Ellipse], denoise_
         ring &= other_distance2 > 1
     # Shot noise: a raw pixel's variance is its electrons.
     raw_e = np.maximum(readout.raw_e[roi], 0.0, dtype=np.float64)
-    variance_e2 = raw_e + readout.floor_e2 + (readout.prnu * raw_e) ** 2
+    variance_e2 = raw_e + readout.floor_e2
+    if readout.prnu > 0:
+        variance_e2 += (readout.prnu * raw_e) ** 2
     above_e = electrons
     if ring.any():
         of_ring = np.flatnonzero(ring)
         # One electron more: the noise of a pixel with fewer is not normal.
         gate_e = BACKGROUND_SIGMA * float(np.sqrt(_median(variance_e2.ravel()[of_ring]) + 1.0))
-        ring_fall_off = fall_off.ravel()[of_ring]
+        ring_fall_off = np.ones(len(of_ring)) if isinstance(fall_off, float) else fall_off.ravel()[of_ring]
         even_e = electrons.ravel()[of_ring] / ring_fall_off
         # The ring without pixels of another surface or light; all of it where its median is between two surfaces.
         even = np.abs(even_e - _median(even_e)) <= gate_e

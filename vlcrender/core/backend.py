@@ -210,27 +210,9 @@ class _Mitsuba:
 
     def load_dict(self, tree: Mapping[str, Any], parallel: bool = True, optimize: bool = True) -> Any:
         """`mitsuba.load_dict` in this variant."""
-        config = self._configuration(parallel, optimize)
-        return self._instantiated(config, self._parser.parse_dict(config, dict(tree)))
-
-    def load_file(self, path: str, parallel: bool = True, optimize: bool = True) -> Any:
-        """`mitsuba.load_file` in this variant. Files that the scene names are looked up in its folder first."""
-        config = self._configuration(parallel, optimize)
-        outside = self.file_resolver()
-        resolver = self.FileResolver(outside)
-        resolver.prepend(str(Path(path).parent))
-        self.set_file_resolver(resolver)
-        try:
-            return self._instantiated(config, self._parser.parse_file(config, path))
-        finally:
-            self.set_file_resolver(outside)
-
-    def _configuration(self, parallel: bool, optimize: bool) -> Any:
         config = self._parser.ParserConfig(self._variant)
         config.parallel, config.merge_equivalent, config.merge_meshes = parallel, optimize, optimize
-        return config
-
-    def _instantiated(self, config: Any, state: Any) -> Any:
+        state = self._parser.parse_dict(config, dict(tree))
         self._parser.transform_all(config, state)
         return self._parser.instantiate(config, state)
 

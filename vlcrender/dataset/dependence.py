@@ -9,8 +9,9 @@ from vlcrender.dataset.recipe import Recipe
 MAX_RECIPES = 1024
 """Recipes that are kept; the one used longest ago is dropped first."""
 NOT_IN_FILES: dict[str, Any] = {
-    **dict.fromkeys(("name", "description", "accelerometer", "gyroscope", "demodulation", "map", "bound"), True),
-    "split": True,
+    **dict.fromkeys(
+        ("name", "description", "licence", "accelerometer", "gyroscope", "demodulation", "map", "bound", "split"), True
+    ),
     "belief": {"accelerometer", "stated_factor"},
 }
 """Keys of a recipe without effect on the files of a frame: they act on tables alone."""

@@ -1,16 +1,23 @@
 """The entry `downlink` of dataset.json: what a receiver knows of the waves that LEDs transmit."""
 
-from typing import Annotated, Literal
+from collections.abc import Collection
+from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from vlcrender.config.toml_model import Settings
+from vlcrender.dataset.values import Count, LedSize, Number, Positive, repeated
 from vlcrender.modulation.keys import Downlink
 from vlcrender.modulation.packet import COORDINATE_BITS, COORDINATE_UNIT_M, POLYNOMIAL, PREAMBLE
 from vlcrender.modulation.transmission import Transmission, Transmitter, transmission_of
 from vlcrender.scene.leds import Leds
 
+MAX_CHIPS = 4096
+MAX_PACKET_LEDS = 2**13
+Depth = Annotated[float, Field(gt=0, le=1)]
+ClockError = Annotated[float, Field(ge=0, le=0.1)]
+Chips = Annotated[str, Field(pattern=f"^[01]{{2,{MAX_CHIPS}}}$")]
 Demodulation = Literal["given", "pixels"]
 
 
@@ -18,54 +25,76 @@ class CodeEntry(Settings):
     """LEDs with one clock that repeat codes."""
 
     send: Literal["code"]
-    chip_us: float
-    depth: float
-    clock_error: float
+    chip_us: Positive
+    depth: Depth
+    clock_error: ClockError
     """Standard deviation, as in all entries."""
-    leds: tuple[int, ...]
-    codes: tuple[str, ...]
+    leds: Annotated[tuple[Count, ...], Field(min_length=1)]
+    codes: tuple[Chips, ...]
+
+    @model_validator(mode="after")
+    def _codes_agree(self) -> Self:
+        if len(self.codes) != len(self.leds):
+            raise ValueError("codes: needed one for each of leds")
+        if len({len(code) for code in self.codes}) > 1 or any(len(set(code)) == 1 for code in self.codes):
+            raise ValueError("codes have to be of one length, and of chips of both kinds")
+        return self
 
 
 class ToneEntry(Settings):
     """LEDs with one clock that send square waves."""
 
     send: Literal["tone"]
-    duty: float
-    depth: float
-    clock_error: float
-    leds: tuple[int, ...]
-    frequencies_hz: tuple[float, ...]
+    duty: Annotated[float, Field(gt=0, lt=1)]
+    depth: Depth
+    clock_error: ClockError
+    leds: Annotated[tuple[Count, ...], Field(min_length=1)]
+    frequencies_hz: tuple[Positive, ...]
+
+    @model_validator(mode="after")
+    def _one_of_each(self) -> Self:
+        if len(self.frequencies_hz) != len(self.leds):
+            raise ValueError("frequencies_hz: needed one for each of leds")
+        return self
 
 
 class PacketDisc(Settings):
     """Round LEDs of panels that send packets."""
 
     shape: Literal["disc"]
-    radius_m: float
+    radius_m: LedSize
 
 
 class PacketSquare(Settings):
     """Square LEDs of panels that send packets, sides along x and y."""
 
     shape: Literal["square"]
-    side_m: float
+    side_m: LedSize
 
 
 class PacketEntry(Settings):
     """All panels that are alike and send packets; it does not tell where they are."""
 
     send: Literal["packet"]
-    chip_us: float
-    depth: float
-    clock_error: float
-    preamble: str
-    polynomial: int
-    coordinate_bits: int
-    coordinate_unit_m: float
-    delays_chips: tuple[int, ...]
-    offsets_m: tuple[tuple[float, float], ...]
+    chip_us: Positive
+    depth: Depth
+    clock_error: ClockError
+    preamble: Annotated[str, Field(pattern="^[01]{0,64}$")]
+    polynomial: Annotated[int, Field(ge=1, lt=2**16)]
+    coordinate_bits: Annotated[int, Field(ge=1, le=16)]
+    coordinate_unit_m: Positive
+    delays_chips: Annotated[tuple[Annotated[int, Field(ge=0, le=MAX_CHIPS)], ...], Field(min_length=1)]
+    offsets_m: tuple[tuple[Number, Number], ...]
     """From the panel's centre to each LED, along x and y."""
     led: Annotated[PacketDisc | PacketSquare, Field(discriminator="shape")]
+
+    @model_validator(mode="after")
+    def _one_of_each(self) -> Self:
+        if len(self.offsets_m) != len(self.delays_chips):
+            raise ValueError("offsets_m: needed one for each of delays_chips")
+        if len(self.delays_chips) > MAX_PACKET_LEDS:
+            raise ValueError(f"delays_chips: {len(self.delays_chips)} LEDs, more than {MAX_PACKET_LEDS}")
+        return self
 
 
 TransmitterEntry = Annotated[CodeEntry | ToneEntry | PacketEntry, Field(discriminator="send")]
@@ -75,7 +104,29 @@ class DownlinkEntry(Settings):
     """`downlink` in dataset.json."""
 
     demodulation: Demodulation
-    transmitters: tuple[TransmitterEntry, ...]
+    transmitters: Annotated[tuple[TransmitterEntry, ...], Field(min_length=1)]
+
+    @property
+    def led_ids(self) -> list[int]:
+        """Ids of the LEDs that codes and tones name."""
+        return [led for one in self.transmitters if not isinstance(one, PacketEntry) for led in one.leds]
+
+    @model_validator(mode="after")
+    def _leds_once(self) -> Self:
+        if (led := repeated(self.led_ids)) is not None:
+            raise ValueError(f"LED {led} is in leds twice")
+        return self
+
+
+def downlink_problem(downlink: DownlinkEntry | None, leds: Collection[int] | None) -> str | None:
+    """What is wrong with a downlink beside an LED map (ids; None for null), None if nothing."""
+    if leds is None:
+        sends_packets = downlink is not None and any(isinstance(one, PacketEntry) for one in downlink.transmitters)
+        if downlink is None or downlink.demodulation != "pixels" or not sends_packets:
+            return 'led_map: null needs a downlink with demodulation "pixels" and a transmitter of packets'
+        return f"downlink: names LED {downlink.led_ids[0]}, but led_map is null" if downlink.led_ids else None
+    unknown = set() if downlink is None else set(downlink.led_ids) - set(leds)
+    return f"downlink: names LED {min(unknown)}, which is not in led_map" if unknown else None
 
 
 OFFSET_DIGITS = 9

@@ -2,7 +2,7 @@
 
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from vlcrender.camera.intrinsics import Camera
 from vlcrender.camera.roi import RegionImage, Roi
-from vlcrender.dataset.files import replace_durably, sha256_of
+from vlcrender.core.digest import sha256_of
+from vlcrender.dataset.files import partial_of, replace_durably
 from vlcrender.errors import InputError
 
 
@@ -22,7 +23,7 @@ def write_exr(path: Path, images: Sequence[RegionImage], sensor: Roi, attributes
     The file appears whole or not at all. Raises InputError where it cannot be written.
     """
     names = [f"region {number}" for number in range(len(images))] if len(images) > 1 else [""]
-    partial = path.with_suffix(".partial")
+    partial = partial_of(path)
     try:
         OpenEXR.File(_parts(images, sensor, attributes, names)).write(str(partial))
     except RuntimeError as error:  # OpenEXR raises it for a full disk as well
@@ -63,29 +64,54 @@ def _box(roi: Roi) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
 
 @dataclass(frozen=True)
 class ExrPart:
-    """One part of an EXR file: its name, its region, the whole sensor, and the type of its pixels."""
+    """One part of an EXR file: its name, its region, the whole sensor, its header and its pixels."""
 
     name: str
     roi: Roi
     sensor: Roi
-    dtype: np.dtype[Any]
+    attributes: Mapping[str, Any]
+    image: NDArray[Any] = field(compare=False)
+    """Channel Y, (rows, columns)."""
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """The type of its pixels."""
+        return self.image.dtype
+
+    @property
+    def largest(self) -> float:
+        """Largest value of its pixels."""
+        return float(self.image.max())
 
 
 def read_exr_parts(path: Path) -> list[ExrPart]:
-    """The parts of a frame's file. Raises InputError where it cannot be read or lacks the channel Y."""
+    """The parts of a frame's file.
+
+    Raises InputError where it cannot be read, or a part has not scan lines with the channel Y alone.
+    """
     try:
+        with OpenEXR.File(str(path), header_only=True) as file:
+            count = len(file.parts)
         with OpenEXR.File(str(path), separate_channels=True) as file:
-            return [
-                ExrPart(
-                    part.header.get("name", ""),
-                    _roi(part.header["dataWindow"]),
-                    _roi(part.header["displayWindow"]),
-                    part.channels["Y"].pixels.dtype,
-                )
-                for part in file.parts
-            ]
+            parts = [_part(part) for part in file.parts]
+        if len(parts) != count:  # the decoder drops unreadable parts silently
+            raise ValueError(f"{len(parts)} of {count} parts")
+        return parts
     except (RuntimeError, KeyError, ValueError, TypeError) as error:
         raise InputError(f"{path}: cannot be read as an EXR with a channel Y: {error}") from None
+
+
+def _part(part: OpenEXR.Part) -> ExrPart:
+    """Raises ValueError for a part of other than scan lines of Y, one value for each place of the data window."""
+    if part.header["type"] != OpenEXR.scanlineimage:
+        raise ValueError("not stored as scan lines")
+    if list(part.channels) != ["Y"]:
+        raise ValueError(f"channels {', '.join(part.channels)}, needed Y alone")
+    pixels, roi = part.channels["Y"].pixels, _roi(part.header["dataWindow"])
+    if pixels is None or pixels.shape != (roi.rows, roi.columns):
+        raise ValueError("Y has not one value for each pixel")
+    sensor = _roi(part.header["displayWindow"])
+    return ExrPart(part.header.get("name", ""), roi, sensor, dict(part.header), pixels)
 
 
 def _roi(box: tuple[NDArray[np.int32], NDArray[np.int32]]) -> Roi:

@@ -10,17 +10,21 @@ from typing import Self
 from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.rig import Mounted
 from vlcrender.camera.roi import Roi
+from vlcrender.core.program import program_sha256
 from vlcrender.core.random_keys import random_key, stream
 from vlcrender.dataset.dependence import Seen, keyed_recipe
 from vlcrender.dataset.downlink import decoded_spots
 from vlcrender.dataset.exr import exr_attributes, write_exr
-from vlcrender.dataset.files import EXPECTED, FRAMES, PREVIEWS, PROCESSED, link_or_copy
+from vlcrender.dataset.files import EXPECTED, PREVIEWS, PROCESSED, link_or_copy, whole_file
+from vlcrender.dataset.frame_files import frame_file, stored, write_frame
+from vlcrender.dataset.frame_numbers import FrameNumbers
+from vlcrender.dataset.manifest import entry_of
 from vlcrender.dataset.motion import poses_during
 from vlcrender.dataset.plan import Plan
 from vlcrender.dataset.pose_sampling import pose_of_frame
 from vlcrender.dataset.preview import write_preview
 from vlcrender.dataset.recipe import Recipe
-from vlcrender.dataset.schema import FrameRecord, FrameRow, LedTruth, SpotRow, TruthRow, five, flat9, triple
+from vlcrender.dataset.schema import FileEntry, FrameRecord, FrameRow, LedTruth, SpotRow, TruthRow, five, flat9, triple
 from vlcrender.dataset.shard import Shard
 from vlcrender.dataset.true_world import (
     built_leds,
@@ -33,6 +37,7 @@ from vlcrender.dataset.true_world import (
     true_camera,
 )
 from vlcrender.dataset.views import View
+from vlcrender.errors import InputError
 from vlcrender.light.lightmap import bake
 from vlcrender.modulation.exposure import MeanWave
 from vlcrender.modulation.transmission import led_waves
@@ -42,6 +47,7 @@ from vlcrender.rendering.expected_image import LedPatch
 from vlcrender.rendering.readout import RollingPoses
 from vlcrender.rendering.renderer import Renderer
 from vlcrender.scene.loader import Scene, build_scene
+from vlcrender.scene.scene_files import check_sources
 from vlcrender.scene.schema import SceneSettings
 from vlcrender.sensor.radiometry import detectors, electron_rate_per_cd_m2
 from vlcrender.sensor.sensor import Sensor
@@ -51,6 +57,8 @@ MAX_SCENES = 8
 """Scenes and renderers that a process keeps; the one used longest ago is dropped first."""
 MAX_WORLDS = 8
 """Kept maps of a scene, each for recipes with the same views."""
+SceneKey = tuple[str, str, tuple[tuple[str, str], ...] | None]
+"""What a scene depends on: its JSON, its folder, and the files of that folder with their SHA-256."""
 
 
 @dataclass(frozen=True)
@@ -61,30 +69,43 @@ class Job:
     scene_json: str
     scene_folder: str
     directory: str
+    sources: tuple[tuple[str, str], ...] | None = None
+    """Files of the scene's folder and their SHA-256, see `Scene.sources`; None where they are not checked."""
+    program: str | None = None
+    """`program_sha256` of the process that planned; None where it is not checked."""
+
+    @property
+    def scene_key(self) -> SceneKey:
+        """What the scene depends on."""
+        return self.scene_json, self.scene_folder, self.sources
 
     @classmethod
     def of(cls, plan: Plan, directory: Path) -> Self:
         """The job of a plan. In this process its frames use the plan's scene, which is not loaded again."""
-        scene, folder = plan.scene.settings.model_dump_json(), str(plan.scene.folder)
-        _loaded.pop((scene, folder), None)
-        _loaded[scene, folder] = plan.scene
+        scene, folder = plan.scene.settings.model_dump_json(), str(plan.scene.folder.absolute())
+        sources = tuple(plan.scene.sources.items())
+        job = cls(plan.recipe.model_dump_json(), scene, folder, str(directory), sources, program_sha256())
+        _loaded.pop(job.scene_key, None)
+        _loaded[job.scene_key] = plan.scene
         while len(_loaded) > MAX_SCENES:
             del _loaded[next(iter(_loaded))]
-        return cls(plan.recipe.model_dump_json(), scene, folder, str(directory))
+        return job
 
 
-_loaded: dict[tuple[str, str], Scene] = {}
-"""Scenes of the latest jobs that this process made, by their JSON and folder."""
+_loaded: dict[SceneKey, Scene] = {}
+"""Scenes of the latest jobs that this process made, by what they depend on."""
 
 
 @dataclass(frozen=True)
 class Files:
-    """The files of a frame: their dataset, and what its row says of the file with its pixels."""
+    """The files of a frame: their dataset, what its row says of the file with its pixels, the entries of all, and the
+    numbers of its summary."""
 
     directory: Path
     file: str
     part: int | None
-    sha256: str
+    entries: Mapping[str, FileEntry]
+    numbers: FrameNumbers | None
 
 
 def make_frames(frames: Sequence[tuple[Job, int]]) -> list[FrameRecord]:
@@ -98,14 +119,19 @@ def made_frames(frames: Iterable[tuple[Job, int]]) -> Iterator[FrameRecord]:
     A frame with the same files as one before it, in another cell, is not exposed again: its files are that one's. Where
     a file holds several frames, all of them are among `frames`.
     """
-    made: dict[tuple[str, str, str, int], Files] = {}
+    made: dict[tuple[SceneKey, str, int], Files] = {}
     for (job, _), of_file in groupby(frames, key=_file_of):
+        if job.program not in (None, program_sha256()):
+            raise InputError(
+                f"{job.directory}: a worker runs another program than the one that started it: vlcrender or a library "
+                "was changed; nothing is mixed; start all again with one program"
+            )
         files_key = keyed_recipe(job.recipe_json).files_key
-        twins = {n: made.get((job.scene_json, job.scene_folder, files_key, n)) for _, n in of_file}
+        twins = {n: made.get((job.scene_key, files_key, n)) for _, n in of_file}
         for record in _made_file(job, twins):
             row = record.device
-            files = Files(Path(job.directory), row.file, row.part, row.sha256)
-            made.setdefault((job.scene_json, job.scene_folder, files_key, record.frame), files)
+            files = Files(Path(job.directory), row.file, row.part, record.files, record.numbers)
+            made.setdefault((job.scene_key, files_key, record.frame), files)
             yield record
 
 
@@ -123,8 +149,8 @@ def _made_file(job: Job, twins: Mapping[int, Files | None]) -> Iterator[FrameRec
         return
     shard = Shard(Path(job.directory), min(twins) // per_file)
     records = [make_frame(job, frame, shard=shard) for frame in twins]
-    digest = shard.write()
-    yield from (record.with_digest(digest) for record in records)
+    entry = shard.write()
+    yield from (record.with_file(entry) for record in records)
 
 
 def make_frame(job: Job, frame: int, twin: Files | None = None, shard: Shard | None = None) -> FrameRecord:
@@ -145,7 +171,7 @@ def make_frame(job: Job, frame: int, twin: Files | None = None, shard: Shard | N
     camera, sensor = told.camera, Roi.of_sensor(told.camera)
     place = pose_number, 0 if recipe.motion is None else shot % recipe.burst_frames
     in_frame = number if shots_differ(recipe) else None
-    views = _views_at(job.scene_json, job.scene_folder, keyed.seen, *place, in_frame)
+    views = _views_at(job.scene_key, keyed.seen, *place, in_frame)
     if which not in views:
         views[which] = _rendered(job, *place, which, in_frame)
     view = views[which]
@@ -154,8 +180,10 @@ def make_frame(job: Job, frame: int, twin: Files | None = None, shard: Shard | N
     start_s = recipe.start_s(shot, bool(waves))
     exposure = view.exposure(recipe, keyed.files_key)
     exposed = exposure.frame(waves, start_s)
-    file, part, digest = f"{FRAMES}/{frame:06d}.exr", None, ""
+    file, part = frame_file(frame, recipe.files.format), None
+    others: list[str] = []
     if twin is None:
+        numbers: FrameNumbers | None = FrameNumbers.of(image, exposed.expected, recipe.sensor, exposure.exposure_s)
         of_device = device_sensor(recipe, device)
         dn = expose_regions(
             of_device,
@@ -168,26 +196,30 @@ def make_frame(job: Job, frame: int, twin: Files | None = None, shard: Shard | N
         # Of the told camera: readers see them.
         attributes = exr_attributes(camera, told.name, exposure.exposure_s, frame)
         if shard is None:
-            digest = write_exr(directory / file, dn, sensor, attributes)
+            write_frame(directory / file, dn, sensor, attributes, recipe.files.format)
         else:
             file, part = shard.file, shard.part_count
-            shard.add(frame, dn, sensor, attributes)
+            shard.add(frame, stored(dn, recipe.files.format), sensor, attributes)
         if recipe.expected:
-            write_exr(directory / EXPECTED / f"{frame:06d}.exr", exposed.expected, sensor, attributes)
+            others.append(f"{EXPECTED}/{frame:06d}.exr")
+            write_exr(directory / others[-1], exposed.expected, sensor, attributes)
         if recipe.files.has_preview(frame):
-            preview = directory / PREVIEWS / f"{frame:06d}.png"
-            write_preview(preview, dn, sensor, recipe.sensor.largest_dn, recipe.sensor.black_level_dn)
+            others.append(f"{PREVIEWS}/{frame:06d}.png")
+            with whole_file(directory / others[-1]) as partial:
+                write_preview(partial, dn, sensor, recipe.sensor.largest_dn, recipe.sensor.black_level_dn)
         if recipe.processed is not None:
             balance = _white_balance(camera, recipe.sensor, view.renderer.scene)
             picture = recipe.processed.develop(dn[0][1], recipe.sensor, balance)
-            recipe.processed.write(directory / PROCESSED / f"{frame:06d}{recipe.processed.suffix}", picture)
+            others.append(f"{PROCESSED}/{frame:06d}{recipe.processed.suffix}")
+            with whole_file(directory / others[-1]) as partial:
+                recipe.processed.write(partial, picture)
+        of_pixels = [] if shard is not None else [file]
+        files = {name: entry_of(directory / name) for name in [*of_pixels, *others]}
     else:
-        file, part, digest = twin.file, twin.part, twin.sha256
-        if not part:  # once a shard
-            link_or_copy(twin.directory / file, directory / file)
-        for folder in (EXPECTED, PREVIEWS, PROCESSED):
-            for path in (twin.directory / folder).glob(f"{frame:06d}.*"):
-                link_or_copy(path, directory / folder / path.name)
+        file, part, files, numbers = twin.file, twin.part, dict(twin.entries), twin.numbers
+        for name in files:
+            if name != file or not part:  # once a shard
+                link_or_copy(twin.directory / name, directory / name)
     # The rig has one accelerometer: its error belongs to the shot. The device turns its reading by the told mounting.
     reading = told.rotation @ reading_m_s2(recipe, device, shot, view.main)
     gyro = None
@@ -205,7 +237,7 @@ def make_frame(job: Job, frame: int, twin: Files | None = None, shard: Shard | N
         device=device,
         file=file,
         part=part,
-        sha256=digest,
+        sha256="" if shard is not None else files[file].sha256,
         camera=told.name,
         exposure_s=exposure.exposure_s,
         capturable=all(sensor.contains(part.roi) for part in image.parts),
@@ -239,7 +271,7 @@ def make_frame(job: Job, frame: int, twin: Files | None = None, shard: Shard | N
         bound_m2=bound_m2,
         bound_exact_m2=bound_exact_m2,
     )
-    return FrameRecord(device=known, truth=truth)
+    return FrameRecord(device=known, truth=truth, files=files, numbers=numbers)
 
 
 def _led_truth(patch: LedPatch, wave: Wave | None, start_s: float) -> LedTruth:
@@ -255,9 +287,7 @@ def _led_truth(patch: LedPatch, wave: Wave | None, start_s: float) -> LedTruth:
 
 
 @lru_cache(maxsize=1)
-def _views_at(
-    scene_json: str, scene_folder: str, seen: Seen, pose_number: int, number: int, frame: int | None
-) -> dict[int, View]:
+def _views_at(scene: SceneKey, seen: Seen, pose_number: int, number: int, frame: int | None) -> dict[int, View]:
     """Views of the cameras of a rig at a place, by the camera's number; kept until frames at another place are made."""
     return {}
 
@@ -340,21 +370,27 @@ class _World:
 
 
 def _world_of(job: Job) -> _World:
-    return _world(job.scene_json, job.scene_folder, keyed_recipe(job.recipe_json).seen)
+    return _world(job.scene_key, keyed_recipe(job.recipe_json).seen)
 
 
 @lru_cache(maxsize=MAX_WORLDS)
-def _world(scene_json: str, scene_folder: str, seen: Seen) -> _World:
-    return _World(seen.recipe, _renderer(scene_json, scene_folder, seen.recipe.sensor.spectral_response))
+def _world(scene: SceneKey, seen: Seen) -> _World:
+    return _World(seen.recipe, _renderer(scene, seen.recipe.sensor.spectral_response))
 
 
 @lru_cache(maxsize=MAX_SCENES)
-def _renderer(scene_json: str, scene_folder: str, spectral_response: str) -> Renderer | MosaicRenderer:
-    """The renderer of a scene on a sensor with this response."""
-    scene = _loaded.get((scene_json, scene_folder))
+def _renderer(key: SceneKey, spectral_response: str) -> Renderer | MosaicRenderer:
+    """The renderer of a scene on a sensor with this response.
+
+    Raises InputError where a file of the scene has not the content that the key says, before or after it was read.
+    """
+    scene_json, folder, sources = key
+    scene = _loaded.get(key)
     if scene is None:
-        scene = build_scene(SceneSettings.model_validate_json(scene_json), "scene", Path(scene_folder))
+        scene = build_scene(SceneSettings.model_validate_json(scene_json), "scene", Path(folder))
     sensor, light = Sensor.model_validate_json(spectral_response), bake(scene)
+    if sources is not None:
+        check_sources(scene.settings, scene.folder, dict(sources))
     if sensor.mosaic == "none":
         return Renderer(scene, light, detectors(sensor)[0], sensor.crosstalk)
     of_colours = tuple(Renderer(scene, light, detector) for detector in detectors(sensor))

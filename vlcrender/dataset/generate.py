@@ -1,10 +1,11 @@
 """Generation of a dataset, or of the cells of a sweep, from a plan. Resumable; any number of workers, same bytes."""
 
 import logging
+import os
 from collections.abc import Iterable, Iterator
+from contextlib import closing
 from dataclasses import replace
-from functools import cache, partial
-from itertools import product
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,22 +13,21 @@ import numpy as np
 
 from vlcrender.core.warn_once import warn_once
 from vlcrender.dataset.dependence import Seen, keyed_recipe
-from vlcrender.dataset.files import write_json
-from vlcrender.dataset.frame_job import Job, poses_of
+from vlcrender.dataset.frame_job import Job, SceneKey
 from vlcrender.dataset.light_checks import light_warnings
+from vlcrender.dataset.lock import locked
+from vlcrender.dataset.manifest import PLAN, write_sealed
 from vlcrender.dataset.plan import Plan, PlannedCells
+from vlcrender.dataset.possible import check_possible
 from vlcrender.dataset.progress import FRAMES_STAGE, Progress, ProgressCallback
 from vlcrender.dataset.sweep import SWEEP_FILE, sweep_tree
-from vlcrender.dataset.true_world import built_leds, device_of_pose, true_camera
-from vlcrender.dataset.unfinished import PLAN, Unfinished, is_complete, prepare_folder, provenance_of
-from vlcrender.dataset.withheld import Seal, check_withholdable
+from vlcrender.dataset.unfinished import Unfinished, is_complete, prepare_folder, provenance_of
+from vlcrender.dataset.withheld import Seal, check_withholdable, same_file_times
 from vlcrender.dataset.workers import Task, done_frames
 from vlcrender.errors import InputError
-from vlcrender.light.lightmap import Lightmap, bake, room_mesh
+from vlcrender.light.lightmap import Lightmap, bake
 from vlcrender.modulation.flicker import flicker_of, flicker_warning
 from vlcrender.rendering.electron_rates import ElectronRates
-from vlcrender.rendering.readout import RollingPoses
-from vlcrender.rendering.renderer import check_inside
 from vlcrender.sensor.quantisation import MIN_NOISE_STEPS, noise_steps
 from vlcrender.sensor.radiometry import detectors
 
@@ -46,10 +46,10 @@ def generate(
 
     Resumes an interrupted run of the same plan. `workers` is the number of processes; `scheduler` is the address of a
     dask scheduler whose workers share the folder. `progress` is called with each report. With `withhold_truth`, a key
-    file that is made where it is missing, the truth is sealed (`withheld.Seal`). Raises InputError where the
-    folder holds anything else, and where a pose, the furniture, or a true camera or LED of the plan is impossible.
+    file that is made where it is missing, the truth is sealed (`withheld.Seal`). Raises InputError where the folder
+    holds anything else or is in use, and where a pose, the furniture, or a true camera or LED of the plan is
+    impossible: before the first frame, except for a pose among thousands (`possible`).
     """
-    report = progress or (lambda report: None)
     try:
         str(directory).encode()
     except UnicodeEncodeError:
@@ -59,6 +59,22 @@ def generate(
         check_withholdable(plan)
         seal = Seal.of_file(withhold_truth, directory)
         plan = seal.secret_plan(plan)
+    if scheduler is not None:
+        directory = Path(os.path.abspath(directory))  # workers have working folders of their own
+    with locked(directory, "vlcrender generate"):
+        return _generate(plan, directory, workers, scheduler, progress, seal)
+
+
+def _generate(
+    plan: Plan,
+    directory: Path,
+    workers: int,
+    scheduler: str | None,
+    progress: ProgressCallback | None,
+    seal: Seal | None,
+) -> bool:
+    """`generate` in a folder that is locked. seal: where the truth is withheld; the plan is then the secret one."""
+    report = progress or (lambda report: None)
     if plan.cells is None:
         file, kind = "dataset.json", "dataset"
         wanted: dict[str, Any] = {"provenance": provenance_of(plan, seal)}
@@ -66,10 +82,12 @@ def generate(
         file, kind = SWEEP_FILE, "sweep"
         wanted = {**sweep_tree(plan.recipe.name, plan.cells.sweep), "provenance": provenance_of(plan)}
     if is_complete(directory, file, wanted, f"a {kind} of another recipe, scene or version"):
+        if seal is not None:
+            same_file_times(directory)  # a run may have been killed before it did that
         log.info("%s: complete and intact already", directory)
         return False
     if plan.cells is None:
-        _check_possible(plan)
+        check_possible(plan, lambda share: report(Progress("poses", share, 1.0)))
         datasets = [Unfinished(lambda: plan, Job.of(plan, directory), plan.frame_count, seal)]
         datasets[0].open()
         lit = iter([plan])
@@ -83,7 +101,7 @@ def generate(
         light = bake(of_scene.scene, progress=lambda step, share: report(Progress(step, share, 1.0)))
         _warn_of_coarse_steps(of_scene, light)
         _warn_of_flicker(of_scene)
-        for warning in light_warnings(of_scene.recipe, of_scene.scene):
+        for warning in (*of_scene.warnings, *light_warnings(of_scene.recipe, of_scene.scene)):
             warn_once(log, warning)
     done = total = plan.frame_count
     done -= sum(dataset.frame_count - dataset.done for dataset in datasets)
@@ -92,17 +110,19 @@ def generate(
         report(Progress(FRAMES_STAGE, done, total))
     unfinished = {dataset.job.directory: dataset for dataset in datasets}
     tasks, count = _tasks(datasets)
-    for job, record in done_frames(tasks, count, workers, scheduler, directory):
-        dataset = unfinished[job.directory]
-        dataset.add(record)
-        done += 1
-        report(Progress(FRAMES_STAGE, done, total))
-        if dataset.done == dataset.frame_count:
-            unfinished.pop(job.directory).finish()
+    # Workers end before the lock is released, also after an interrupt.
+    with closing(done_frames(tasks, count, workers, scheduler, directory)) as made:
+        for job, record in made:
+            dataset = unfinished[job.directory]
+            dataset.add(record)
+            done += 1
+            report(Progress(FRAMES_STAGE, done, total))
+            if dataset.done == dataset.frame_count:
+                unfinished.pop(job.directory).finish()
     for dataset in unfinished.values():  # of which an interrupted run had made all frames
         dataset.finish()
     if plan.cells is not None:
-        write_json(directory / SWEEP_FILE, wanted)
+        write_sealed(directory / SWEEP_FILE, wanted)
         (directory / PLAN).unlink()
     return True
 
@@ -118,7 +138,7 @@ def _cells(cells: PlannedCells, directory: Path) -> list[Unfinished]:
         job = replace(job, scene_json=texts.setdefault(job.scene_json, job.scene_json))
         if _view_of(job) not in possible:
             try:
-                _check_possible(plan)
+                check_possible(plan)
             except InputError as error:
                 raise InputError(f"{cells.source}: {cell}: {error}") from None
             possible.add(_view_of(job))
@@ -126,34 +146,15 @@ def _cells(cells: PlannedCells, directory: Path) -> list[Unfinished]:
     return datasets
 
 
-def _view_of(job: Job) -> tuple[str, str, Seen]:
+def _view_of(job: Job) -> tuple[SceneKey, Seen]:
     """What the views of a job's frames depend on."""
-    return job.scene_json, job.scene_folder, keyed_recipe(job.recipe_json).seen
+    return job.scene_key, keyed_recipe(job.recipe_json).seen
 
 
 def _with_each_scene(datasets: list[Unfinished]) -> Iterator[Plan]:
     """The plan of the first dataset with each scene, and of the last dataset; one scene at a time is in memory."""
-    first = {(d.job.scene_json, d.job.scene_folder): d for d in reversed(datasets)}
+    first = {d.job.scene_key: d for d in reversed(datasets)}
     return (dataset.plan() for dataset in dict.fromkeys([*reversed(first.values()), *datasets[-1:]]))
-
-
-def _check_possible(plan: Plan) -> None:
-    """Raise InputError where a pose, a true camera or LED, or the furniture of a plan is impossible."""
-    mounted_of = cache(partial(true_camera, plan.recipe))
-    numbers = {0} if plan.recipe.motion is None else {0, plan.recipe.burst_frames - 1}
-    for pose_number in plan.recipe.pose_numbers:
-        for which, number in product(range(len(plan.recipe.cameras)), numbers):
-            mounted = mounted_of(which, device_of_pose(plan.recipe, pose_number))
-            *_, during = poses_of(plan.recipe, plan.scene, pose_number, mounted, number)
-            first, last = during.ends if isinstance(during, RollingPoses) else (during[0], during[-1])
-            check_inside(plan.scene, first)
-            check_inside(plan.scene, last)
-    if plan.recipe.belief is not None:
-        for map_number in range(plan.recipe.belief.maps):
-            built_leds(plan.recipe, plan.scene, map_number)
-    room_mesh(plan.scene)
-    if plan.recipe.split is not None:
-        plan.recipe.split.name_at((0.0, 0.0), plan.scene.room_m, plan.recipe.seed)
 
 
 def _tasks(datasets: Iterable[Unfinished]) -> tuple[Iterator[Task], int]:
@@ -162,20 +163,20 @@ def _tasks(datasets: Iterable[Unfinished]) -> tuple[Iterator[Task], int]:
     A task is a burst, a single shot, or the frames of a file that holds several, in all datasets whose views are the
     same. Its datasets are open. Tasks of one scene follow one another, then those of one view in the order of poses.
     """
-    scenes: dict[tuple[str, str], dict[tuple[Seen, int], list[Unfinished]]] = {}
+    scenes: dict[SceneKey, dict[tuple[Seen, int], list[Unfinished]]] = {}
     for dataset in datasets:
         recipe = keyed_recipe(dataset.job.recipe_json).recipe
         together = len(recipe.cameras) * recipe.burst_frames
         if recipe.files.frames_per_file > 1:
             together = recipe.files.frames_per_file
-        *scene, seen = _view_of(dataset.job)
-        scenes.setdefault((scene[0], scene[1]), {}).setdefault((seen, together), []).append(dataset)
-    shots = [
+        scene, seen = _view_of(dataset.job)
+        scenes.setdefault(scene, {}).setdefault((seen, together), []).append(dataset)
+    groups = [(group, together) for of_scene in scenes.values() for (_, together), group in of_scene.items()]
+    shots = (
         (group, range(start, start + together))
-        for of_scene in scenes.values()
-        for (_, together), group in of_scene.items()
+        for group, together in groups
         for start in range(0, group[0].frame_count, together)
-    ]
+    )
 
     def tasks() -> Iterator[Task]:
         for group, frames in shots:
@@ -187,7 +188,7 @@ def _tasks(datasets: Iterable[Unfinished]) -> tuple[Iterator[Task], int]:
             if task:
                 yield task
 
-    return tasks(), len(shots)
+    return tasks(), sum(-(-group[0].frame_count // together) for group, together in groups)
 
 
 def _warn_of_coarse_steps(plan: Plan, light: Lightmap) -> None:

@@ -10,6 +10,7 @@ from vlcrender.config.presets import with_presets
 from vlcrender.config.toml_model import check, read_toml
 from vlcrender.dataset.light_checks import check_light
 from vlcrender.dataset.recipe import Recipe, ScaleMode, scaled
+from vlcrender.dataset.recipe_warnings import recipe_warnings
 from vlcrender.dataset.sweep import Cell, Sweep, SweepTables, Value
 from vlcrender.errors import InputError
 from vlcrender.scene.loader import Scene, load_scene
@@ -25,6 +26,8 @@ class Plan:
     """Values of a cell of a sweep, by name."""
     cells: "PlannedCells | None" = None
     """The cells of a sweep; None without [[sweep]], and in a cell's own plan."""
+    warnings: tuple[str, ...] = ()
+    """What is odd in the recipe."""
 
     @property
     def frame_count(self) -> int:
@@ -105,9 +108,10 @@ class RecipeSource:
             self._scenes[key] = scene
             while len(self._scenes) > MAX_SCENES:
                 del self._scenes[next(iter(self._scenes))]
+        warnings = recipe_warnings(recipe)
         recipe = scaled(recipe, self.scale, self.scale_mode)
         check_light(recipe, scene, source, self.scale)
-        return Plan(recipe, scene, {} if cell is None else cell.values)
+        return Plan(recipe, scene, {} if cell is None else cell.values, warnings=warnings)
 
 
 def load_plan(path: Path, assignments: Iterable[str] = (), scale: int = 1, scale_mode: ScaleMode = "binned") -> Plan:

@@ -174,6 +174,19 @@ def pose_of_frame(poses: AnyPoses, frame: int, seed: int, camera: Camera, scene:
     return _aimed_pose(poses, tilts, frame, seed, camera, scene)
 
 
+def places_m(poses: AnyPoses, scene: Scene) -> NDArray[np.float64] | None:
+    """Places of all poses of a list or a grid, (count, 3); None where a place takes a search."""
+    if isinstance(poses, ListedPoses):
+        return np.array([entry.position_m for entry in poses.pose])
+    if isinstance(poses, GridPoses):
+        x_m, y_m, _ = scene.room_m
+        x = (np.arange(poses.columns) + 0.5) * x_m / poses.columns
+        y = (np.arange(poses.rows) + 0.5) * y_m / poses.rows
+        height = np.full(poses.count, poses.height_m)
+        return np.column_stack((np.tile(x, poses.rows), np.repeat(y, poses.columns), height))
+    return None
+
+
 def _stratified_tilts_deg(poses: AimedPoses, frame: int, seed: int) -> tuple[float, float]:
     tilts = []
     for axis, (low, high) in (("x", poses.tilt_x_deg), ("y", poses.tilt_y_deg)):

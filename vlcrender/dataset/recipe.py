@@ -15,6 +15,7 @@ from vlcrender.dataset.added_noise import AddedNoise
 from vlcrender.dataset.auto_exposure import Metering, NoiseLevelMetering
 from vlcrender.dataset.belief import Belief
 from vlcrender.dataset.file_settings import FileSettings
+from vlcrender.dataset.licence import Licence
 from vlcrender.dataset.motion import Motion
 from vlcrender.dataset.pose_sampling import Aim, Poses
 from vlcrender.dataset.splits import Split
@@ -45,6 +46,8 @@ class Recipe(Settings):
     """Name of the dataset."""
     description: str = ""
     """One line about the dataset."""
+    licence: Licence | None = None
+    """Licence of the dataset, an SPDX expression such as "CC-BY-4.0"; not stated where not given."""
     scene: str
     """Path of the scene file, relative to the recipe's folder, or the name of a packaged scene."""
     seed: Annotated[int, Field(ge=0, lt=2**128)]
@@ -68,7 +71,7 @@ class Recipe(Settings):
     processed: Processed | None = None
     """Settings of processed pictures, as a phone makes them; none are written where not given."""
     files: FileSettings = FileSettings()
-    """How many frames have previews, and how many share a file."""
+    """The format of frames, how many of them have previews, and how many share a file."""
     split: Split | None = None
     """Train, validation and test frames by position; no split where not given."""
     bound: bool = False
@@ -141,12 +144,9 @@ class Recipe(Settings):
         return self
 
     @model_validator(mode="after")
-    def _shards_are_of_regions(self) -> Self:
-        if self.files.frames_per_file > 1 and self.regions is None:
-            raise ValueError(
-                f"files.frames_per_file = {self.files.frames_per_file}: files of several frames hold regions; add "
-                "[regions] or remove frames_per_file"
-            )
+    def _files_hold_the_frames(self) -> Self:
+        if problem := self.files.problem(self.sensor.bits, self.regions is not None):
+            raise ValueError(problem)
         return self
 
     @model_validator(mode="after")

@@ -4,20 +4,37 @@ Rows of frames.parquet and truth.parquet, a line of the journal, and dataset.jso
 verifier reads them back, and the Arrow schemas of the tables derive from them.
 """
 
+import re
+from pathlib import PurePosixPath
 from types import NoneType, UnionType
-from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin
+from typing import Annotated, Any, Final, Literal, Self, Union, get_args, get_origin
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import ConfigDict, Field, field_validator, model_validator
 
 from vlcrender.camera.distortion import Distortion
 from vlcrender.camera.rig import Mounted
-from vlcrender.camera.shutter import Shutter
 from vlcrender.config.toml_model import Settings
 from vlcrender.dataset.belief import CAMERA_PARAMETERS, EXACT_CAMERA, CameraSigmas, Sigmas
-from vlcrender.dataset.downlink_entry import DownlinkEntry
+from vlcrender.dataset.camera_entries import CameraEntry, CameraUncertainty, SensorEntry
+from vlcrender.dataset.downlink_entry import DownlinkEntry, downlink_problem
+from vlcrender.dataset.file_settings import FilesEntry
+from vlcrender.dataset.frame_numbers import FrameNumbers, Summary
+from vlcrender.dataset.values import (
+    Coordinate,
+    Count,
+    LedSize,
+    NotNegative,
+    Number,
+    Positive,
+    Sigma,
+    Sigmas3,
+    TiltSigma,
+    Triple,
+    repeated,
+)
 from vlcrender.scene.as_built import Luminaires
 from vlcrender.scene.leds import Leds
 from vlcrender.sensor.accelerometer import Imu, TiltError
@@ -28,13 +45,11 @@ FORMAT_VERSION: Final = 4
 DATA_VERSION = 4
 """`data_version` of the provenance: raised whenever the same recipe gives other bits."""
 
-Triple = tuple[float, float, float]
-Matrix = tuple[Triple, Triple, Triple]
-Flat9 = tuple[float, float, float, float, float, float, float, float, float]
+Flat9 = tuple[Number, Number, Number, Number, Number, Number, Number, Number, Number]
 """A 3 x 3 matrix, row by row."""
-Five = tuple[float, float, float, float, float]
+Five = tuple[Number, Number, Number, Number, Number]
 """Distortion: k1, k2, k3, p1, p2."""
-Seven = tuple[float, float, float, float, float, float, float]
+Seven = tuple[Sigma, Sigma, Sigma, Sigma, Sigma, Sigma, Sigma]
 """One number for each of belief.CAMERA_PARAMETERS."""
 
 
@@ -65,32 +80,32 @@ def _seven(numbers: NDArray[np.float64]) -> Seven:
 class SpotRow(Settings):
     """A decoded identity: one LED and its rough pixel."""
 
-    led: int
+    led: Count
     """LED id."""
-    u_px: float
-    v_px: float
+    u_px: Number
+    v_px: Number
 
 
 class FrameRow(Settings):
     """A row of frames.parquet: what a device knows about one frame."""
 
-    frame: int
-    shot: int
-    burst: int
+    frame: Count
+    shot: Count
+    burst: Count
     """Frames of one burst follow each other at the frame rate; equal to `shot` without bursts."""
-    start_s: float
+    start_s: Number
     """Start of the exposure of the first line, on the rig's clock."""
-    pose: int
-    device: int
+    pose: Count
+    device: Count
     """Frames of one device share the errors of a device."""
     file: str
     """Path below the dataset, with `/`."""
-    part: int | None
+    part: Count | None = None
     """Number of the frame's first part in that file where it holds several frames; else None."""
     sha256: str
     """Digest of that file, 64 hex digits."""
     camera: str
-    exposure_s: float
+    exposure_s: Positive
     capturable: bool
     """Whether every region of the frame lies on the sensor."""
     accelerometer_m_s2: Triple
@@ -101,20 +116,35 @@ class FrameRow(Settings):
     split: str | None = None
     """Train, validation or test; None where the frame belongs to none, or the recipe has no [split]."""
 
+    @field_validator("sha256")
+    @classmethod
+    def _is_a_digest(cls, sha256: str) -> str:
+        if sha256 and not re.fullmatch("[0-9a-fA-F]{64}", sha256):
+            raise ValueError("has to have 64 hex digits")
+        return sha256
+
+    @field_validator("file")
+    @classmethod
+    def _is_inside(cls, file: str) -> str:
+        path = PurePosixPath(file)
+        if not file or path.is_absolute() or ".." in path.parts or "\\" in file or "\0" in file:
+            raise ValueError("has to be a path below the dataset, with /")
+        return file
+
 
 class LedTruth(Settings):
     """The true image of one LED that lights at least one pixel of a frame."""
 
-    led: int
+    led: Count
     """LED id."""
-    u_px: float
+    u_px: Number
     """Image of the LED's centre, exact, at the time of its own line."""
-    v_px: float
-    visible_fraction: float
+    v_px: Number
+    visible_fraction: Number
     """Share of the LED's image that falls on the sensor."""
-    clock_error: float | None
+    clock_error: Number | None
     """Relative error of the frequency of the LED's clock; None for a steady LED."""
-    phase: float | None
+    phase: Number | None
     """Phase of the LED's wave at the frame's `start_s`, periods, in [0, 1); None for a steady LED."""
     bits: str | None
     """Chips of one period of the LED's wave, "1" lit; None for a steady LED and for waves that send nothing."""
@@ -123,9 +153,9 @@ class LedTruth(Settings):
 class TruthRow(Settings):
     """A row of truth.parquet: the pose of one frame and what follows from it."""
 
-    frame: int
-    shot: int
-    map: int
+    frame: Count
+    shot: Count
+    map: Count
     """The map of the LEDs that the frame shows."""
     K: Flat9
     """True intrinsics of this frame."""
@@ -134,15 +164,15 @@ class TruthRow(Settings):
     position_m: Triple
     """Projection centre of this frame's camera, world."""
     R_cam_world: Flat9
-    tilt_x_deg: float
-    tilt_y_deg: float
-    yaw_deg: float
+    tilt_x_deg: Number
+    tilt_y_deg: Number
+    yaw_deg: Number
     angular_velocity_rad_s: Triple | None
     """About the axes of this frame's camera, right-handed; None at rest."""
     linear_velocity_m_s: Triple | None
     """Velocity of the projection centre, world axes; None at rest."""
     leds: tuple[LedTruth, ...]
-    added_noise_dn: float | None
+    added_noise_dn: Number | None
     """Standard deviation of the noise that `[added_noise]` adds before rounding, digital numbers; None without."""
     bound_m2: Flat9 | None
     """Cramér-Rao bound of the position; hybrid with a belief."""
@@ -153,8 +183,8 @@ class TruthRow(Settings):
 class DeviceTruthRow(Settings):
     """A row of truth_devices.parquet: the true camera and accelerometer of one device."""
 
-    device: int
-    map: int
+    device: Count
+    map: Count
     camera: str
     K: Flat9
     """True intrinsics without the errors of a shot."""
@@ -168,29 +198,41 @@ class DeviceTruthRow(Settings):
 class MapTruthRow(Settings):
     """A row of truth_map.parquet: one LED of one map as built."""
 
-    map: int
-    led: int
+    map: Count
+    led: Count
     position_m: Triple
-    size_m: float
+    size_m: Positive
     """Radius of a disc, side of a square."""
     gradient: tuple[float, float]
     """Relative change of luminance from the centre to the rim along x and y."""
 
 
+class FileEntry(Settings):
+    """A file of a dataset in manifest.json."""
+
+    sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+    bytes: Annotated[int, Field(ge=0)]
+
+
 class FrameRecord(Settings):
-    """One finished frame: its row in both tables. A line of journal.jsonl."""
+    """One finished frame: its row in both tables, and its files. In a line of journal.jsonl."""
 
     device: FrameRow
     truth: TruthRow
+    numbers: FrameNumbers | None = None
+    """For the summary of the set; None where they are not known."""
+    files: dict[str, FileEntry]
+    """Every file that was made of the frame, by its path below the dataset; a shard is a file of each of its frames."""
 
     @property
     def frame(self) -> int:
         """Number of the frame."""
         return self.device.frame
 
-    def with_digest(self, sha256: str) -> "FrameRecord":
-        """The record with the digest of its file."""
-        return self.model_copy(update={"device": self.device.model_copy(update={"sha256": sha256})})
+    def with_file(self, entry: FileEntry) -> "FrameRecord":
+        """The record with the digest of the file of its pixels."""
+        device = self.device.model_copy(update={"sha256": entry.sha256})
+        return self.model_copy(update={"device": device, "files": {device.file: entry, **self.files}})
 
 
 _SCALARS = {int: pa.int64(), float: pa.float64(), str: pa.string(), bool: pa.bool_()}
@@ -211,6 +253,8 @@ def _arrow_type(annotation: Any) -> pa.DataType:
     if isinstance(annotation, type) and issubclass(annotation, Settings):
         return pa.struct(list(arrow_schema(annotation)))
     arguments = get_args(annotation)
+    if get_origin(annotation) is Annotated:
+        return _arrow_type(arguments[0])
     if get_origin(annotation) in (Union, UnionType):
         (present,) = (argument for argument in arguments if argument is not NoneType)
         return _arrow_type(present)
@@ -224,99 +268,46 @@ FRAMES_SCHEMA = arrow_schema(FrameRow)
 TRUTH_SCHEMA = arrow_schema(TruthRow)
 
 
-class CameraUncertainty(Settings):
-    """Standard deviations of a camera's errors, as dataset.json states them."""
-
-    parameters: tuple[str, ...]
-    device_sigma: Seven
-    shot_sigma: Seven
-    offset_sigma_m: float
-    rotation_sigma_deg: float
-
-
-class CameraEntry(Settings):
-    """A camera in dataset.json."""
-
-    width_px: int
-    height_px: int
-    K: Matrix
-    pixel_pitch_um: float
-    focal_length_mm: float
-    image_distance_mm: float
-    f_number: float
-    projection: Literal["perspective", "equidistant"]
-    distortion: Distortion | None
-    focus_distance_m: float | Literal["infinity"] | None
-    psf: Literal["none", "diffraction", "measured"]
-    psf_wavelength_nm: float
-    psf_kernel: tuple[tuple[float, ...], ...] | None
-    shutter: Shutter
-    R_cam_rig: Matrix
-    offset_m: Triple
-    uncertainty: CameraUncertainty | None
-
-
-class SensorEntry(Settings):
-    """The sensor in dataset.json: parameters in effect at the ISO, temperature and noise mode of the frames."""
-
-    bits: int
-    gain_e_per_dn: float
-    full_well_e: float
-    black_level_dn: int
-    noise: str
-    crosstalk: float
-    hot_pixel_share: float
-    hot_pixel_e_s: float
-    prnu: float
-    dark_current_e_s: float
-    dsnu_e: float
-    read_noise_e: float
-    adc_noise_dn: float
-    row_offset_e: float
-    column_offset_e: float
-    mosaic: str
-
-
 class AccelerometerEntry(Settings):
     """The accelerometer in dataset.json."""
 
     kind: Literal["tilt-error", "imu"]
-    error_deg: float
-    device_error_deg: float | None
-    shot_error_deg: float | None
+    error_deg: TiltSigma
+    device_error_deg: TiltSigma | None
+    shot_error_deg: TiltSigma | None
 
 
 class GyroscopeEntry(Settings):
     """The gyroscope in dataset.json: standard deviations about each axis."""
 
-    noise_rad_s: float
-    bias_rad_s: float
+    noise_rad_s: NotNegative
+    bias_rad_s: NotNegative
 
 
 class DiscEntry(Settings):
     """A round LED in dataset.json: the data that it broadcasts about itself."""
 
-    id: int
-    position_m: Triple
+    id: Count
+    position_m: tuple[Coordinate, Coordinate, Coordinate]
     shape: Literal["disc"]
-    radius_m: float
-    luminaire: int | None
-    sigma_m: Triple | None
-    radius_sigma_m: float | None
-    gradient_sigma: float | None
+    radius_m: LedSize
+    luminaire: Count | None
+    sigma_m: Sigmas3 | None
+    radius_sigma_m: NotNegative | None
+    gradient_sigma: NotNegative | None
 
 
 class SquareEntry(Settings):
     """A square LED in dataset.json, sides along x and y: the data that it broadcasts about itself."""
 
-    id: int
-    position_m: Triple
+    id: Count
+    position_m: tuple[Coordinate, Coordinate, Coordinate]
     shape: Literal["square"]
-    side_m: float
-    luminaire: int | None
-    sigma_m: Triple | None
-    side_sigma_m: float | None
-    gradient_sigma: float | None
+    side_m: LedSize
+    luminaire: Count | None
+    sigma_m: Sigmas3 | None
+    side_sigma_m: NotNegative | None
+    gradient_sigma: NotNegative | None
 
 
 LedMapEntry = Annotated[DiscEntry | SquareEntry, Field(discriminator="shape")]
@@ -325,17 +316,17 @@ LedMapEntry = Annotated[DiscEntry | SquareEntry, Field(discriminator="shape")]
 class LuminaireEntry(Settings):
     """A luminaire in dataset.json: a panel, or a single LED."""
 
-    id: int
+    id: Count
     position_m: Triple
-    sigma_m: Triple
-    sigma_rotation_deg: Triple
+    sigma_m: Sigmas3
+    sigma_rotation_deg: Sigmas3
 
 
 class MapDatumEntry(Settings):
     """Standard deviations of the map as a whole in dataset.json."""
 
-    sigma_m: Triple
-    scale_sigma_ppm: float
+    sigma_m: Sigmas3
+    scale_sigma_ppm: NotNegative
 
 
 class Withheld(Settings):
@@ -353,12 +344,14 @@ class Withheld(Settings):
 
 
 class DatasetFile(Settings):
-    """dataset.json."""
+    """dataset.json. Keys of its outermost object that FORMAT.md does not know are ignored."""
+
+    model_config = ConfigDict(extra="ignore")
 
     format: Literal["vlcrender-dataset"]
     version: Literal[4]
     name: str
-    frame_count: int
+    frame_count: Count
     cameras: dict[str, CameraEntry]
     sensor: SensorEntry
     accelerometer: AccelerometerEntry
@@ -368,10 +361,35 @@ class DatasetFile(Settings):
     luminaires: tuple[LuminaireEntry, ...]
     map_datum: MapDatumEntry | None
     downlink: DownlinkEntry | None
-    room_m: Triple
+    room_m: tuple[Positive, Positive, Positive]
+    files: FilesEntry = FilesEntry()
+    """Where not given, as the default: sets made before it was stated."""
+    summary: Summary | None = None
+    """None in sets made before it was stated."""
+    licence: str | None = None
+    """SPDX licence expression of the recipe; None where not stated."""
     withheld: Withheld | None = None
     """None where the set has its truth."""
     provenance: dict[str, Any]
+    manifest_sha256: str | None = None
+    """SHA-256 of manifest.json; None in a set that was made before there were manifests."""
+    seal: str | None = None
+    """SHA-256 of this file's content without the seal, see manifest.py."""
+
+    @model_validator(mode="after")
+    def _identities_agree(self) -> Self:
+        ids = {led.id for led in self.led_map or ()}
+        luminaires = {entry.id for entry in self.luminaires}
+        if (one := repeated(led.id for led in self.led_map or ())) is not None:
+            raise ValueError(f"led_map: id {one} occurs twice")
+        if (one := repeated(entry.id for entry in self.luminaires)) is not None:
+            raise ValueError(f"luminaires: id {one} occurs twice")
+        for led in self.led_map or ():
+            if luminaires and led.luminaire is not None and led.luminaire not in luminaires:
+                raise ValueError(f"LED {led.id} names luminaire {led.luminaire}, which is not in luminaires")
+        if problem := downlink_problem(self.downlink, None if self.led_map is None else ids):
+            raise ValueError(problem)
+        return self
 
 
 def camera_entry(mounted: Mounted, sigmas: CameraSigmas | None = None) -> CameraEntry:

@@ -13,7 +13,9 @@ from typing import Any
 
 from vlcrender.camera.roi import RegionImage, Roi
 from vlcrender.dataset.exr import ExrPart, exr_bytes
-from vlcrender.dataset.files import FRAMES, sha256_of, whole_file
+from vlcrender.dataset.files import FRAMES, whole_file
+from vlcrender.dataset.manifest import entry_of
+from vlcrender.dataset.schema import FileEntry
 
 MAGIC, VERSION = 20000630, 2
 SEVERAL_PARTS = 0x1000
@@ -51,13 +53,13 @@ class Shard:
         names = [_name(frame, number) for number in range(len(images))]
         self._parts += _parts_of(exr_bytes(images, sensor, attributes, names))
 
-    def write(self) -> str:
-        """Write the file, durably, and return its SHA-256. Raises InputError where it cannot be written."""
+    def write(self) -> FileEntry:
+        """Write the file, durably, and return its digest and size. Raises InputError where it cannot be written."""
         path = self.directory / self.file
         with whole_file(path) as partial:
             partial.write_bytes(_joined(self._parts))
-            digest = sha256_of(partial)
-        return digest
+            entry = entry_of(partial)
+        return entry
 
 
 def parts_of_frame(parts: Sequence[ExrPart], frame: int, first: int) -> list[ExrPart]:

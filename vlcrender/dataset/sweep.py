@@ -278,6 +278,8 @@ class SweepFile(Settings):
     sweep: tuple[SweptKey, ...]
     cells: tuple[CellEntry, ...]
     provenance: dict[str, Any]
+    seal: str | None = None
+    """SHA-256 of this file's content without the seal, see manifest.py."""
 
 
 def sweep_tree(name: str, sweep: Sweep) -> dict[str, Any]:

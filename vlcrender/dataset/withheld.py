@@ -12,15 +12,20 @@ import re
 import secrets
 import tempfile
 import zipfile
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
-from vlcrender.dataset.files import first_line, read_dataset_file, sha256_of, whole_file, write_json
+from vlcrender.core.digest import sha256_of
+from vlcrender.dataset.files import first_line, read_dataset_file, whole_file
+from vlcrender.dataset.frame_numbers import Summary
+from vlcrender.dataset.lock import LOCK, locked
+from vlcrender.dataset.manifest import DATASET_FILE, frames_per_file, manifest_of_files, write_sealed
 from vlcrender.dataset.plan import Plan
 from vlcrender.dataset.pose_sampling import AimedPoses
 from vlcrender.dataset.schema import DatasetFile, TruthRow, Withheld
+from vlcrender.dataset.summary import disk_use
 from vlcrender.dataset.tables import write_table
 from vlcrender.dataset.truth_tables import TRUTH, TRUTH_TABLES, write_truth
 from vlcrender.errors import InputError
@@ -30,14 +35,19 @@ SEALED = "truth.sealed"
 """File with the sealed truth."""
 PROVENANCE = "provenance.json"
 """Member of the sealed archive with the whole provenance."""
+SUMMARY = "summary.json"
+"""Member of the sealed archive with the summary in all digits."""
 MAGIC = b"VLCSEAL1"
 KEY_BYTES, NONCE_BYTES, SEED_BITS, SERIAL_BITS = 32, 12, 128, 63
 MAX_SEALED_BYTES = 2**31 - 1
 """Most bytes that one call of the cipher takes."""
 KEY_LINE = re.compile(r"vlcrender-truth-key-1 ([0-9a-f]{64})\n?")
 KEY_RULE = "one line, vlcrender-truth-key-1 and 64 hex digits"
-PUBLIC_KEYS = ("data_version", "versions")
-"""Keys of the provenance that a withheld set states; a new key is sealed unless it is named here."""
+PUBLIC_KEYS = ("program_sha256", "data_version", "versions")
+"""Keys of the provenance that a withheld set states; a new key is sealed unless it is named here.
+
+`sources` is sealed: digests of meshes and textures tell which of many known files a scene is made of.
+"""
 PUBLIC_RECIPE_KEYS = ("expected", "processed", "files", "burst")
 """Keys of the recipe that a withheld set states: which files there are, and how frames follow each other."""
 
@@ -60,10 +70,13 @@ class Seal:
         if directory.resolve() in path.resolve().parents:
             raise InputError(f"{path}: is within the dataset, which is to be published; put the key file elsewhere")
         if not path.exists():
-            if directory.is_dir() and any(directory.iterdir()):
+            if directory.is_dir() and any(found.name != LOCK for found in directory.iterdir()):
                 raise InputError(f"{path}: is missing, and {directory} is not empty; give the key file of that run")
             key = secrets.token_bytes(KEY_BYTES)
-            descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+            try:
+                descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+            except OSError as error:
+                raise InputError(f"{path}: cannot be made: {error.strerror}") from None
             with os.fdopen(descriptor, "w", encoding="ascii") as file:
                 file.write(f"vlcrender-truth-key-1 {key.hex()}\n")
                 file.flush()
@@ -126,7 +139,8 @@ class Seal:
         Plans that differ in anything share no pose: sets of one key do not show the same places.
         """
         recipe = plan.recipe
-        whole = f"{recipe.model_dump_json()}\0{plan.scene.settings.model_dump_json()}".encode()
+        files = json.dumps(dict(plan.scene.sources), sort_keys=True)
+        whole = f"{recipe.model_dump_json()}\0{plan.scene.settings.model_dump_json()}\0{files}".encode()
 
         def number(purpose: str, bits: int) -> int:
             return int.from_bytes(self.derived(purpose, whole), "little") >> (8 * KEY_BYTES - bits)
@@ -141,9 +155,10 @@ class Seal:
     def public_provenance(self, provenance: Mapping[str, Any]) -> dict[str, Any]:
         """What a withheld set states of its provenance: nothing of poses, errors, scene or seed, but a commitment.
 
-        The commitment is a keyed digest of the whole provenance: another key, recipe or scene has another.
+        The commitment is a keyed digest of the rest: another key, recipe or scene has another, another program has not.
         """
-        whole = json.dumps(provenance, sort_keys=True).encode()
+        rest = {key: value for key, value in provenance.items() if key not in PUBLIC_KEYS}
+        whole = json.dumps(rest, sort_keys=True).encode()
         return {
             "recipe": {key: provenance["recipe"][key] for key in PUBLIC_RECIPE_KEYS},
             **{key: provenance[key] for key in PUBLIC_KEYS},
@@ -155,31 +170,33 @@ class Seal:
         plan: Plan,
         directory: Path,
         provenance: Mapping[str, Any],
+        summary: Summary,
         rows: Callable[[], Iterable[TruthRow]],
         splits: Mapping[int, str | None],
-    ) -> Withheld:
+    ) -> tuple[list[str], Withheld]:
         """Write truth.sealed, and truth.parquet of the frames that are not withheld; the whole truth is in no file.
 
-        provenance: whole; rows: of all frames; splits: of each frame. Withheld are the test frames, or all frames
-        where the recipe has no [split].
+        provenance, summary: whole; rows: of all frames; splits: of each frame. Withheld are the test frames, or all
+        frames where the recipe has no [split]. Returns the names of the files too.
         """
         archive = io.BytesIO()
-        with tempfile.TemporaryDirectory(prefix="vlcrender-truth-") as folder:
-            write_truth(plan, Path(folder), rows())
-            with zipfile.ZipFile(archive, "w", zipfile.ZIP_STORED) as file:
-                for name in TRUTH_TABLES:
-                    if (table := Path(folder) / name).is_file():
-                        file.writestr(zipfile.ZipInfo(name), table.read_bytes())
-                file.writestr(zipfile.ZipInfo(PROVENANCE), json.dumps(provenance, indent=1))
+        with (
+            tempfile.TemporaryDirectory(prefix="vlcrender-truth-") as folder,
+            zipfile.ZipFile(archive, "w", zipfile.ZIP_STORED) as file,
+        ):
+            for name in write_truth(plan, Path(folder), rows()):
+                file.writestr(zipfile.ZipInfo(name), (Path(folder) / name).read_bytes())
+            file.writestr(zipfile.ZipInfo(SUMMARY), summary.model_dump_json())
+            file.writestr(zipfile.ZipInfo(PROVENANCE), json.dumps(provenance, indent=1))
         with whole_file(directory / SEALED) as partial:
             partial.write_bytes(self.encrypt(archive.getvalue(), "truth"))
         digest = sha256_of(directory / SEALED)
         if plan.recipe.split is None:
-            return Withheld(sha256=digest, frames="all")
+            return [SEALED], Withheld(sha256=digest, frames="all")
         withheld = Withheld(sha256=digest, frames=tuple(n for n, split in splits.items() if split == "test"))
         told = set(withheld.frames_with_truth(len(splits)))
         write_table(directory / TRUTH, (row for row in rows() if row.frame in told), TruthRow)
-        return withheld
+        return [SEALED, TRUTH], withheld
 
 
 def _cipher(key: bytes) -> Any:
@@ -220,16 +237,24 @@ def _revealed(plan: Plan) -> str | None:
     return None
 
 
-def withheld_problems(directory: Path, dataset: DatasetFile) -> list[str]:
-    """What is wrong with the sealed truth of a withheld set, by what can be seen without the key."""
+def _sealed_problem(path: Path, withheld: Withheld) -> str | None:
+    """What is wrong with the file truth.sealed."""
+    if not path.is_file():
+        return f"{path}: is missing"
+    if sha256_of(path) != withheld.sha256:
+        return f"{path}: SHA-256 differs from dataset.json: the file was changed or truncated"
+    return None
+
+
+def withheld_problems(directory: Path, dataset: DatasetFile, damaged: Collection[str] = ()) -> list[str]:
+    """What is wrong with the sealed truth of a withheld set, by what can be seen without the key.
+
+    damaged: files that have a line already.
+    """
     if dataset.withheld is None:
         return []
-    path = directory / SEALED
-    problems = []
-    if not path.is_file():
-        problems.append(f"{path}: is missing")
-    elif sha256_of(path) != dataset.withheld.sha256:
-        problems.append(f"{path}: SHA-256 differs from dataset.json: the file was changed or truncated")
+    problem = None if SEALED in damaged else _sealed_problem(directory / SEALED, dataset.withheld)
+    problems = [] if problem is None else [problem]
     frames = dataset.withheld.frames
     if frames != "all" and not set(frames) <= set(range(dataset.frame_count)):
         problems.append(f"{directory / 'dataset.json'}: withheld.frames: has to be of frames 0 to frame_count - 1")
@@ -238,9 +263,9 @@ def withheld_problems(directory: Path, dataset: DatasetFile) -> list[str]:
     return problems
 
 
-def same_file_times(directory: Path, last: Path) -> None:
-    """Give all files of a dataset the time of the last one: times of frames tell how long each took to render."""
-    times = last.stat()
+def same_file_times(directory: Path) -> None:
+    """Give all files of a dataset the time of dataset.json: times of frames tell how long each took to render."""
+    times = (directory / DATASET_FILE).stat()
     for path in directory.rglob("*"):
         os.utime(path, ns=(times.st_mtime_ns, times.st_mtime_ns))
 
@@ -248,26 +273,40 @@ def same_file_times(directory: Path, last: Path) -> None:
 def release(directory: Path, key_file: Path) -> None:
     """Write the truth of a withheld set again, after which the set is that of `generate` with the true seed.
 
-    Raises InputError where the set has its truth already, and where the key is another's or the sealed truth damaged.
+    A release that was interrupted is made again. Raises InputError where the set has its truth already, where the key
+    is another's or the sealed truth damaged, and where the folder is in use.
     """
+    with locked(directory, "vlcrender release"):
+        _release(directory, Seal.read(key_file), key_file)
+
+
+def _release(directory: Path, seal: Seal, key_file: Path) -> None:
+    """`release` in a folder that is locked."""
     dataset = read_dataset_file(directory)
     path = directory / SEALED
     if dataset.withheld is None:
         raise InputError(f"{directory}: its truth is not withheld")
-    seal = Seal.read(key_file)
-    if problems := withheld_problems(directory, dataset):
-        raise InputError(problems[0])
+    if (problem := _sealed_problem(path, dataset.withheld)) is not None:
+        raise InputError(problem)
     plain = seal.decrypt(path.read_bytes(), "truth")
     if plain is None:
         raise InputError(f"{key_file}: is not the key of {path}")
     try:
         with zipfile.ZipFile(io.BytesIO(plain)) as archive:
             provenance = json.loads(archive.read(PROVENANCE))
+            summary = Summary.model_validate_json(archive.read(SUMMARY))
             for name in set(archive.namelist()) & set(TRUTH_TABLES):
                 with whole_file(directory / name) as partial:
                     partial.write_bytes(archive.read(name))
     except (zipfile.BadZipFile, KeyError, ValueError) as error:
         raise InputError(f"{path}: is no archive of a truth: {first_line(str(error))}") from None
-    tree = dataset.model_copy(update={"withheld": None, "provenance": provenance}).model_dump(mode="json")
-    write_json(directory / "dataset.json", tree)
+    # The sealed truth goes last: until dataset.json has the provenance, it alone has it.
+    per_file = frames_per_file({"provenance": provenance})
+    changes = {
+        "withheld": None,
+        "provenance": provenance,
+        "manifest_sha256": manifest_of_files(directory, per_file, directory, without=(SEALED,)),
+        "summary": summary.model_copy(update={"bytes": disk_use(directory)}),
+    }
+    write_sealed(directory / DATASET_FILE, dataset.model_copy(update=changes).model_dump(mode="json", exclude={"seal"}))
     path.unlink()

@@ -4,12 +4,15 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
+from typing import Any
 
+from vlcrender.dataset.files import first_line
 from vlcrender.dataset.frame_job import Job, made_frames, make_frames
 from vlcrender.dataset.schema import FrameRecord
 from vlcrender.errors import InputError
@@ -17,13 +20,15 @@ from vlcrender.rendering.renderer import share_cores
 
 Task = Sequence[tuple[Job, int]]
 """Frames that one process makes, one after another, since they share views or files."""
+TASKS_ON_CLUSTER = 1000
+"""Tasks that a scheduler knows at a time: more than the threads of a cluster, and memory does not grow with the set."""
 Done = tuple[Job, FrameRecord]
 """A frame that is made, with its dataset's job."""
 
 
 def done_frames(
     tasks: Iterator[Task], count: int, workers: int, scheduler: str | None, directory: Path
-) -> Iterator[Done]:
+) -> Generator[Done, None, None]:
     """Make the frames of all tasks; their records in any order, each with its dataset's job.
 
     tasks: taken one by one, shortly before they start. count: the number of tasks. Raises InputError where a worker
@@ -58,6 +63,13 @@ def _in_processes(tasks: Iterator[Task], workers: int, directory: Path) -> Itera
             f"{directory}: a worker process died (out of memory?); run the same command again, "
             "with fewer --workers, to resume"
         ) from None
+    except BaseException:
+        # Frames in the making would not be recorded: end their workers now, and do not wait for them.
+        with _interrupts_deferred():
+            for process in list((pool._processes or {}).values()):
+                process.kill()
+            pool.shutdown(cancel_futures=True)
+        raise
     finally:
         pool.shutdown(cancel_futures=True)
 
@@ -99,7 +111,8 @@ def _exit_with_parent() -> None:
 
 def _on_cluster(tasks: Iterator[Task], address: str) -> Iterator[Done]:
     try:
-        from dask.distributed import Client, as_completed
+        from dask.distributed import Client, KilledWorker, as_completed
+        from distributed.client import FutureCancelledError
     except ImportError:
         raise InputError(f"--scheduler {address}: needs dask.distributed: pip install 'vlcrender[cluster]'") from None
     try:
@@ -107,8 +120,29 @@ def _on_cluster(tasks: Iterator[Task], address: str) -> Iterator[Done]:
     except (OSError, ValueError) as error:
         raise InputError(f"--scheduler {address}: no answer from a scheduler: {error}") from None
     with client:
-        of_future = {client.submit(make_frames, task, pure=False): task for task in tasks}
-        for future in as_completed(list(of_future)):
+        finished, of_future = as_completed(), dict[Any, Task]()
+
+        def submit(count: int) -> None:
+            for task in islice(tasks, count):
+                future = client.submit(make_frames, task, pure=False)
+                of_future[future] = task
+                finished.add(future)
+
+        submit(TASKS_ON_CLUSTER)
+        for future in finished:
             task = of_future.pop(future)
-            yield from zip((job for job, _ in task), future.result(), strict=True)
-            future.release()
+            try:
+                records = future.result()
+            except KilledWorker as error:
+                raise InputError(
+                    f"--scheduler {address}: each worker that took frame {task[0][1]} died (out of memory?): "
+                    f"{first_line(str(error))}; run the same command again to resume"
+                ) from None
+            except FutureCancelledError as error:
+                died = " ".join(str(error).split())
+                raise InputError(f"--scheduler {address}: {died}; run the same command again to resume") from None
+            for (job, _), record in zip(task, records, strict=True):
+                if not (Path(job.directory) / record.device.file).is_file():
+                    raise InputError(f"--scheduler {address}: its workers do not see the folder {job.directory}")
+                yield job, record
+            submit(1)

@@ -2,10 +2,9 @@
 
 import logging
 import os
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
-from zipfile import BadZipFile
-from zlib import error as ZlibError
+from uuid import uuid4
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +14,6 @@ from vlcrender.core.warn_once import warn_once
 
 Array = NDArray[np.float64]
 logger = logging.getLogger(__name__)
-
-DAMAGES = (OSError, ValueError, KeyError, EOFError, BadZipFile, ZlibError, NotImplementedError, RuntimeError)
-"""What NumPy, zipfile and zlib raise for files that are cut short or have wrong bytes."""
 
 
 @dataclass(frozen=True)
@@ -37,28 +33,48 @@ _in_memory: dict[str, BakedIlluminance] = {}
 
 
 def cache_folder() -> Path | None:
-    """$VLCRENDER_CACHE, else the user's cache folder of this platform; None for a user without a home folder."""
+    """$VLCRENDER_CACHE, else the user's cache folder of this platform; None for a user without a home folder.
+
+    A relative $XDG_CACHE_HOME is ignored, as its specification has it.
+    """
     chosen = os.environ.get("VLCRENDER_CACHE")
     if chosen:
         return Path(chosen)
     try:
-        return Path(user_cache_dir("vlcrender", appauthor=False))
-    except RuntimeError:  # platformdirs finds no home folder
+        folder = Path(user_cache_dir("vlcrender", appauthor=False))
+        if not folder.is_absolute():
+            folder = Path.home() / ".cache/vlcrender"
+    except RuntimeError:  # no home folder is found
         return None
+    return folder if folder.is_absolute() else None
 
 
 def load(key: str, count: int, folder: Path | None) -> BakedIlluminance | None:
-    """The bake kept under `key`, with arrays of `count` values; None if there is none or its file is damaged."""
+    """The bake kept under `key`, with arrays of `count` values; None, with a warning, if its file is damaged.
+
+    None without a warning if there is no such file.
+    """
     if key in _in_memory:
         return _in_memory[key]
     if folder is None:
         return None
+    file = _file(folder, key)
     try:
-        with np.load(_file(folder, key)) as stored:
+        with np.load(file) as stored:
             baked = BakedIlluminance(stored["led_lux"], stored["daylight_lux"], stored["sigma_lux"])
-    except DAMAGES:
-        return None  # missing, or damaged by a crash or a disk
-    return baked if baked.led_lux.shape == (count,) else None
+        if not all(_sound(values, count) for values in astuple(baked)):
+            raise ValueError("values that no bake has")
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except Exception as error:  # whatever its readers trip over, the file is no bake
+        reason = (isinstance(error, OSError) and error.strerror) or "damaged by a crash or a disk"
+        warn_once(logger, f"{file}: cannot be read ({reason}); the light is baked again")
+        return None
+    return baked
+
+
+def _sound(values: Array, count: int) -> bool:
+    return values.shape == (count,) and values.dtype == np.float64 and bool((np.isfinite(values) & (values >= 0)).all())
 
 
 def store(key: str, baked: BakedIlluminance, folder: Path | None) -> None:
@@ -67,10 +83,10 @@ def store(key: str, baked: BakedIlluminance, folder: Path | None) -> None:
         if folder is None:
             raise OSError("no home folder")
         _write(_file(folder, key), baked)
-    except OSError as error:
+    except Exception as error:  # a bake that is done is never lost
         _in_memory[key] = baked
         place = "the user's cache folder" if folder is None else str(folder)
-        reason = error.strerror or error
+        reason = (isinstance(error, OSError) and error.strerror) or error
         warn_once(
             logger,
             f"{place}: cannot keep bakes ({reason}); each process bakes anew; set VLCRENDER_CACHE to a writable folder",
@@ -83,11 +99,11 @@ def _file(folder: Path, key: str) -> Path:
 
 def _write(file: Path, baked: BakedIlluminance) -> None:
     file.parent.mkdir(parents=True, exist_ok=True)
-    partial = file.with_suffix(f".{os.getpid()}.partial")
+    partial = file.with_suffix(f".{uuid4().hex}.partial")  # other threads and machines may write the same bake
     try:
         with partial.open("wb") as out:
             np.savez_compressed(out, led_lux=baked.led_lux, daylight_lux=baked.daylight_lux, sigma_lux=baked.sigma_lux)
         os.replace(partial, file)
-    except OSError:
-        partial.unlink(missing_ok=True)  # a full disk keeps no half file
+    except BaseException:
+        partial.unlink(missing_ok=True)  # a full disk, or an interrupt, leaves no half file
         raise

@@ -114,8 +114,7 @@ def _warn_of_dark_furniture(scene: Scene, mesh: Mesh, baked: BakedIlluminance) -
         if lux[: len(mesh.vertices_m)].any() and not lux[vertices].any():
             warn_once(
                 logger,
-                f"furniture[{number}].file = {piece.file!r}: no light falls on the front sides of its triangles; their "
-                "vertices must be counter-clockwise as seen from the lit side, and nothing may enclose them",
+                f"furniture[{number}].file = {piece.file!r}: no light falls on it; nothing else may enclose it",
             )
 
 

@@ -18,7 +18,7 @@ ASSP 35(3), 1987) lets lens and map err too, by the sigmas of `Uncertainty`: eac
 prior, which adds 1 / sigma^2 to its own information. In units of the sigmas all priors are rows of the identity; the
 bound is found by QR from the slopes themselves, never from their products, because these lose the pose where priors are
 wide. Every unknown moves an LED's image as a motion of the LED's face in its own plane would: a shift and a linear
-deformation (`FaceMotions`). So the pixels of an image tell six numbers, whose slopes follow from those by the camera's
+deformation (`face_motions`). So the pixels of an image tell six numbers, whose slopes follow from those by the camera's
 x and y; all else is geometry. Unknowns that cannot be told apart, such as the map's datum and the position, therefore
 remain so in the last digit, as they would not with slopes by pixels for each. Motions within a face that are not linear
 are left out: of a disc they show nothing, and of a small square next to nothing.
@@ -41,13 +41,13 @@ from vlcrender.camera.rig import Mounted
 from vlcrender.camera.roi import LedRegions, RegionImage, Roi, led_regions
 from vlcrender.core.planar_shapes import Disc
 from vlcrender.rendering.expected_image import Gains, LedPatch, gain_in
+from vlcrender.rendering.face_motions import FACE_NUMBERS, OWN, face_motions, moved
 from vlcrender.rendering.led_coverage import intersections_with_plane
 from vlcrender.rendering.led_radiance import face_of_led
 from vlcrender.rendering.led_slopes import Cameras
 from vlcrender.rendering.uncertainty import (
     MapLevers,
     Uncertainty,
-    intrinsics_displacements_px,
     tilt_covariance_rad2,
 )
 from vlcrender.scene.leds import Leds
@@ -63,12 +63,6 @@ MAX_CONDITION = 1e12
 """Condition number of the information, in units of the steps, above which a direction holds only rounding errors."""
 PIXELS_AT_ONCE = 100_000
 """Pixels whose slopes are reduced together: bounds the memory for an LED as large as the image."""
-FACE_NUMBERS = 6
-"""Numbers of a linear motion of an LED's face: `FaceMotions`."""
-FACE_STEP = 1e-6
-"""Step of the differences of these motions, m or radian: 0.01 px of 15 000 px; they are right to some 1e-9."""
-OWN = 6
-"""Errors of an LED's own: x, y, z, size, and two tilts of its face."""
 
 Render = Callable[[PosedCamera, Sequence[Cameras]], Sequence[Sequence[LedPatch]]]
 """`led_slopes` of a renderer: the patches of some LEDs at a camera, and their changes with each change of it."""
@@ -412,90 +406,10 @@ class FrameSlopes:
         return np.stack(slopes)
 
 
-@dataclass(frozen=True)
-class FaceMotions:
-    """How unknowns move and deform the images of k LEDs, told as motions of each face in its own plane.
-
-    Each is (k, 6, unknowns), the FACE_NUMBERS of the linear motion d(x, y) = (t_x, t_y) + E (x, y): t_x, t_y, m; then
-    E_xx, E_yx, E_xy, E_yy.
-    """
-
-    pose: Array
-    """By the pose of `main`: x, y, z, m; tilt_x, tilt_y, yaw, radians."""
-    lens: Array
-    """By the unknowns of the lens, in the units of INTRINSICS."""
-    own: Array
-    """By what is the LED's own: x, y, z, m; the logarithm of its radius or side; tilts about x and y, radians."""
-
-
-def face_motions(mounted: Mounted, main: Pose, leds: Leds, indices: NDArray[np.int64]) -> FaceMotions:
-    """The motions of the faces of some LEDs; those of a disc without its turn in its plane, which no image shows.
-
-    A point of the face whose image moves to another pixel position moves in the face's plane to the point that the
-    unmoved camera sees there. The linear motion is that of the centre and of four points of the rim.
-    """
-    posed = mounted.posed(main)
-    faces = [face_of_led(leds, int(i)) for i in indices]
-    discs = np.array([isinstance(face.shape, Disc) for face in faces])
-    halves = np.array(
-        [
-            [face.shape.radius_m] * 2 if isinstance(face.shape, Disc) else [side / 2 for side in face.shape.size_m]
-            for face in faces
-        ]
-    )
-    centers_m = np.stack([face.center_m for face in faces])
-    plane = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]]) * halves[:, None, :]  # (k, 5, 2)
-    points = np.concatenate([plane, np.zeros((len(faces), 5, 1))], axis=2) + centers_m[:, None, :]
-    pixels = posed.project(points)
-
-    def motion(plus_px: Array, minus_px: Array, step: float) -> Array:
-        """(k, 6), from the pixel positions (k, 5, 2) of the points at a step to either side."""
-        (x1, y1), (x0, y0) = (
-            intersections_with_plane(posed, centers_m.T[:, :, None], px[..., 0], px[..., 1])
-            for px in (plus_px, minus_px)
-        )
-        d = np.stack([x1 - x0, y1 - y0], axis=-1) / (2 * step)
-        by_x, by_y = (d[:, 1] - d[:, 2]) / (2 * halves[:, :1]), (d[:, 3] - d[:, 4]) / (2 * halves[:, 1:])
-        shear = (by_x[:, 1] + by_y[:, 0]) / 2
-        by_x[:, 1] = np.where(discs, shear, by_x[:, 1])
-        by_y[:, 0] = np.where(discs, shear, by_y[:, 0])
-        return np.concatenate([d[:, 0], by_x, by_y], axis=1)
-
-    def by_pose(unknown: int) -> Array:
-        plus, minus = (mounted.posed(moved(main, unknown, sign * FACE_STEP)).project(points) for sign in (1, -1))
-        return motion(plus, minus, FACE_STEP)
-
-    def by_lens(displaced: Array) -> Array:
-        step = FACE_STEP * mounted.camera.focal_px / max(float(np.abs(displaced).max()), 1.0)
-        return motion(pixels + step * displaced, pixels - step * displaced, step)
-
-    def by_points(change: Array) -> Array:
-        return motion(posed.project(points + FACE_STEP * change), posed.project(points - FACE_STEP * change), FACE_STEP)
-
-    displacements = np.moveaxis(intrinsics_displacements_px(mounted.camera, pixels[..., 0], pixels[..., 1]), 1, -1)
-    lifts = [np.stack([0 * lift, 0 * lift, lift], axis=-1) for lift in (plane[..., 1], -plane[..., 0])]
-    bare = np.array([leds.diffusers[int(i)] is None for i in indices], dtype=np.float64)[:, None]
-    growth = np.tile([0.0, 0.0, 1.0, 0.0, 0.0, 1.0], (len(faces), 1))
-    shifts = [by_points(np.broadcast_to(axis, points.shape)) for axis in np.eye(3)]
-    return FaceMotions(
-        pose=np.stack([by_pose(unknown) for unknown in range(6)], axis=2),
-        lens=np.stack([by_lens(displaced) for displaced in displacements], axis=2),
-        own=np.stack([*shifts, bare * growth, *(bare * by_points(lift) for lift in lifts)], axis=2),
-    )
-
-
 def _triangle(rows: Array) -> Array:
     """R of the rows' QR decomposition: R' R = rows' rows, without forming the product."""
     triangle: Array = np.asarray(np.linalg.qr(rows, mode="r"))
     return triangle
-
-
-def moved(pose: Pose, unknown: int, by: float) -> Pose:
-    """The pose with one of x, y, z (m), tilt_x, tilt_y, yaw (rad) changed."""
-    x, y, z = pose.position_m
-    numbers = [x, y, z, pose.tilt_x_deg, pose.tilt_y_deg, pose.yaw_deg]
-    numbers[unknown] += by if unknown < 3 else float(np.degrees(by))
-    return Pose((numbers[0], numbers[1], numbers[2]), *numbers[3:])
 
 
 def _marginal(slopes: Array, nuisances: Array, weight: Array) -> Array:

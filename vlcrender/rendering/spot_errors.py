@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from vlcrender.camera.rig import MAIN
-from vlcrender.rendering.crlb import MAX_CONDITION, FrameSlopes, moved
+from vlcrender.rendering.crlb import MAX_CONDITION, FrameSlopes
+from vlcrender.rendering.face_motions import moved
 from vlcrender.rendering.uncertainty import (
     LUMINAIRE_UNKNOWNS,
     MapLevers,

@@ -3,7 +3,7 @@
 World frame: metres, right-handed, z up, origin at a floor corner.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlcrender.config.toml_model import check, override, read_toml
-from vlcrender.errors import InputError
 from vlcrender.scene.leds import Leds, leds_of
+from vlcrender.scene.paths import file_inside
+from vlcrender.scene.scene_files import scene_sources
 from vlcrender.scene.schema import SceneSettings
 from vlcrender.scene.surfaces import Glazing, Surface, check_absorptance, glazings_of, panel_surfaces, room_surfaces
 
@@ -31,6 +32,8 @@ class Scene:
     """All LEDs."""
     folder: Path
     """The folder of furniture and textures."""
+    sources: Mapping[str, str]
+    """SHA-256 of each file of the folder that the scene is made of, before it was read, by its path from the folder."""
 
     @property
     def name(self) -> str:
@@ -57,19 +60,20 @@ def load_scene(
 def build_scene(settings: SceneSettings, source: str, folder: Path = Path()) -> Scene:
     """The scene of checked settings. Files of furniture and textures are looked up in `folder`.
 
-    Raises InputError that starts with `source` for geometry outside the room, for overlaps, for missing files, for
-    textures that cannot be read and for surfaces that absorb no light. Furniture is read, and checked, by a bake.
+    Raises InputError that starts with `source` for geometry outside the room, for overlaps, for files that are missing
+    or outside `folder`, for textures that cannot be read and for surfaces that absorb no light. Furniture is read, and
+    checked, by a bake.
     """
+    sources = scene_sources(settings, folder)  # before the files are read: a change while they are is found later
     leds = leds_of(settings, source)
     glazings = glazings_of(settings, source)
     surfaces = room_surfaces(settings.room, settings.panels, glazings, folder, source)
     for index, grid in enumerate(settings.panels):
         surfaces += panel_surfaces(grid, np.array(settings.room.size_m), f"{source}: panels[{index}]")
     for index, piece in enumerate(settings.furniture):
-        if not (folder / piece.file).is_file():
-            raise InputError(f"{source}: furniture[{index}].file = {piece.file!r}: no such file in the scene's folder")
+        file_inside(folder, piece.file, f"{source}: furniture[{index}].file = {piece.file!r}")
     if not settings.furniture:
         glazing_m2 = sum(glazing.area_m2 for glazing in glazings)
         absorbing_m2 = sum((1 - surface.reflectance) * surface.area_m2 for surface in surfaces) + glazing_m2
         check_absorptance(absorbing_m2, sum(surface.area_m2 for surface in surfaces) + glazing_m2, source)
-    return Scene(settings, tuple(surfaces), glazings, leds, folder)
+    return Scene(settings, tuple(surfaces), glazings, leds, folder, sources)

@@ -35,8 +35,8 @@ class TextureEntry(Settings):
     """An image whose grey values are a surface's reflectances, repeated tile by tile."""
 
     file: Annotated[str, Field(pattern=r"\.png$")]
-    """Grey PNG of 8 or 16 bits, a path from the scene's folder. Values are linear: 0 reflects nothing, the largest
-    value reflects all light."""
+    """Grey PNG of 8 or 16 bits without transparency, a path inside the scene's folder. Values are linear: 0 reflects
+    nothing, the largest value reflects all light."""
     tile_m: tuple[Length, Length]
     """Width and height that the image covers on the surface, metres."""
 
@@ -249,10 +249,11 @@ class GlazingEntry(Settings):
 
 
 class Furniture(Settings):
-    """A mesh that occludes LEDs and reflects light. A closed mesh is lit on its outside."""
+    """A mesh that occludes LEDs and reflects light. A closed mesh is lit on its outside, an open one on both sides."""
 
     file: Annotated[str, Field(pattern=r"\.(ply|obj|xml)$")]
-    """PLY, OBJ, or Mitsuba XML with mesh shapes; a path from the scene's folder. Metres (see `scale`), z up."""
+    """PLY, OBJ, or Mitsuba XML; a path inside the scene's folder. Metres (see `scale`), z up. XML may hold the shapes
+    ply, obj, serialized, cube and rectangle with diffuse BSDFs, of a number, an rgb, a bitmap or a checkerboard."""
     position_m: Point = (0.0, 0.0, 0.0)
     """Position of the file's origin in the room, x, y, z in metres."""
     yaw_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlcrender.errors import InputError
+from vlcrender.scene.paths import file_inside
 from vlcrender.scene.schema import PanelFrame, PanelGrid, Room, SceneSettings, TextureEntry
 from vlcrender.scene.texture import Texture, read_reflectances
 
@@ -126,7 +127,7 @@ def room_surfaces(
     """Floor, ceiling and walls, with holes for panels and glazing. Textures are read from `folder`.
 
     Raises InputError that starts with `source` for a surface with neither or both of reflectance and texture, and for a
-    texture that cannot be read.
+    texture that cannot be read or is outside `folder`.
     """
     o = np.zeros(3)
     x, y, z = (np.diag(room.size_m)[i] for i in range(3))
@@ -170,7 +171,8 @@ def _finish(room: Room, name: str, folder: Path, source: str) -> _Finish:
         raise InputError(
             f"{source}: room.reflectance.{name} = {reflectance}: there is a room.texture.{name} too; remove one of them"
         )
-    image = read_reflectances(folder / entry.file, f"{source}: room.texture.{name}.file = {entry.file!r}")
+    where = f"{source}: room.texture.{name}.file = {entry.file!r}"
+    image = read_reflectances(file_inside(folder, entry.file, where), where)
     return _Finish(float(image.mean()), image, entry.tile_m)
 
 

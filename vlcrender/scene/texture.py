@@ -4,9 +4,11 @@ Reflectance is linear between the centres of the image's pixels. Means take each
 this conserves energy and differs from the linear form by a blur of half a pixel.
 """
 
+import warnings
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +19,8 @@ Array = NDArray[np.float64]
 
 MAX_PIXELS = 4_000_000
 """Largest number of pixels of an image; its table of sums takes 32 bytes a pixel."""
-
-
-FULL_SCALE = {"L": 255, "I;16": 65535, "I": 65535}
-"""Value of a reflectance of 1, by Pillow's modes of grey images."""
+GREY_MODES = ("L", "I;16", "I")
+"""Pillow's modes of grey images of 8 and of 16 bits."""
 
 
 @dataclass(frozen=True)
@@ -84,24 +84,33 @@ class Texture:
 def read_reflectances(path: Path, where: str) -> Array:
     """Reflectances (rows, columns) of a grey PNG: 0 to 255, or 0 to 65535, is 0 to 1, linearly, without gamma.
 
-    Raises InputError that starts with `where` for a missing file, a file that is no PNG, an image that is not grey, and
-    one of more than MAX_PIXELS pixels.
+    Raises InputError that starts with `where` for a file that cannot be read or is no PNG, an image that is not grey or
+    has transparency, and one of more than MAX_PIXELS pixels.
+    """
+    values = read_image(path, where, ("PNG",), GREY_MODES)
+    return values.astype(np.float64) / (255 if values.dtype == np.uint8 else 65535)
+
+
+def read_image(path: Path, where: str, formats: tuple[str, ...], modes: tuple[str, ...]) -> NDArray[Any]:
+    """Values (rows, columns), or with a last axis of 3 colours, of an image: uint8, or uint16 of 16 bits.
+
+    formats: PNG, JPEG; modes: Pillow's, of images without transparency. Raises InputError that starts with `where`.
     """
     from PIL import Image, UnidentifiedImageError  # loaded for scenes with a texture only
 
-    if not path.is_file():
-        raise InputError(f"{where}: no such file in the scene's folder")
+    kinds = " or ".join(formats)
     try:
-        with Image.open(path, formats=["PNG"]) as image:
+        with warnings.catch_warnings(action="ignore"), Image.open(path, formats=formats) as image:
             if image.width * image.height > MAX_PIXELS:
                 raise InputError(
                     f"{where}: has {image.width} x {image.height} pixels; at most {MAX_PIXELS} in all are allowed"
                 )
-            if image.mode not in FULL_SCALE:
-                raise InputError(f"{where}: is no grey image of 8 or 16 bits without transparency")
-            values = np.asarray(image, dtype=np.float64) / FULL_SCALE[image.mode]
+            if image.mode not in modes or "transparency" in image.info:
+                grey = "grey" if "RGB" not in modes else "grey or RGB"
+                raise InputError(f"{where}: is no {grey} image of 8 or 16 bits without transparency")
+            values = np.array(image)  # Mitsuba takes no read-only array
     except InputError:
         raise
     except (UnidentifiedImageError, OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise InputError(f"{where}: is no PNG that can be read: {' '.join(str(error).split())[:120]}") from None
-    return values
+        raise InputError(f"{where}: is no {kinds} that can be read: {' '.join(str(error).split())[:120]}") from None
+    return values if values.dtype == np.uint8 else values.astype(np.uint16)
