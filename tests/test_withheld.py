@@ -267,7 +267,7 @@ def test_repair_makes_nothing_of_a_withheld_set_but_its_manifest(withheld: Path,
     assert content(folder) == content(withheld)
     assert vr.repair(folder) == []
     (folder / "frames/000001.exr").unlink()
-    with pytest.raises(InputError, match="its truth is withheld, and with it recipe and seed: nothing can be made again"):
+    with pytest.raises(InputError, match="its truth is withheld, and with it recipe and seed: nothing can be made"):
         vr.repair(folder)
 
 

@@ -35,6 +35,7 @@ from vlcrender.dataset.values import (
     Triple,
     repeated,
 )
+from vlcrender.dataset.withheld_entry import Withheld
 from vlcrender.scene.as_built import Luminaires
 from vlcrender.scene.leds import Leds
 from vlcrender.sensor.accelerometer import Imu, TiltError
@@ -327,20 +328,6 @@ class MapDatumEntry(Settings):
 
     sigma_m: Sigmas3
     scale_sigma_ppm: NotNegative
-
-
-class Withheld(Settings):
-    """What dataset.json says of a truth that is withheld."""
-
-    sha256: str
-    """Digest of truth.sealed, 64 hex digits."""
-    frames: Literal["all"] | tuple[int, ...]
-    """Frames without a row in truth.parquet; with "all" there is no such file."""
-
-    def frames_with_truth(self, count: int) -> list[int]:
-        """Frames of a set of `count` frames that truth.parquet has a row of."""
-        withheld = set(range(count) if self.frames == "all" else self.frames)
-        return [frame for frame in range(count) if frame not in withheld]
 
 
 class DatasetFile(Settings):

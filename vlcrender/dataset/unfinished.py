@@ -33,7 +33,6 @@ from vlcrender.dataset.schema import (
     FileEntry,
     FrameRecord,
     FrameRow,
-    Withheld,
     accelerometer_entry,
     camera_entry,
     gyroscope_entry,
@@ -47,6 +46,7 @@ from vlcrender.dataset.tables import write_table
 from vlcrender.dataset.truth_tables import write_truth
 from vlcrender.dataset.verify import verify
 from vlcrender.dataset.withheld import Seal, same_file_times
+from vlcrender.dataset.withheld_entry import Withheld
 from vlcrender.errors import InputError
 from vlcrender.scene.as_built import luminaires_of
 from vlcrender.scene.scene_files import check_sources

@@ -24,10 +24,11 @@ from vlcrender.dataset.lock import LOCK, locked
 from vlcrender.dataset.manifest import DATASET_FILE, frames_per_file, manifest_of_files, write_sealed
 from vlcrender.dataset.plan import Plan
 from vlcrender.dataset.pose_sampling import AimedPoses
-from vlcrender.dataset.schema import DatasetFile, TruthRow, Withheld
+from vlcrender.dataset.schema import DatasetFile, TruthRow
 from vlcrender.dataset.summary import disk_use
 from vlcrender.dataset.tables import write_table
 from vlcrender.dataset.truth_tables import TRUTH, TRUTH_TABLES, write_truth
+from vlcrender.dataset.withheld_entry import Withheld
 from vlcrender.errors import InputError
 from vlcrender.sensor.accelerometer import Imu
 
