@@ -20,6 +20,7 @@ from cyclopts import App, CycloptsError, Parameter
 import estimator
 from estimator.errors import InputError
 from estimator.io.process import INTERRUPTED, ending_at_second_interrupt, prepare_streams, progress_console
+from estimator.report.benchmark_commands import leaderboard, submit
 from estimator.report.score_commands import score
 from estimator.report.table_commands import plot, table
 
@@ -139,6 +140,8 @@ def _with_centroid_sigma(names: list[str] | None, sigma_px: float | None) -> lis
 app.command(score)
 app.command(table)
 app.command(plot)
+app.command(submit)
+app.command(leaderboard)
 
 
 @app.command

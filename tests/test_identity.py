@@ -215,7 +215,7 @@ def test_a_damaged_unfinished_set_is_finished_as_if_nothing_had_happened(
 
 def test_each_changed_byte_of_a_line_is_noticed(half: Path) -> None:
     line = (half / "journal.jsonl").read_bytes().splitlines(keepends=True)[0]
-    assert _record_of(line) is not None
+    assert _record_of(line, None) is not None
     for place in range(0, len(line), 7):
         assert _record_of(line[:place] + bytes([line[place] ^ 4]) + line[place + 1 :]) is None
 

@@ -49,6 +49,7 @@ def test_the_columns_are_those_of_the_format() -> None:
         "accelerometer_m_s2": pa.list_(pa.float64(), 3),
         "gyro_rad_s": pa.list_(pa.float64(), 3),
         "spots": pa.list_(pa.struct(SPOT)),
+        "split": pa.string(),
     }
     assert pa.schema(list(expected.items())).equals(FRAMES_SCHEMA)
     expected = {

@@ -41,7 +41,7 @@ MAX_RENDERERS = 4
 MAX_EXPOSURE_S = 100.0
 MAX_START_S = 1e7
 """Latest start of a frame: the phase of a wave of 1 ms is then known to 1e-6 periods."""
-MAX_SEED = 2**63
+MAX_SEED = 2**128
 
 
 @dataclass(frozen=True)
@@ -247,7 +247,7 @@ def expose(
         raise InputError(f'demodulation = "{demodulation}": has to be "given" or "pixels"')
     for name, number in (("seed", seed), ("frame", frame)):
         if not 0 <= int(number) < MAX_SEED:
-            raise InputError(f"{name} = {number}: has to be an integer from 0 to 2**63 - 1")
+            raise InputError(f"{name} = {number}: has to be an integer from 0 to 2**128 - 1")
     if sensor.spectral_response != mean.sensor.spectral_response:
         mean = render(mean.scene, mean.camera, mean.pose, sensor=sensor, regions=mean.regions)
     device = accelerometer or TiltError()
@@ -296,20 +296,24 @@ def generate(
     scale_mode: ScaleMode = "binned",
     scheduler: str | None = None,
     progress: "ProgressCallback | None" = None,
+    withhold_truth: str | Path | None = None,
 ) -> bool:
     """Generate the dataset of a recipe, or of each cell of its sweep, in the folder `out`; continue an interrupted run.
 
     `recipe` is a packaged name, the path of a TOML file, or what `load_recipe` returns; `overrides`, `scale` and
     `scale_mode` are those of `load_recipe`. `workers` processes make frames, or the workers of a dask `scheduler` (its
-    address); the bits are the same for any number. `progress` is called with `Progress` reports. Returns False if the
-    dataset was already complete and intact. Raises InputError for bad input, or if `out` holds anything else.
+    address); the bits are the same for any number. `progress` is called with `Progress` reports. `withhold_truth` is a
+    key file, made if missing: the truth of the test frames is sealed with it, or that of all frames without [split],
+    and `release` writes it again. Returns False if the dataset was already complete and intact. Raises InputError for
+    bad input, or if `out` holds anything else.
     """
     if workers < 1:
         raise InputError(f"workers = {workers}: has to be 1 or more")
     plan = _plan(recipe, overrides, scale, scale_mode)
     from vlcrender.dataset.generate import generate as make  # loads Mitsuba: after the recipe is known to be good
 
-    return make(plan, Path(out), workers, scheduler, progress)
+    key_file = None if withhold_truth is None else Path(withhold_truth)
+    return make(plan, Path(out), workers, scheduler, progress, key_file)
 
 
 def budget(
@@ -342,6 +346,17 @@ def verify(directory: str | Path) -> list[str]:
     from vlcrender.dataset.verify import verify as problems_of
 
     return problems_of(Path(directory))
+
+
+def release(directory: str | Path, key_file: str | Path) -> None:
+    """Write the withheld truth of a dataset again: it then is the dataset of the recipe with the true seed.
+
+    `key_file` is that of `generate(..., withhold_truth=...)`. Raises InputError if the dataset has its truth, the key
+    is not its key, or the sealed truth is damaged.
+    """
+    from vlcrender.dataset.withheld import release as write
+
+    write(Path(directory), Path(key_file))
 
 
 def repair(directory: str | Path, *, scene_folder: str | Path | None = None, workers: int = 1) -> list[str]:

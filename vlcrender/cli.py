@@ -53,6 +53,7 @@ def generate(
     scale_mode: Literal["binned", "same-photons"] = "binned",
     workers: int = 1,
     scheduler: str | None = None,
+    withhold_truth: Path | None = None,
     dry_run: Annotated[bool, Parameter(negative=())] = False,
 ) -> None:
     """Generate the dataset of a recipe, or one for each cell of its sweep; an interrupted run is continued.
@@ -75,6 +76,9 @@ def generate(
         Processes that make frames.
     scheduler
         Address of a dask scheduler whose workers see the same folder.
+    withhold_truth
+        Key file, made if missing, with which the truth of the test frames is sealed, or that of all frames without
+        [split] (docs/benchmark.md). Keep it; `vlcrender release` needs it.
     dry_run
         Print what would be made, and estimates of time and size from a few frames; write nothing in the folder.
     """
@@ -85,10 +89,16 @@ def generate(
         raise InputError(f"--workers {workers}: has to be 1 or more")
     plan = api.load_recipe(recipe, set_, scale=scale, scale_mode=scale_mode)
     if dry_run:
+        if withhold_truth is not None:
+            from vlcrender.dataset.withheld import check_withholdable
+
+            check_withholdable(plan)
         _dry_run(plan, workers, out)
         return
     with ProgressDisplay(plan.recipe.name, plan.frame_count) as display:
-        made = api.generate(plan, out, workers=workers, scheduler=scheduler, progress=display.show)
+        made = api.generate(
+            plan, out, workers=workers, scheduler=scheduler, progress=display.show, withhold_truth=withhold_truth
+        )
     cells = "" if plan.cells is None else f"{len(plan.cells)} cells, "
     print(f"{out}: {cells}{plan.frame_count} frames{'' if made else ' (was already complete and intact)'}")
     if made and plan.cells is None:
@@ -141,9 +151,13 @@ def verify(
     from vlcrender.dataset.sweep import SWEEP_FILE
 
     if (directory / SWEEP_FILE).is_file():
-        content = f"{len(read_sweep_file(directory).cells)} cells"
+        content, unchecked = f"{len(read_sweep_file(directory).cells)} cells", ""
     else:
-        content = f"{read_dataset_file(directory).frame_count} frames"
+        dataset = read_dataset_file(directory)
+        content, unchecked = f"{dataset.frame_count} frames", ""
+        if dataset.withheld is not None:
+            told = len(dataset.withheld.frames_with_truth(dataset.frame_count))
+            unchecked = f" (not checked: the withheld truth of {dataset.frame_count - told} frames)"
     if repair:
         for line in api.repair(directory, scene_folder=scene_folder, workers=workers):
             print(f"{directory}: {line}")
@@ -152,7 +166,24 @@ def verify(
         _complain(problem)
     if found:
         sys.exit(2)
-    print(f"{directory}: {content}, all there and intact")
+    print(f"{directory}: {content}, all there and intact{unchecked}")
+
+
+@app.command
+def release(directory: Path, key_file: Path, /) -> None:
+    """Write the withheld truth of a dataset again; anybody can then score it.
+
+    Parameters
+    ----------
+    directory
+        Folder of a dataset that `vlcrender generate --withhold-truth` made.
+    key_file
+        Its key file.
+    """
+    from vlcrender import api
+
+    api.release(directory, key_file)
+    print(f"{directory}: has its truth")
 
 
 @app.command

@@ -44,6 +44,7 @@ from estimator.io.led_map import AnyLed
 from estimator.io.lock import locked
 from estimator.io.records import Positive, Row, Size
 from estimator.io.truth import TruthRow, read_true_map, read_truth
+from estimator.io.withheld import read_withheld
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -357,6 +358,11 @@ def _score(folder: Path) -> Scores:
     paths = estimate_paths(folder)
     if not paths:
         raise InputError(f"{folder / 'estimates'}: no estimates to score; make them with `estimator run {folder}`")
+    if read_withheld(dataset.folder) is not None:
+        raise InputError(
+            f"{dataset.folder}: truth is withheld; score bundles: estimator score BUNDLE.zip "
+            f"--dataset {dataset.folder} --truth KEYFILE"
+        )
     sources = sources_of(folder, paths)
     truth = read_truth(dataset.folder / "truth.parquet", len(dataset.frames))
     devices = [record.device for record in dataset.frames]

@@ -184,13 +184,14 @@ def of_all(errors_m: Sequence[float | None]) -> OfAll | None:
     """Percentiles of the errors of all frames, None for a failed one; None without a frame."""
     if not errors_m:
         return None
+    return OfAll(median_m=percentile_of_all(errors_m, 50), p95_m=percentile_of_all(errors_m, 95))
+
+
+def percentile_of_all(errors_m: Sequence[float | None], percent: int) -> float | None:
+    """The smallest error that `percent` of all frames do not exceed, None for a failed frame; None is infinite."""
     ordered = sorted(np.inf if error_m is None else error_m for error_m in errors_m)
-
-    def percentile(percent: int) -> float | None:
-        error_m = ordered[-(-percent * len(ordered) // 100) - 1]
-        return error_m if np.isfinite(error_m) else None
-
-    return OfAll(median_m=percentile(50), p95_m=percentile(95))
+    error_m = ordered[-(-percent * len(ordered) // 100) - 1]
+    return error_m if np.isfinite(error_m) else None
 
 
 def root_mean_square(values: Floats, axis: int = -1) -> Floats:

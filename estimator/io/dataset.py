@@ -63,8 +63,8 @@ FRAME_COLUMNS = {
     "start_s": pa.float64(),
     "gyro_rad_s": pa.list_(pa.float64()),
 }
-OPTIONAL_FRAME_COLUMNS = {"part": pa.int64()}
-"""Null in a set whose files hold one frame each; sets without it are such."""
+OPTIONAL_FRAME_COLUMNS = {"part": pa.int64(), "split": pa.string()}
+"""`part` is null in a set whose files hold one frame each, `split` in a set without a split; sets without are such."""
 
 
 class FrameRecord(Row):
@@ -85,6 +85,7 @@ class FrameRecord(Row):
     start_s: Number
     gyro_rad_s: Triple | None
     part: int | None = Field(default=None, ge=0)
+    split: Literal["train", "validation", "test"] | None = None
 
     @field_validator("file")
     @classmethod

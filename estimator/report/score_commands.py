@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
@@ -21,9 +21,12 @@ ABOVE_LIMIT = 1
 
 
 def score(
-    dataset: Path,
+    dataset: Annotated[Path, Parameter(name="DATASET")],
     /,
-    *,
+    *bundles: Path,
+    of: Annotated[Path | None, Parameter(name="--dataset")] = None,
+    truth: Path | None = None,
+    split: Literal["train", "validation", "test"] = "test",
     wide: Flag = False,
     plot: Flag = False,
     unit: str | None = None,
@@ -43,7 +46,16 @@ def score(
     Parameters
     ----------
     dataset
-        Folder of a dataset with estimates, or of a sweep: each cell gets its scores.json, the table is of all cells.
+        Folder of a dataset with estimates, or of a sweep: each cell gets its scores.json, the table is of all cells. Or
+        a bundle of estimates (.zip), of which no file is written.
+    bundles
+        Further bundles.
+    of
+        Folder of the dataset that bundles are of.
+    truth
+        Key file of a dataset whose truth is withheld, for bundles.
+    split
+        The frames that bundles are scored on, where the dataset has a split.
     wide
         All tables, as wide as they are: intervals, bounds, devices and maps, identities, failures by LEDs.
     plot
@@ -66,6 +78,7 @@ def score(
     """
     from estimator.evaluate.threshold import Threshold
     from estimator.io.sweep import read_sweep
+    from estimator.report.benchmark_commands import print_bundle_scores
     from estimator.report.score_lines import unit_named
 
     ways = [name for name, on in (("--json", json), ("--csv", csv), ("--markdown", markdown), ("--latex", latex)) if on]
@@ -73,6 +86,11 @@ def score(
         raise InputError(f"{', '.join([*ways, *(['--wide'] if wide else [])])}: needed one of them at most")
     limits = [Threshold.of(text) for text in fail_above or ()]
     chosen = None if unit is None else unit_named(unit)
+    if dataset.suffix == ".zip" or bundles or of is not None:
+        if limits or plot or quiet or chosen or wide or set(ways) - {"--json"}:
+            raise InputError(f"{dataset}: of bundles there is a table, or --json")
+        print_bundle_scores([dataset, *bundles], of, truth, split, json)
+        return 0
     if read_sweep(dataset) is not None:
         if limits or csv or markdown or latex or wide:
             raise InputError(f"{dataset}: is a sweep; --json, or `estimator table {dataset}`, or the score of one cell")

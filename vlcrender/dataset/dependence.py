@@ -10,7 +10,7 @@ MAX_RECIPES = 1024
 """Recipes that are kept; the one used longest ago is dropped first."""
 NOT_IN_FILES: dict[str, Any] = {
     **dict.fromkeys(
-        ("name", "description", "licence", "accelerometer", "gyroscope", "demodulation", "map", "bound"), True
+        ("name", "description", "licence", "accelerometer", "gyroscope", "demodulation", "map", "bound", "split"), True
     ),
     "belief": {"accelerometer", "stated_factor"},
 }

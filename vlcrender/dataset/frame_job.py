@@ -244,6 +244,7 @@ def make_frame(job: Job, frame: int, twin: Files | None = None, shard: Shard | N
         accelerometer_m_s2=reading.tolist(),
         gyro_rad_s=gyro,
         spots=spots,
+        split=_split_of(recipe, view.renderer.scene, pose_number),
     )
     angular = linear = None
     if recipe.motion is not None:
@@ -326,6 +327,14 @@ def poses_of(
         if later_s:
             middle = recipe.motion.pose_at(main, later_s)
     return main, middle, poses_during(recipe.motion, mounted, middle, exposure_s, scene)
+
+
+def _split_of(recipe: Recipe, scene: Scene, pose_number: int) -> str | None:
+    """The split of all frames of a pose, by its place before the rig moves; None without [split]."""
+    if recipe.split is None:
+        return None
+    pose = pose_of_frame(recipe.poses, pose_number, recipe.seed, recipe.camera, scene)
+    return recipe.split.name_at(pose.position_m, scene.room_m, recipe.seed)
 
 
 def _white_balance(camera: Camera, sensor: Sensor, scene: Scene) -> tuple[float, float, float]:

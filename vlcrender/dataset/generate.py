@@ -22,6 +22,7 @@ from vlcrender.dataset.possible import check_possible
 from vlcrender.dataset.progress import FRAMES_STAGE, Progress, ProgressCallback
 from vlcrender.dataset.sweep import SWEEP_FILE, sweep_tree
 from vlcrender.dataset.unfinished import Unfinished, is_complete, prepare_folder, provenance_of
+from vlcrender.dataset.withheld import Seal, check_withholdable, same_file_times
 from vlcrender.dataset.workers import Task, done_frames
 from vlcrender.errors import InputError
 from vlcrender.light.lightmap import Lightmap, bake
@@ -39,41 +40,55 @@ def generate(
     workers: int = 1,
     scheduler: str | None = None,
     progress: ProgressCallback | None = None,
+    withhold_truth: Path | None = None,
 ) -> bool:
     """Generate the dataset of a plan in `directory`, or its cells; False where it is already complete and intact.
 
     Resumes an interrupted run of the same plan. `workers` is the number of processes; `scheduler` is the address of a
-    dask scheduler whose workers share the folder. `progress` is called with each report. Raises InputError where the
-    folder holds anything else or is in use, and where a pose, the furniture, or a true camera or LED of the plan is
+    dask scheduler whose workers share the folder. `progress` is called with each report. With `withhold_truth`, a key
+    file that is made where it is missing, the truth is sealed (`withheld.Seal`). Raises InputError where the folder
+    holds anything else or is in use, and where a pose, the furniture, or a true camera or LED of the plan is
     impossible: before the first frame, except for a pose among thousands (`possible`).
     """
     try:
         str(directory).encode()
     except UnicodeEncodeError:
         raise InputError(f"--out {directory}: not a UTF-8 name; EXR files need one") from None
+    seal = None
+    if withhold_truth is not None:
+        check_withholdable(plan)
+        seal = Seal.of_file(withhold_truth, directory)
+        plan = seal.secret_plan(plan)
     if scheduler is not None:
         directory = Path(os.path.abspath(directory))  # workers have working folders of their own
     with locked(directory, "vlcrender generate"):
-        return _generate(plan, directory, workers, scheduler, progress)
+        return _generate(plan, directory, workers, scheduler, progress, seal)
 
 
 def _generate(
-    plan: Plan, directory: Path, workers: int, scheduler: str | None, progress: ProgressCallback | None
+    plan: Plan,
+    directory: Path,
+    workers: int,
+    scheduler: str | None,
+    progress: ProgressCallback | None,
+    seal: Seal | None,
 ) -> bool:
-    """`generate` in a folder that is locked."""
+    """`generate` in a folder that is locked. seal: where the truth is withheld; the plan is then the secret one."""
     report = progress or (lambda report: None)
     if plan.cells is None:
         file, kind = "dataset.json", "dataset"
-        wanted: dict[str, Any] = {"provenance": provenance_of(plan)}
+        wanted: dict[str, Any] = {"provenance": provenance_of(plan, seal)}
     else:
         file, kind = SWEEP_FILE, "sweep"
         wanted = {**sweep_tree(plan.recipe.name, plan.cells.sweep), "provenance": provenance_of(plan)}
     if is_complete(directory, file, wanted, f"a {kind} of another recipe, scene or version"):
+        if seal is not None:
+            same_file_times(directory)  # a run may have been killed before it did that
         log.info("%s: complete and intact already", directory)
         return False
     if plan.cells is None:
         check_possible(plan, lambda share: report(Progress("poses", share, 1.0)))
-        datasets = [Unfinished(lambda: plan, Job.of(plan, directory), plan.frame_count)]
+        datasets = [Unfinished(lambda: plan, Job.of(plan, directory), plan.frame_count, seal)]
         datasets[0].open()
         lit = iter([plan])
     else:

@@ -7,7 +7,7 @@ ASCII. dataset.json has the digest of manifest.json, so that its seal covers eve
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -92,10 +92,10 @@ def files_of_set(directory: Path) -> list[str]:
     return sorted(set(found) - set(NO_PART))
 
 
-def manifest_of_files(directory: Path, per_file: int, to: Path) -> str:
+def manifest_of_files(directory: Path, per_file: int, to: Path, without: Collection[str] = ()) -> str:
     """Write manifest.json of the files of `directory` as they are to the folder `to`; return its SHA-256.
 
-    The order is that of every manifest. per_file: frames in each file.
+    The order is that of every manifest. per_file: frames in each file. without: files that are left out.
     """
 
     def place(name: str) -> tuple[int, str]:
@@ -107,7 +107,7 @@ def manifest_of_files(directory: Path, per_file: int, to: Path) -> str:
             return -1, name
         return int(number) * (per_file if of_shard else 1), name
 
-    names = sorted(files_of_set(directory), key=place)
+    names = sorted(set(files_of_set(directory)) - set(without), key=place)
     return write_manifest(to, ((name, entry_of(directory / name)) for name in names))
 
 

@@ -26,7 +26,7 @@ POSES_A_REPORT = 100
 
 
 def check_possible(plan: Plan, report: Callable[[float], None] = lambda share: None) -> None:
-    """Raise InputError where a pose, a true camera or LED, or the furniture of a plan is impossible.
+    """Raise InputError where a pose, a true camera or LED, the furniture or the split of a plan is impossible.
 
     report: gets the share of the poses that are checked, from time to time.
     """
@@ -47,6 +47,8 @@ def check_possible(plan: Plan, report: Callable[[float], None] = lambda share: N
         for map_number in range(plan.recipe.belief.maps):
             built_leds(plan.recipe, plan.scene, map_number)
     room_mesh(plan.scene)
+    if plan.recipe.split is not None:
+        plan.recipe.split.name_at((0.0, 0.0), plan.scene.room_m, plan.recipe.seed)
 
 
 def poses_to_check(numbers: range) -> list[int]:

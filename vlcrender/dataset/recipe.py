@@ -18,6 +18,7 @@ from vlcrender.dataset.file_settings import FileSettings
 from vlcrender.dataset.licence import Licence
 from vlcrender.dataset.motion import Motion
 from vlcrender.dataset.pose_sampling import Aim, Poses
+from vlcrender.dataset.splits import Split
 from vlcrender.dataset.sweep import SweepTable
 from vlcrender.dataset.timeline import Burst, start_of_burst_s
 from vlcrender.errors import InputError
@@ -49,7 +50,7 @@ class Recipe(Settings):
     """Licence of the dataset, an SPDX expression such as "CC-BY-4.0"; not stated where not given."""
     scene: str
     """Path of the scene file, relative to the recipe's folder, or the name of a packaged scene."""
-    seed: Annotated[int, Field(ge=0, lt=2**63)]
+    seed: Annotated[int, Field(ge=0, lt=2**128)]
     """Seed of every random number of the dataset."""
     exposure_s: Annotated[float, Field(gt=0, le=100)] | None = None
     """Exposure time of every frame, seconds. Give either this or `exposure`."""
@@ -71,6 +72,8 @@ class Recipe(Settings):
     """Settings of processed pictures, as a phone makes them; none are written where not given."""
     files: FileSettings = FileSettings()
     """The format of frames, how many of them have previews, and how many share a file."""
+    split: Split | None = None
+    """Train, validation and test frames by position; no split where not given."""
     bound: bool = False
     """Whether each frame's Cramér-Rao bound is computed: some seconds for a full frame of many LEDs."""
     camera: Camera = Camera()

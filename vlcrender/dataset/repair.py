@@ -168,6 +168,11 @@ def _records(plan: Plan, work: Path, frames: Iterable[int], workers: int) -> lis
 def _plan_of(dataset: DatasetFile, directory: Path, scene_folder: Path | None) -> Plan:
     """The plan of a dataset's provenance. Raises InputError where it has none that this program can follow."""
     path, provenance = directory / DATASET_FILE, dataset.provenance
+    if dataset.withheld is not None:
+        raise InputError(
+            f"{directory}: its truth is withheld, and with it recipe and seed: nothing can be made again; take damaged "
+            "files from a copy, or generate the set in another folder with its key file"
+        )
     recipe, sources = recipe_of(dataset), provenance.get("sources") or {}
     if recipe is None or "scene" not in provenance:
         raise InputError(f"{path}: provenance has no recipe and scene to make files of")

@@ -35,6 +35,7 @@ from vlcrender.dataset.values import (
     Triple,
     repeated,
 )
+from vlcrender.dataset.withheld_entry import Withheld
 from vlcrender.scene.as_built import Luminaires
 from vlcrender.scene.leds import Leds
 from vlcrender.sensor.accelerometer import Imu, TiltError
@@ -113,6 +114,8 @@ class FrameRow(Settings):
     gyro_rad_s: Triple | None
     """Reading of the gyroscope, mean over the readout, in the axes of this frame's camera; None without one."""
     spots: tuple[SpotRow, ...]
+    split: str | None = None
+    """Train, validation or test; None where the frame belongs to none, or the recipe has no [split]."""
 
     @field_validator("sha256")
     @classmethod
@@ -363,6 +366,8 @@ class DatasetFile(Settings):
     """SPDX licence expression of the recipe; None where not stated."""
     names: NamesEntry = NamesEntry()
     """Where not given, no presets: sets made before they were stated."""
+    withheld: Withheld | None = None
+    """None where the set has its truth."""
     provenance: dict[str, Any]
     manifest_sha256: str | None = None
     """SHA-256 of manifest.json; None in a set that was made before there were manifests."""

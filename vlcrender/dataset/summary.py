@@ -21,9 +21,16 @@ MANY_SATURATED = 0.5
 
 
 def summary_of(
-    recipe: Recipe, records: Iterable[FrameRecord], directory: Path, warnings: Iterable[str] = ()
+    recipe: Recipe,
+    records: Iterable[FrameRecord],
+    directory: Path,
+    warnings: Iterable[str] = (),
+    rounded: bool = False,
 ) -> Summary:
-    """The summary of a set whose frames and tables are written; `warnings` are those of its plan."""
+    """The summary of a set whose frames and tables are written; `warnings` are those of its plan.
+
+    rounded: numbers of pixels have two digits. Exact ones of a withheld set would tell of a frame what its noise hides.
+    """
     leds: Counter[int] = Counter()
     backgrounds_e = array("d")
     pixels = saturated = frames_saturated = 0
@@ -39,9 +46,12 @@ def summary_of(
         saturated += numbers.saturated
         frames_saturated += numbers.saturated > 0
         brightest_e = max(brightest_e, numbers.brightest_e)
+    share, background_e = saturated / max(pixels, 1), float(np.median(backgrounds_e)) if known else 0.0
+    if rounded:
+        share, brightest_e, background_e = (float(f"{value:.2g}") for value in (share, brightest_e, background_e))
     found = list(warnings)
-    if known and saturated > MANY_SATURATED * pixels:
-        found.append(f"{100 * saturated / pixels:.0f} % of all pixels are saturated; choose a shorter exposure")
+    if known and share > MANY_SATURATED:
+        found.append(f"{100 * share:.0f} % of all pixels are saturated; choose a shorter exposure")
     elif known and frames_saturated == len(backgrounds_e):
         found.append(
             f"every frame has saturated pixels: the brightest has {brightest_e:.0f} electrons, and a pixel holds "
@@ -50,11 +60,11 @@ def summary_of(
     if leds[0]:
         found.append(f"{leds[0]} of {leds.total()} frames show no whole LED")
     return Summary(
-        saturated_share=saturated / pixels if known else None,
+        saturated_share=share if known else None,
         leds=_counts(leds),
         field_of_view_deg={mounted.name: mounted.camera.view_angles_deg()[0] for mounted in recipe.cameras},
         brightest_e=brightest_e if known else None,
-        background_e=float(np.median(backgrounds_e)) if known else None,
+        background_e=background_e if known else None,
         saturation_e=recipe.sensor.saturation_e,
         bytes=disk_use(directory),
         warnings=tuple(found),

@@ -30,13 +30,10 @@ from vlcrender.dataset.schema import (
     DATA_VERSION,
     FORMAT_VERSION,
     DatasetFile,
-    DeviceTruthRow,
     FileEntry,
     FrameRecord,
     FrameRow,
-    MapTruthRow,
     NamesEntry,
-    TruthRow,
     accelerometer_entry,
     camera_entry,
     gyroscope_entry,
@@ -46,10 +43,11 @@ from vlcrender.dataset.schema import (
 )
 from vlcrender.dataset.shard import incomplete
 from vlcrender.dataset.summary import summary_of
-from vlcrender.dataset.sweep import sweep_columns
 from vlcrender.dataset.tables import write_table
-from vlcrender.dataset.true_world import device_rows, map_rows
+from vlcrender.dataset.truth_tables import write_truth
 from vlcrender.dataset.verify import verify
+from vlcrender.dataset.withheld import Seal, same_file_times
+from vlcrender.dataset.withheld_entry import Withheld
 from vlcrender.errors import InputError
 from vlcrender.scene.as_built import luminaires_of
 from vlcrender.scene.scene_files import check_sources
@@ -117,6 +115,8 @@ def _difference(there: Any, here: Any, key: str = "") -> str | None:
     if name.startswith("sources."):
         state = {(True, False): "is new", (False, True): "is missing"}.get((there is None, here is None), "was changed")
         return f"the file {name.removeprefix('sources.')}, which {state}"
+    if name == "commitment":
+        return "recipe, scene or key file, all of which the commitment of a withheld truth is made of"
     if name == "program_sha256":
         return "the program: the source of vlcrender was changed since; a set is made by one program"
     return f"{name}: {_short(there)} there, {_short(here)} here"
@@ -138,8 +138,13 @@ def prepare_folder(directory: Path, wanted: Mapping[str, Any], other: str) -> No
     write_json(plan_file, wanted)
 
 
-def provenance_of(plan: Plan) -> dict[str, Any]:
-    """What a dataset is made of: the resolved recipe and scene, the cell of a sweep, files, program and versions."""
+def provenance_of(plan: Plan, seal: Seal | None = None) -> dict[str, Any]:
+    """What a dataset states that it is made of: of a withheld set (`seal`), nothing that gives the truth away."""
+    return _whole_provenance(plan) if seal is None else seal.public_provenance(_whole_provenance(plan))
+
+
+def _whole_provenance(plan: Plan) -> dict[str, Any]:
+    """The resolved recipe and scene, the cell of a sweep, files, program and versions."""
     recipe = plan.recipe.model_dump(mode="json")
     recipe["seed"] = str(plan.recipe.seed)  # JSON readers round integers beyond 2**53
     return {
@@ -161,9 +166,10 @@ def _versions() -> dict[str, str]:
 class Unfinished:
     """A dataset that is being made. `open` its folder before a frame of it is made."""
 
-    def __init__(self, plan: Callable[[], Plan], job: Job, frame_count: int) -> None:
-        """plan: makes or returns its plan, which is not kept."""
+    def __init__(self, plan: Callable[[], Plan], job: Job, frame_count: int, seal: Seal | None = None) -> None:
+        """plan: makes or returns its plan, which is not kept. seal: of a set whose truth is withheld."""
         self.plan = plan
+        self.seal = seal
         self.job = job
         self.frame_count = frame_count
         self._directory = Path(job.directory)
@@ -196,13 +202,13 @@ class Unfinished:
             return
         plan = self.plan()
         self._check_scene(plan)
-        recipe, wanted = plan.recipe, {"provenance": provenance_of(plan)}
+        recipe, wanted = plan.recipe, {"provenance": provenance_of(plan, self.seal)}
         prepare_folder(self._directory, wanted, "an unfinished dataset of another recipe, scene or version")
         for name in [FRAMES, *extra_folders(recipe.expected, recipe.processed is not None, recipe.files)]:
             (self._directory / name).mkdir(exist_ok=True)
         for leftover in self._directory.rglob("*.partial"):
             leftover.unlink()
-        self._places = _journal(self._directory, recipe)
+        self._places = _journal(self._directory, recipe, self.seal)
 
     def missing(self, frames: range) -> list[int]:
         """Those of some frames that are not done."""
@@ -215,7 +221,7 @@ class Unfinished:
         is_new = not (self._directory / JOURNAL).exists()
         with (self._directory / JOURNAL).open("ab") as journal:
             self._places[record.frame] = journal.tell()
-            journal.write(_line(record))
+            journal.write(_line(record, self.seal))
             journal.flush()
             os.fsync(journal.fileno())
         if is_new:
@@ -229,10 +235,12 @@ class Unfinished:
         assert self._places is not None
         plan = self.plan()
         self._check_scene(plan)
-        records = partial(_recorded, self._directory / JOURNAL, self._places)
-        write_dataset(plan, self._directory, provenance_of(plan), records)
+        records = partial(_recorded, self._directory / JOURNAL, self._places, self.seal)
+        write_dataset(plan, self._directory, records, self.seal)
         (self._directory / PLAN).unlink()
         (self._directory / JOURNAL).unlink()
+        if self.seal is not None:
+            same_file_times(self._directory)
 
     def _check_scene(self, plan: Plan) -> None:
         """Raise InputError where a plan has another scene than the job: its file was changed and read again."""
@@ -242,7 +250,7 @@ class Unfinished:
             check_sources(plan.scene.settings, plan.scene.folder, dict(self.job.sources))
 
 
-def _journal(directory: Path, recipe: Recipe) -> dict[int, int]:
+def _journal(directory: Path, recipe: Recipe, seal: Seal | None) -> dict[int, int]:
     """Frames that an interrupted run finished and whose files are still intact; the journal then holds these alone.
 
     Each with the place of its line in the journal: the memory of a run does not grow with records of frames.
@@ -259,7 +267,7 @@ def _journal(directory: Path, recipe: Recipe) -> dict[int, int]:
 
     lines = path.read_bytes().splitlines(keepends=True)
     for line in lines:
-        record = _record_of(line)
+        record = _record_of(line, seal)
         if record is not None and all(is_intact(name, entry) for name, entry in record.files.items()):
             done[record.frame] = line
     for frame in incomplete(done, recipe.files.frames_per_file, recipe.frame_count):
@@ -271,35 +279,39 @@ def _journal(directory: Path, recipe: Recipe) -> dict[int, int]:
     return dict(zip(done, accumulate(map(len, done.values()), initial=0), strict=False))
 
 
-def _line(record: FrameRecord) -> bytes:
-    """The journal's line of a frame: the SHA-256 of the record's JSON, and the record."""
+def _line(record: FrameRecord, seal: Seal | None) -> bytes:
+    """The journal's line of a frame: the SHA-256 of the record's JSON, and the record; sealed with `seal`."""
     content = record.model_dump_json().encode()
-    return b'{"sha256": "' + hashlib.sha256(content).hexdigest().encode() + b'", "record": ' + content + b"}\n"
+    line = b'{"sha256": "' + hashlib.sha256(content).hexdigest().encode() + b'", "record": ' + content + b"}\n"
+    return line if seal is None else seal.line(line)
 
 
-def _record_of(line: bytes) -> FrameRecord | None:
+def _record_of(line: bytes, seal: Seal | None) -> FrameRecord | None:
     """The frame of a line of the journal; None where the line is not as it was written, after a crash for example."""
+    plain = line if seal is None else seal.plain_line(line)
     try:
-        record = FrameRecord.model_validate_json(line[RECORD_START:-2])
+        record = FrameRecord.model_validate_json(plain[RECORD_START:-2])
     except (ValidationError, ValueError):
         return None
-    return record if _line(record) == line else None
+    return record if _line(record, seal) == line else None
 
 
 RECORD_START = len('{"sha256": "", "record": ') + 64
 """Place of the record in a line of the journal."""
 
 
-def _recorded(path: Path, places: dict[int, int]) -> Iterator[FrameRecord]:
+def _recorded(path: Path, places: dict[int, int], seal: Seal | None) -> Iterator[FrameRecord]:
     """The frames of a journal, of which each has its place, in order of their numbers."""
     with path.open("rb") as journal:
         for frame in sorted(places):
             journal.seek(places[frame])
-            record = _record_of(journal.readline())
+            record = _record_of(journal.readline(), seal)
             if record is None:
                 raise InputError(f"{path}: the line of frame {frame} was changed; run the same command again")
             yield record
 
+
+FRAMES_TABLE = "frames.parquet"
 
 Records = Callable[[], Iterable[FrameRecord]]
 """Gives the records of all frames, in order; called more than once, so that not all are in memory."""
@@ -307,17 +319,17 @@ Records = Callable[[], Iterable[FrameRecord]]
 
 def write_tables(plan: Plan, directory: Path, records: Records) -> list[str]:
     """Write the tables of a dataset, and return their names. Raises InputError where one cannot be written."""
-    recipe, names = plan.recipe, ["frames.parquet", "truth.parquet"]
-    write_table(directory / "frames.parquet", (record.device for record in records()), FrameRow)
-    truth, columns = (record.truth for record in records()), sweep_columns(plan.values)
-    write_table(directory / "truth.parquet", truth, TruthRow, columns)
-    if recipe.belief is not None:
-        write_table(directory / "truth_devices.parquet", device_rows(recipe), DeviceTruthRow)
-        names.append("truth_devices.parquet")
-    if recipe.belief is not None or recipe.map != "given":
-        write_table(directory / "truth_map.parquet", map_rows(recipe, plan.scene), MapTruthRow)
-        names.append("truth_map.parquet")
-    return names
+    write_table(directory / FRAMES_TABLE, (record.device for record in records()), FrameRow)
+    return [FRAMES_TABLE, *write_truth(plan, directory, (record.truth for record in records()))]
+
+
+def _write_withheld(plan: Plan, directory: Path, records: Records, seal: Seal) -> tuple[list[str], Withheld]:
+    """`write_tables` of a set whose truth is withheld, with truth.sealed among the names."""
+    write_table(directory / FRAMES_TABLE, (record.device for record in records()), FrameRow)
+    splits = {record.frame: record.device.split for record in records()}
+    whole = _whole_provenance(plan), summary_of(plan.recipe, records(), directory, plan.warnings)
+    names, withheld = seal.write_truth(plan, directory, *whole, lambda: (r.truth for r in records()), splits)
+    return [FRAMES_TABLE, *names], withheld
 
 
 def _entries(directory: Path, tables: list[str], records: Records) -> Iterator[tuple[str, FileEntry]]:
@@ -331,10 +343,16 @@ def _entries(directory: Path, tables: list[str], records: Records) -> Iterator[t
         before = record.files
 
 
-def write_dataset(plan: Plan, directory: Path, provenance: dict[str, Any], records: Records) -> None:
-    """Write the tables, manifest.json and dataset.json of a dataset whose frames are made, in this order."""
-    recipe, scene = plan.recipe, plan.scene
-    tables = write_tables(plan, directory, records)
+def write_dataset(plan: Plan, directory: Path, records: Records, seal: Seal | None = None) -> None:
+    """Write the tables, manifest.json and dataset.json of a dataset whose frames are made, in this order.
+
+    seal: of a set whose truth is withheld.
+    """
+    recipe, scene, withheld = plan.recipe, plan.scene, None
+    if seal is None:
+        tables = write_tables(plan, directory, records)
+    else:
+        tables, withheld = _write_withheld(plan, directory, records, seal)
     manifest_sha256 = write_manifest(directory, _entries(directory, tables, records))
     sigmas = luminaires = None
     told_map = recipe.map == "given"
@@ -359,10 +377,11 @@ def write_dataset(plan: Plan, directory: Path, provenance: dict[str, Any], recor
         downlink=downlink_entry(scene.leds, recipe.demodulation),
         room_m=scene.settings.room.size_m,
         files=FilesEntry(format=recipe.files.format),
-        summary=summary_of(recipe, records(), directory, plan.warnings),
+        summary=summary_of(recipe, records(), directory, plan.warnings, rounded=seal is not None),
         licence=recipe.licence,
         names=NamesEntry.model_validate(plan.presets),
-        provenance=provenance,
+        withheld=withheld,
+        provenance=provenance_of(plan, seal),
         manifest_sha256=manifest_sha256,
     )
     write_sealed(directory / "dataset.json", dataset.model_dump(mode="json", exclude={"seal"}))

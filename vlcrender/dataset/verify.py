@@ -1,6 +1,6 @@
 """Verification of a dataset on disk: each file as it was made; rows, images and truth consistent with the recipe."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import TypeVar
@@ -20,7 +20,15 @@ from vlcrender.dataset.tables import Constants, read_table
 from vlcrender.dataset.value_checks import row_problems as value_problems
 from vlcrender.dataset.verify_files import FileCheck
 from vlcrender.dataset.verify_images import frame_problems
-from vlcrender.dataset.verify_rows import reading_problems, recipe_of, row_problems, start_problem, time_problems
+from vlcrender.dataset.verify_rows import (
+    file_problems,
+    reading_problems,
+    recipe_of,
+    row_problems,
+    split_problem,
+    start_problem,
+    time_problems,
+)
 from vlcrender.dataset.verify_truth import (
     Positions,
     camera_of,
@@ -33,6 +41,7 @@ from vlcrender.dataset.verify_truth import (
     wave_problems,
     waves_of,
 )
+from vlcrender.dataset.withheld import withheld_problems
 from vlcrender.errors import InputError
 
 R = TypeVar("R", FrameRow, TruthRow)
@@ -41,6 +50,8 @@ S = TypeVar("S", DeviceTruthRow, MapTruthRow)
 
 def verify(directory: Path) -> list[str]:
     """Problems of a dataset, or of all cells of a sweep, one line each; empty where it is complete and intact.
+
+    Of a dataset whose truth is withheld, what needs truth, recipe, scene or seed is not checked.
 
     Raises InputError where there is no readable dataset.json or sweep.json, or where a dataset's camera is impossible.
     """
@@ -84,9 +95,15 @@ def _problems(directory: Path) -> list[str]:
     }
     file_check = FileCheck.of(directory, dataset)
     problems = list(file_check.problems)
-    frames = _read_rows(directory / "frames.parquet", FrameRow, dataset.frame_count, problems)
+    problems += withheld_problems(directory, dataset, file_check.damaged)
+    told: Sequence[int] = range(dataset.frame_count)
+    if dataset.withheld is not None:
+        told = dataset.withheld.frames_with_truth(dataset.frame_count)
+    frames = _read_rows(directory / "frames.parquet", FrameRow, range(dataset.frame_count), problems)
     columns = sweep_columns(dataset.provenance.get("sweep") or {})
-    truth = _read_rows(directory / "truth.parquet", TruthRow, dataset.frame_count, problems, columns)
+    truth: list[TruthRow] = []
+    if dataset.withheld is None or dataset.withheld.frames != "all":
+        truth = _read_rows(directory / "truth.parquet", TruthRow, told, problems, columns)
     of_frame = {row.frame: row for row in truth}
     waves = cache(partial(waves_of, dataset))
     problems += value_problems(frames, dataset)
@@ -96,17 +113,21 @@ def _problems(directory: Path) -> list[str]:
     for row in frames:
         problems += frame_problems(directory, row, of_frame.get(row.frame), dataset, file_check, parts_of)
     recipe = dataset.provenance.get("recipe", {})
-    maps: dict[int, Positions] = {0: {led.id: np.array(led.position_m) for led in dataset.led_map or ()}}
+    maps: dict[int, Positions] = {}
+    if dataset.led_map is not None:
+        maps[0] = {led.id: np.array(led.position_m) for led in dataset.led_map}
     devices: list[DeviceTruthRow] | None = None
     if recipe.get("belief") is not None:
         devices = _read_sealed(directory / "truth_devices.parquet", DeviceTruthRow, problems)
-    if recipe.get("belief") is not None or dataset.led_map is None:
+    if dataset.withheld is None and (recipe.get("belief") is not None or dataset.led_map is None):
         built = _read_sealed(directory / "truth_map.parquet", MapTruthRow, problems)
         problems += sealed_problems(devices, built, dataset)
         maps = {}
         for led in built:
             maps.setdefault(led.map, {})[led.led] = np.array(led.position_m)  # type: ignore[index]
     files = check(recipe.get("files", {}), FileSettings, "dataset.json: provenance.recipe.files")
+    if recipe:
+        problems += [problem for row in frames for problem in file_problems(row, files)]
     folders = extra_folders(bool(recipe.get("expected")), recipe.get("processed") is not None, files)
     missing = missing_files(file_check.stems, folders, range(dataset.frame_count), files)
     problems += [f"{directory / name}: is missing" for name in missing.values()]
@@ -114,7 +135,7 @@ def _problems(directory: Path) -> list[str]:
     row_of = {row.frame: row for row in frames}
     for pose in truth:
         frame = row_of.get(pose.frame)
-        if frame is not None:
+        if frame is not None and dataset.withheld is None:  # the waves follow from the seed, which is withheld too
             problems += wave_problems(pose, frame.start_s, waves(pose.map))
         entry = None if frame is None else dataset.cameras.get(frame.camera)
         if frame is None or entry is None:
@@ -146,14 +167,14 @@ def _recipe_problems(frames: list[FrameRow], truth: list[TruthRow], dataset: Dat
     problems = []
     for row in frames:
         pose = of_frame.get(row.frame)
-        problems += row_problems(row, pose, recipe)
+        problems += row_problems(row, pose, recipe) + split_problem(row, pose, recipe, dataset.room_m)
         if pose is not None:
             problems += start_problem(row, recipe, is_modulated(pose.map))
     return problems + reading_problems(frames, truth, recipe)
 
 
 def _read_rows(
-    path: Path, model: type[R], count: int, problems: list[str], constants: Constants | None = None
+    path: Path, model: type[R], numbers: Sequence[int], problems: list[str], constants: Constants | None = None
 ) -> list[R]:
     """Rows of a table; none, and a line in `problems`, where the table is damaged."""
     try:
@@ -161,8 +182,9 @@ def _read_rows(
     except InputError as error:
         problems.append(str(error))
         return []
-    if [row.frame for row in rows] != list(range(count)):
-        problems.append(f"{path}: {len(rows)} rows; frames 0 to {count - 1} in order are expected")
+    if [row.frame for row in rows] != list(numbers):
+        expected = f"frames 0 to {len(numbers) - 1}" if isinstance(numbers, range) else f"{len(numbers)} frames"
+        problems.append(f"{path}: {len(rows)} rows; {expected} in order are expected")
         return []
     return rows
 

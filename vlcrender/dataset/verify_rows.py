@@ -9,7 +9,9 @@ import numpy as np
 from pydantic import ValidationError
 
 from vlcrender.camera.intrinsics import Pose
+from vlcrender.camera.rig import MAIN
 from vlcrender.dataset.downlink import ROUGH_PX
+from vlcrender.dataset.file_settings import FileSettings
 from vlcrender.dataset.files import FRAMES
 from vlcrender.dataset.recipe import Recipe
 from vlcrender.dataset.schema import DatasetFile, FrameRow, TruthRow
@@ -25,9 +27,9 @@ MAX_SPOT_SIGMAS = 8.0
 
 
 def recipe_of(dataset: DatasetFile) -> Recipe | None:
-    """The recipe of the provenance; None where there is none. Raises InputError where it is no recipe."""
+    """The recipe of the provenance; None where it is withheld or not there. Raises InputError where it is no recipe."""
     tree = dataset.provenance.get("recipe")
-    if tree is None:
+    if tree is None or dataset.withheld is not None:
         return None
     try:
         return Recipe.model_validate({**tree, "seed": int(tree["seed"])})
@@ -42,20 +44,15 @@ def row_problems(row: FrameRow, truth: TruthRow | None, recipe: Recipe) -> list[
     number = recipe.first_shot * len(recipe.cameras) + row.frame
     pose, shot, which = recipe.place_of_frame(number)
     device, shots = device_of_pose(recipe, pose), shot - recipe.first_shot
-    per_file = recipe.files.frames_per_file
-    stem = f"{row.frame:06d}" if per_file == 1 else f"shard-{row.frame // per_file:06d}"
     wanted: dict[str, Any] = {
         "shot": shots,
         "burst": shots // recipe.burst_frames,
         "pose": pose - recipe.pose_numbers.start,
         "device": device,
         "camera": recipe.cameras[which].name,
-        "file": f"{FRAMES}/{stem}{PurePosixPath(row.file).suffix}",
     }
     found = [(key, getattr(row, key), value) for key, value in wanted.items()]
     problems = [f"{where}: {key} is {own!r}; the recipe gives {value!r}" for key, own, value in found if own != value]
-    if (row.part is None) != (per_file == 1):
-        problems.append(f"{where}: part is {row.part}, and files hold {per_file} frames")
     lowest_s, highest_s = (0.0, recipe.max_exposure_s) if recipe.metering is not None else (recipe.max_exposure_s,) * 2
     if not (lowest_s * (1 - 1e-9) <= row.exposure_s <= highest_s * (1 + 1e-9) and row.exposure_s > 0):
         problems.append(f"{where}: exposure_s = {row.exposure_s}: the recipe gives {lowest_s} to {highest_s}")
@@ -63,6 +60,29 @@ def row_problems(row: FrameRow, truth: TruthRow | None, recipe: Recipe) -> list[
         problems += _truth_row_problems(truth, shots, map_of_device(recipe, device), recipe)
         problems += _spot_problems(row, truth, recipe, which)
     return problems
+
+
+def file_problems(row: FrameRow, files: FileSettings) -> list[str]:
+    """Contradictions of a frame's file and part with [files] of the recipe."""
+    where, per_file = f"frames.parquet: frame {row.frame}", files.frames_per_file
+    stem = f"{row.frame:06d}" if per_file == 1 else f"shard-{row.frame // per_file:06d}"
+    wanted = f"{FRAMES}/{stem}{PurePosixPath(row.file).suffix}"
+    problems = [] if row.file == wanted else [f"{where}: file is {row.file!r}; the recipe gives {wanted!r}"]
+    if (row.part is None) != (per_file == 1):
+        problems.append(f"{where}: part is {row.part}, and files hold {per_file} frames")
+    return problems
+
+
+def split_problem(row: FrameRow, truth: TruthRow | None, recipe: Recipe, room_m: Sequence[float]) -> list[str]:
+    """A line where a frame is in another split than its place gives; of frames whose truth has the pose's own place."""
+    wanted = None
+    if recipe.split is not None:
+        if truth is None or recipe.motion is not None or recipe.belief is not None or row.camera != MAIN:
+            return []
+        wanted = recipe.split.name_at(truth.position_m, np.array(room_m), recipe.seed)
+    if row.split == wanted:
+        return []
+    return [f"frames.parquet: frame {row.frame}: split is {row.split!r}; place and seed give {wanted!r}"]
 
 
 def start_problem(row: FrameRow, recipe: Recipe, is_modulated: bool) -> list[str]:
