@@ -210,6 +210,7 @@ WRONG_VALUES: list[tuple[str, Callable[[dict[str, Any]], object]]] = [
     ("downlink.transmitters.0", lambda c: c.update(downlink=sending({**CODES, "send": "morse"}))),
     ("downlink.transmitters.0.chip_us", lambda c: c.update(downlink=sending({**CODES, "chip_us": 0}))),
     ("downlink.transmitters.0.depth", lambda c: c.update(downlink=sending({**CODES, "depth": 1.5}))),
+    ("downlink.transmitters.0.clock_error", lambda c: c.update(downlink=sending({**CODES, "clock_error": 0.1001}))),
     ("downlink.transmitters.0.codes", lambda c: c.update(downlink=sending(without(CODES, "codes")))),
     ("downlink.transmitters.0.codes.1", lambda c: c.update(downlink=sending({**CODES, "codes": ["01", "02"]}))),
     ("codes have to be of one length", lambda c: c.update(downlink=sending({**CODES, "codes": ["01", "011"]}))),

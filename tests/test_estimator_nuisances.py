@@ -110,3 +110,10 @@ def test_a_component_is_what_values_and_redundancy_say() -> None:
     # Nothing is controlled: the component stays.
     assert Components(place_m=1e-3).updated(stated, values, 0 * redundancy, used) == Components(place_m=1e-3)
     assert NO_COMPONENTS.added(stated).exact
+
+
+def test_tilts_on_both_sides_of_half_a_turn_are_near_each_other() -> None:
+    """Measured 0.01 rad before half a turn, the rig is 0.02 rad beyond it: 0.03 rad back, 3 standard deviations."""
+    gravity = Gravity(np.array([np.pi - 0.01, 0.1]), np.array([0.01, 0.01]))
+    residual = gravity.residual(np.array([-np.pi + 0.02, 0.1, 0.0]))
+    np.testing.assert_allclose(residual, [-3.0, 0.0], atol=1e-12)  # rounding of pi, 4e-16, over 0.01

@@ -294,6 +294,13 @@ def test_pictures_are_linear_light(tmp_path: Path, suffix: str, bits: int, tone:
     assert not picture.clipped[20:].any()
 
 
+def test_a_picture_s_codes_are_those_of_srgb(tmp_path: Path) -> None:
+    """From the codes of a file to light and back, over both branches of the curve: float32, 1e-6 of 255, ten times."""
+    codes = np.tile(np.arange(256, dtype=np.uint8), (8, 1))
+    cv2.imwrite(str(tmp_path / "steps.png"), codes)
+    np.testing.assert_allclose(read_picture(tmp_path / "steps.png", "srgb").coded, codes, atol=2.5e-3)
+
+
 def test_a_saturated_colour_counts_as_saturated_and_grey_is_luminance(tmp_path: Path) -> None:
     codes = np.zeros((8, 8, 4), np.uint8)
     codes[..., 2], codes[..., 3] = 255, 7

@@ -315,6 +315,13 @@ def test_four_edges_give_the_pose_and_another_led_the_yaw(tilts: tuple[float, fl
     np.testing.assert_allclose(found.R_cam_world, view.R_cam_world, atol=1e-11)
 
 
+def test_a_square_may_be_near() -> None:
+    """The same image from a sixth of the distance: the position is as good."""
+    view = view_of((3.55, 3.45, 3.5), 0.5, 25, -15, 40)
+    found = v_p4l(view, 0.05, CENTRE_M + [[0.17, 0.05, -0.03]], true_half_m=0.05)
+    np.testing.assert_allclose(found.position_m, view.position_m, atol=1e-11)
+
+
 def test_a_square_turned_by_a_quarter_looks_the_same_and_has_another_position() -> None:
     """Where the other LED is said to be a quarter turn on, so is the camera."""
     quarter = rotation(0.0, 0.0, np.pi / 2)

@@ -267,6 +267,13 @@ def test_json_has_null_where_a_value_is_infinite(plain: Path) -> None:
     assert first["failures"] == {"detect: no spot": 1}
 
 
+def test_json_with_a_number_that_json_has_not_is_refused() -> None:
+    """"NaN" in a file would be read by Python alone. A statistic that there is not is null; a setting is a number."""
+    made = Table("error_3d_m", ("sigma",), (), (), (TableRow((Key(float("nan")),), (), 1, 1, (), {}),))
+    with pytest.raises(ValueError, match="JSON"):
+        table_json(made)
+
+
 def test_reasons_are_counted_whatever_their_numbers(plain: Path, tmp_path: Path) -> None:
     """Three frames fail alike but for their numbers; a line shows two reasons, the CSV all."""
     folder = copy_of(plain, tmp_path / "set")

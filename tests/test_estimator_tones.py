@@ -121,3 +121,26 @@ def test_the_readout_axis_is_the_one_with_the_gradients() -> None:
 
 def test_the_band_is_what_an_image_can_show() -> None:
     assert band_hz(20e-6, 60e-6, 50) == pytest.approx((900.0, 15000.0))
+
+
+def test_noise_adds_to_the_standard_deviation_of_a_frequency_what_the_slopes_of_the_wave_say() -> None:
+    """Beside the model's 0.03 periods, as by least squares on seven parameters, whose slopes are differences here.
+
+    The fit takes the noise from what is left of 120 lines, of which a variance is known to sqrt(2 / 113): five times.
+    """
+    count, frequency, noise, rng = 120, 3000.0, 200.0, np.random.default_rng(7)
+    start, y = np.arange(count) * ROW_S, np.linspace(-1, 1, count)
+
+    def wave(hz: float, late_s: float) -> Array:
+        return gains(np.array([1.0, 0.0]), 0.5e6 / hz, 1e6 * (start + late_s), 1e6 * EXPOSURE_S)
+
+    bright = wave(frequency, 0.0)
+    by_hz = (wave(frequency + 0.1, 0.0) - wave(frequency - 0.1, 0.0)) / 0.2
+    by_s = (wave(frequency, 1e-8) - wave(frequency, -1e-8)) / 2e-8
+    level = 1000 * bright
+    slopes = np.stack([1000 * by_hz, 1000 * by_s, np.ones(count), y, bright, bright * y, bright * y**2], axis=1)
+    expected_hz2 = noise**2 * np.linalg.inv(slopes.T @ slopes)[0, 0]
+    fit = fit_tone(Signal(start, EXPOSURE_S, level + noise * rng.standard_normal(count), np.ones(count)), BAND)
+    assert fit is not None
+    of_model_hz = 0.03 / (start[-1] + EXPOSURE_S)
+    assert fit.sigma_hz**2 - of_model_hz**2 == pytest.approx(expected_hz2, rel=5 * np.sqrt(2 / 113))

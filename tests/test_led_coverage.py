@@ -9,7 +9,14 @@ from vlcrender.camera.distortion import Distortion
 from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.core.planar_shapes import Disc, Rectangle, circle_polygon_area, rectangle_polygon_area
-from vlcrender.rendering.led_coverage import CoverageBlocks, LedCoverage, LedFace, _coverage_of_band, coverage_of_led
+from vlcrender.rendering.led_coverage import (
+    CoverageBlocks,
+    LedCoverage,
+    LedFace,
+    _coverage_of_band,
+    coverage_of_led,
+    outline_roi,
+)
 from vlcrender.scene.bounding_spheres import BoundingSpheres
 
 SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
@@ -155,6 +162,14 @@ def test_visible_fraction_of_a_disc_cut_by_the_border() -> None:
 )
 def test_a_disc_out_of_sight_has_no_image(center: list[float], why: str) -> None:
     assert image_of_disc(Camera(), Pose((3.0, 3.0, 0.5)), np.array(center), 0.01) is None, why
+
+
+def test_a_face_at_the_height_of_the_lens_has_no_outline() -> None:
+    """It shows its edge, which emits nothing; from 1 mm below, its whole face, however narrow."""
+    face = LedFace(np.array([3.0, 4.0, 3.5]), Disc(0.05))
+    level, below = (PosedCamera(Camera(), Pose((3.0, 3.0, height), tilt_x_deg=-85.0)) for height in (3.5, 3.499))
+    assert outline_roi(below, face) is not None
+    assert outline_roi(level, face) is None
 
 
 def rectangle_area(polygon: np.ndarray, half_x: float, half_y: float) -> float:

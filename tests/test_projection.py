@@ -92,3 +92,10 @@ def test_the_main_camera_of_a_rig_has_the_pose_of_the_rig() -> None:
     (main,) = mounted_cameras(Camera(), ())
     pose = Pose((1.0, 1.0, 0.5), 5.0, -7.0, 80.0)
     assert main.posed(pose) == PosedCamera(Camera(), pose)
+
+
+@pytest.mark.parametrize(("point", "imaged"), [((0.0, 0.1), True), ((0.1, 0.0), True), ((0.0, 0.0), False)])
+def test_a_fish_eye_images_all_that_is_behind_it_but_for_its_axis(point: tuple[float, float], imaged: bool) -> None:
+    """On the axis behind the lens all directions of the image are equally right."""
+    x, y = (np.array([value]) for value in point)
+    assert Equidistant().images(x, y, np.array([-1.0])).tolist() == [imaged]
