@@ -17,7 +17,7 @@ from vlcrender.dataset.exr import exr_attributes, write_exr
 from vlcrender.dataset.files import EXPECTED, FRAMES, PREVIEWS, PROCESSED, link_or_copy
 from vlcrender.dataset.motion import poses_during
 from vlcrender.dataset.plan import Plan
-from vlcrender.dataset.pose_sampling import pose_of_frame
+from vlcrender.dataset.pose_sampling import ListedPoses, pose_of_frame
 from vlcrender.dataset.preview import write_preview
 from vlcrender.dataset.recipe import Recipe
 from vlcrender.dataset.schema import FrameRecord, FrameRow, LedTruth, SpotRow, TruthRow, five, flat9, triple
@@ -212,6 +212,7 @@ def make_frame(job: Job, frame: int, twin: Files | None = None, shard: Shard | N
         accelerometer_m_s2=reading.tolist(),
         gyro_rad_s=gyro,
         spots=spots,
+        time_s=recipe.poses.pose[pose_number].time_s if isinstance(recipe.poses, ListedPoses) else None,
     )
     angular = linear = None
     if recipe.motion is not None:

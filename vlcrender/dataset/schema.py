@@ -98,6 +98,8 @@ class FrameRow(Settings):
     gyro_rad_s: Triple | None
     """Reading of the gyroscope, mean over the readout, in the axes of this frame's camera; None without one."""
     spots: tuple[SpotRow, ...]
+    time_s: float | None = None
+    """Time stamp of the pose in the recipe; None where it has none."""
 
 
 class LedTruth(Settings):
