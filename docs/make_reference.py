@@ -32,6 +32,7 @@ UNITS = {
     "db": "dB",
     "dn": "DN",
     "hz": "Hz",
+    "lm": "lm",
     "mm": "mm",
     "nm": "nm",
     "px": "px",

@@ -50,6 +50,7 @@ COLMAP_MODELS = {
 MAX_NUMBERS = 100
 MAX_YAML = 1_000_000
 """Letters of a YAML file, which is read slowly."""
+MAX_DEPTH = 20
 GEOMETRY = (
     *("width_px", "height_px", "focal_length_mm", "principal_point_px"),
     *("aspect_ratio", "skew_px", "projection", "distortion"),
@@ -146,6 +147,7 @@ OF_GEOMETRY = re.compile(rf"(^|\.)\s*camera\s*\.\s*({'|'.join(GEOMETRY)})\b")
 def _calibrated(camera: Mapping[str, Any], own: Any, folder: Path, where: str) -> dict[str, Any]:
     """A [camera] with the keys of its calibration. `own`: the recipe file's own [camera], if there is one."""
     name, which, pitch_um = (camera.get(key) for key in ("calibration", "calibration_camera", "pixel_pitch_um"))
+    which = str(which) if isinstance(which, int) else which  # --set calibration_camera=1
     if not isinstance(name, str) or not isinstance(which, str | None):
         raise InputError(f"{where}.calibration: has to be the path of a file, and calibration_camera a text")
     try:
@@ -198,17 +200,25 @@ def _yaml(path: Path) -> dict[str, Any]:
         lines[0] = ""  # OpenCV writes "%YAML:1.0", which is not YAML; an empty line keeps the numbers of lines
     text = "\n".join(lines)
     try:
-        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, Loader=yaml.BaseLoader)):
-            raise InputError(f"{path}: has YAML aliases (*), which no calibration needs")
+        _check_events(text)
         parsed = yaml.load(text, Loader=yaml.BaseLoader)  # text, lists and mappings alone
     except yaml.MarkedYAMLError as error:
         where = "" if error.problem_mark is None else f"line {error.problem_mark.line + 1}: "
-        raise InputError(f"{path}: {where}is not YAML: {error.problem}") from None
+        raise InputError(f"{path}: {where}cannot be read as YAML: {error.problem}") from None
     except (yaml.YAMLError, RecursionError, ValueError) as error:
-        raise InputError(f"{path}: is not YAML: {str(error).splitlines()[0]}") from None
+        raise InputError(f"{path}: cannot be read as YAML: {str(error).splitlines()[0]}") from None
     if not isinstance(parsed, dict):
         raise InputError(f"{path}: is not a calibration: it has no keys")
     return {str(key): value for key, value in parsed.items()}
+
+
+def _check_events(text: str) -> None:
+    """Raise YAMLError for text that would take long to read: aliases, and brackets in brackets."""
+    depth = 0
+    for event in yaml.parse(text, Loader=yaml.BaseLoader):
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if isinstance(event, yaml.AliasEvent) or depth > MAX_DEPTH:
+            raise yaml.YAMLError(f"aliases (*), or more than {MAX_DEPTH} brackets in brackets")
 
 
 def _of_entries(entries: Mapping[str, Any], source: str) -> Calibration:
