@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from vlcrender.config.presets import KINDS, presets
+from vlcrender.dataset.pose_file import PoseFile
 from vlcrender.dataset.recipe import RecipeFile
+from vlcrender.scene.led_map_file import LedMapFile
 from vlcrender.scene.schema import SceneSettings
 
 DOCS = Path(__file__).parent
@@ -30,6 +32,7 @@ UNITS = {
     "db": "dB",
     "dn": "DN",
     "hz": "Hz",
+    "lm": "lm",
     "mm": "mm",
     "nm": "nm",
     "px": "px",
@@ -54,6 +57,20 @@ for instance after a first line `#:schema ../docs/schemas/recipe.schema.json`.
 
 Schema = dict[str, Any]
 
+CALIBRATION: Schema = {
+    "calibration": {
+        "type": "string",
+        "description": "Path of a calibration from the recipe's folder: OpenCV's YAML or npz, Kalibr, ROS camera_info "
+        "or COLMAP's cameras.txt. It states size, focal length (with pixel_pitch_um), principal point, aspect ratio, "
+        "skew, projection and distortion, which are then no keys of this table. See inputs.md.",
+    },
+    "calibration_camera": {
+        "type": "string",
+        "description": "The camera of a Kalibr or COLMAP file of several, such as `cam1` or `2`.",
+    },
+}
+"""Keys of [camera] that stand for others."""
+
 
 @dataclass
 class Table:
@@ -66,16 +83,26 @@ class Table:
 
 def scene_schema() -> Schema:
     """JSON Schema of a scene file."""
-    return _schema(SceneSettings.model_json_schema(), "vlcrender scene")
+    tree = SceneSettings.model_json_schema()
+    tree["$defs"]["LedMapFile"] = LedMapFile.model_json_schema()
+    tree["properties"]["led_map"] = {
+        "anyOf": [{"type": "string"}, {"$ref": "#/$defs/LedMapFile"}],
+        "description": "LEDs of a CSV or JSON file, behind those of `led`: its path, or a table with it as `file`.",
+        "default": None,
+    }
+    return _schema(tree, "vlcrender scene")
 
 
 def recipe_schema() -> Schema:
-    """JSON Schema of a recipe file, with the key `preset` that stands for several others."""
+    """JSON Schema of a recipe file, with the keys `preset` and those of files, which stand for several others."""
     tree = RecipeFile.model_json_schema()
     tables, properties = tree["$defs"], tree["properties"]
     of_camera = _preset("camera")
     of_camera["description"] += " It is whole: the sensor's preset is in it. Under [camera] alone, not in a rig."
-    tables["Camera"]["properties"] = {"preset": of_camera, **tables["Camera"]["properties"]}
+    tables["Camera"]["properties"] = {"preset": of_camera, **CALIBRATION, **tables["Camera"]["properties"]}
+    tables["PoseFile"] = PoseFile.model_json_schema()
+    properties["poses"]["oneOf"].append({"$ref": "#/$defs/PoseFile"})
+    properties["poses"]["discriminator"]["mapping"]["file"] = "#/$defs/PoseFile"
     tables["Sensor"]["properties"] = {"preset": _preset("sensor"), **tables["Sensor"]["properties"]}
     tables["Belief"]["properties"] = {"preset": _preset("belief"), **tables["Belief"]["properties"]}
     preset_imu = copy.deepcopy(tables["Imu"])

@@ -34,7 +34,7 @@ COEFFICIENTS = {
     12: "k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4",
     14: "k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 tau_x tau_y",
 }
-MATRIX_KEYS = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "mtx", "intrinsic_matrix", "M", "intrinsics")
+MATRIX_KEYS = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "k", "mtx", "intrinsic_matrix", "M", "intrinsics")
 DISTORTION_KEYS = (
     "distortion_coefficients",
     "Distortion_Coefficients",
@@ -44,9 +44,10 @@ DISTORTION_KEYS = (
     "distortion",
     "dist",
     "D",
+    "d",
 )
 PERSPECTIVE_MODELS = ("plumb_bob", "rational_polynomial", "radtan", "brown_conrady", "pinhole", "perspective", "none")
-FISHEYE_MODELS = ("equidistant", "fisheye", "kannala_brandt4")
+FISHEYE_MODELS = ("equidistant", "equi", "fisheye", "kannala_brandt4")
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,12 +6,14 @@ Pixels are continuous (u, v) = (column, row), (0, 0) at the image's top-left cor
 
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, ValidationError, ValidatorFunctionWrapHandler, WrapValidator, model_validator
 
+from vlcrender.camera.calibration import read_calibration
 from vlcrender.camera.distortion import Distortion
 from vlcrender.camera.glare import Glare
 from vlcrender.camera.projection import Equidistant, FieldOfView, Perspective, Projection
@@ -98,6 +100,18 @@ class Camera(Settings):
         """
         where = f"camera preset {name}"
         return check(with_presets({"camera": {"preset": name}}, [], where)["camera"], cls, where)
+
+    @classmethod
+    def calibrated(cls, path: str | Path, pixel_pitch_um: float, name: str | None = None, **keys: Any) -> Self:
+        """The camera of a calibration file, as `calibration` under [camera] of a recipe makes it.
+
+        path: OpenCV's YAML or npz, Kalibr, ROS camera_info or COLMAP. name: its camera, where it has several. keys:
+        further fields, such as `f_number`. Raises InputError for a file that is no calibration, and for a lens that
+        no camera of this class has.
+        """
+        found, focus_m = read_calibration(Path(path), name), keys.get("focus_distance_m")
+        of_file = found.camera_keys(pixel_pitch_um, focus_m if isinstance(focus_m, int | float) else None)
+        return check({**keys, "pixel_pitch_um": pixel_pitch_um, **of_file}, cls, str(path))
 
     @model_validator(mode="after")
     def _principal_point_is_near_the_image(self) -> Self:

@@ -21,7 +21,7 @@ from vlcrender.dataset.frame_numbers import FrameNumbers
 from vlcrender.dataset.manifest import entry_of
 from vlcrender.dataset.motion import poses_during
 from vlcrender.dataset.plan import Plan
-from vlcrender.dataset.pose_sampling import pose_of_frame
+from vlcrender.dataset.pose_sampling import ListedPoses, pose_of_frame
 from vlcrender.dataset.preview import write_preview
 from vlcrender.dataset.recipe import Recipe
 from vlcrender.dataset.schema import FileEntry, FrameRecord, FrameRow, LedTruth, SpotRow, TruthRow, five, flat9, triple
@@ -245,6 +245,7 @@ def make_frame(job: Job, frame: int, twin: Files | None = None, shard: Shard | N
         gyro_rad_s=gyro,
         spots=spots,
         split=_split_of(recipe, view.renderer.scene, pose_number),
+        time_s=recipe.poses.pose[pose_number].time_s if isinstance(recipe.poses, ListedPoses) else None,
     )
     angular = linear = None
     if recipe.motion is not None:

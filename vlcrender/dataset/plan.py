@@ -5,10 +5,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from vlcrender.camera.calibration import with_calibrations
 from vlcrender.config.packaged import find_file
 from vlcrender.config.presets import resolved
 from vlcrender.config.toml_model import check, read_toml
 from vlcrender.dataset.light_checks import check_light
+from vlcrender.dataset.pose_file import with_pose_file
 from vlcrender.dataset.recipe import Recipe, ScaleMode, scaled
 from vlcrender.dataset.recipe_warnings import recipe_warnings
 from vlcrender.dataset.sweep import Cell, Sweep, SweepTables, Value
@@ -75,7 +77,7 @@ class RecipeSource:
         return f"{self.path} with --set" if self.assignments else str(self.path)
 
     def tree_with(self, swept: Sequence[str] = (), how: str = "--set ") -> tuple[dict[str, Any], dict[str, str]]:
-        """The recipe's tree with presets and assignments, those of a cell included, and the names of its presets.
+        """The recipe's tree with presets, assignments (of a cell too) and files inserted, and the presets' names.
 
         `how`: as in `override`.
         """
@@ -87,6 +89,8 @@ class RecipeSource:
             if way in keys and other not in keys:
                 tree.pop(other, None)  # the assigned way to expose replaces the recipe's
         tree, names = resolved(tree, assignments, source, how)
+        tree = with_calibrations(tree, self.tree, assignments, self.path.parent, source)
+        tree = with_pose_file(tree, self.path.parent, source)
         noise = tree.get("added_noise")
         if "added_noise" in keys and isinstance(noise, dict) and noise.get("relative_to") == "photon":
             for way in {"exposure", "exposure_s"} - keys:

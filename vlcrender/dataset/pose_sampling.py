@@ -117,6 +117,8 @@ class PoseEntry(Settings):
     """Tilt about the camera's y axis, degrees."""
     yaw_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
     """Rotation about the vertical, degrees."""
+    time_s: Annotated[float, Field(ge=-1e12, le=1e12)] | None = None
+    """Time stamp, s, on any clock: it stands with each frame of the pose, and no light depends on it."""
 
 
 class ListedPoses(Settings):

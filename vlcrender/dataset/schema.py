@@ -116,6 +116,8 @@ class FrameRow(Settings):
     spots: tuple[SpotRow, ...]
     split: str | None = None
     """Train, validation or test; None where the frame belongs to none, or the recipe has no [split]."""
+    time_s: float | None = None
+    """Time stamp of the pose in the recipe; None where it has none."""
 
     @field_validator("sha256")
     @classmethod

@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlcrender.config.toml_model import check, override, read_toml
+from vlcrender.errors import InputError
+from vlcrender.scene.led_map_file import of_led_map, with_led_map
 from vlcrender.scene.leds import Leds, leds_of
 from vlcrender.scene.paths import file_inside
 from vlcrender.scene.scene_files import scene_sources
@@ -53,8 +55,12 @@ def load_scene(
 
     source: start of the messages, the path where not given. how: as in `toml_model.override`.
     """
-    tree, source = override(read_toml(path), assignments, how), source or str(path)
-    return build_scene(check(tree, SceneSettings, source), source, path.parent)
+    source, (of_map, others) = source or str(path), of_led_map(assignments)
+    tree, lines = with_led_map(override(read_toml(path), of_map, how), path.parent, source)
+    try:
+        return build_scene(check(override(tree, others, how), SceneSettings, source), source, path.parent)
+    except InputError as error:
+        raise InputError(lines.named(str(error))) from None
 
 
 def build_scene(settings: SceneSettings, source: str, folder: Path = Path()) -> Scene:
