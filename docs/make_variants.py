@@ -1,4 +1,4 @@
-"""Make docs/variants.md from the catalogue of variants and the docstrings of their modules: python docs/make_variants.py"""
+"""Make docs/variants.md from the catalogue of variants and the docstrings of modules: python docs/make_variants.py"""
 
 import importlib
 import inspect
@@ -14,10 +14,11 @@ PAGE = Path(__file__).parent / "variants.md"
 INTRODUCTION = """\
 # Variants and their papers
 
-Made by `make docs` from the variants and the docstrings of their modules (`docs/make_variants.py`). A docstring names the
-publication, says what is known of it, and what had to be chosen here. `estimator run DIR` runs the variants of the first
-table; `--variant NAME`, which may be repeated, runs the named ones of both. [rivals.md](rivals.md) has their measured
-errors, and the stages of `huynh2016` that can be chosen. [own_variant.md](own_variant.md) adds a variant of your own.
+Made by `make docs` from the variants and the docstrings of their modules (`docs/make_variants.py`). A docstring names
+the publication, says what is known of it, and what had to be chosen here. `estimator run DIR` runs the variants of the
+first table; `--variant NAME`, which may be repeated, runs the named ones of both. [rivals.md](rivals.md) has their
+measured errors, and the stages of `huynh2016` that can be chosen. [own_variant.md](own_variant.md) adds a variant of
+your own.
 """
 
 

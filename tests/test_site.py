@@ -18,8 +18,18 @@ from mkdocs.commands.build import build
 from mkdocs.config import load_config
 from mkdocs.exceptions import Abort
 from pymdownx.slugs import slugify
+from test_reference import script
 
-RESOURCES = {("script", "src"), ("img", "src"), ("link", "href"), ("iframe", "src"), ("source", "src"), ("object", "data")}
+from estimator.methods.catalogue import OWN
+
+RESOURCES = {
+    ("script", "src"),
+    ("img", "src"),
+    ("link", "href"),
+    ("iframe", "src"),
+    ("source", "src"),
+    ("object", "data"),
+}
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 FENCED = re.compile(r"^ *```.*?^ *```", re.MULTILINE | re.DOTALL)
 
@@ -77,6 +87,12 @@ def test_every_document_is_a_page(pages: dict[Path, Links], site: Path) -> None:
     made = {path.relative_to(site).with_suffix("").as_posix() for path in pages}
     assert made > {path.stem for path in (ROOT / "docs").glob("*.md")} | {"FORMAT", "CONTRIBUTING", "CHANGELOG"}
     assert made > {f"notebooks/{path.stem}" for path in (ROOT / "docs/notebooks").glob("*.ipynb")}
+
+
+def test_the_page_of_variants_is_what_the_catalogue_says() -> None:
+    made = script("make_variants").page()
+    assert made == (ROOT / "docs/variants.md").read_text(encoding="utf-8"), "run make docs"
+    assert all(f"`{name}`" in made for name in OWN)
 
 
 def test_links_of_the_site_lead_somewhere(pages: dict[Path, Links], site: Path) -> None:

@@ -1,6 +1,5 @@
 """docs/tutorial_hall.md, run from its own page: its figures and statements are those of the run."""
 
-import importlib.util
 import json
 import re
 import resource
@@ -10,6 +9,7 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 from conftest import ROOT, run
+from test_reference import script
 
 PAGE = ROOT / "docs/tutorial_hall.md"
 NUMBER = re.compile(r"\d+(?:\.\d+)?")
@@ -29,14 +29,9 @@ class Tutorial:
 
 @pytest.fixture(scope="module")
 def tutorial(tmp_path_factory: pytest.TempPathFactory) -> Tutorial:
-    spec = importlib.util.spec_from_file_location("make_tutorial", ROOT / "docs/make_tutorial.py")
-    assert spec is not None
-    assert spec.loader is not None
-    script = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(script)
     folder = tmp_path_factory.mktemp("tutorial")
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    text = script.executed(PAGE.read_text(encoding="utf-8"), folder)
+    text = script("make_tutorial").executed(PAGE.read_text(encoding="utf-8"), folder)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return Tutorial(text, folder, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
 
