@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: check demo test lint docs figures paper paper-full bench mutants damage clean
+.PHONY: check demo test lint docs site figures paper paper-full bench mutants damage clean
 
 demo: $(READY)
 	$(BIN)/vlcrender generate datasets/quickstart.toml --out out/quickstart
@@ -28,6 +28,12 @@ docs: $(READY)
 	$(BIN)/python docs/make_reference.py
 	$(BIN)/python docs/make_api.py
 	$(BIN)/python docs/make_notebooks.py
+	$(BIN)/python docs/make_variants.py
+	$(BIN)/python docs/make_tutorial.py
+
+# out/site/index.html; a warning is an error. tests/test_site.py builds it too, and checks its links.
+site: $(READY)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build
 
 figures: $(READY)
 	$(BIN)/python docs/measure.py

@@ -12,9 +12,9 @@ INTRODUCTION = """\
 # Python API
 
 Made by `make docs` from the docstrings (`docs/make_api.py`). What is not listed here is internal and may change.
-[notebooks/](notebooks/) show the API at work. [reference.md](reference.md) has the range and unit of every setting: a
-class of settings, such as `Camera` or `Sensor`, raises `pydantic.ValidationError`, a `ValueError`, for a value out of
-range.
+[Notebooks](notebooks/first_frame.ipynb) show the API at work. [reference.md](reference.md) has the range and unit of
+every setting: a class of settings, such as `Camera` or `Sensor`, raises `pydantic.ValidationError`, a `ValueError`, for
+a value out of range.
 """
 
 

@@ -51,8 +51,9 @@ INTRODUCTION = """\
 Made by `make docs` from the models that check the files (`docs/make_reference.py`). Every key is listed with its type,
 default, range and unit. A key without a default is required. Unknown keys are refused.
 
-JSON Schemas of both files are in [schemas/](schemas/). An editor with TOML support completes and checks keys with them,
-for instance after a first line `#:schema ../docs/schemas/recipe.schema.json`.
+JSON Schemas of both files: [scene](schemas/scene.schema.json), [recipe](schemas/recipe.schema.json). An editor with
+TOML support completes and checks keys with them, for instance after a first line
+`#:schema ../docs/schemas/recipe.schema.json`.
 """
 
 Schema = dict[str, Any]
