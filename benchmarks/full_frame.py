@@ -17,8 +17,8 @@ from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.roi import Roi
 from vlcrender.core.backend import dr, mi
-from vlcrender.dataset.exr import exr_attributes, write_exr
-from vlcrender.dataset.preview import MAX_SIDE_PX, write_preview
+from vlcrender.dataset.format.exr import exr_attributes, write_exr
+from vlcrender.dataset.format.preview import MAX_SIDE_PX, write_preview
 from vlcrender.rendering.path_traced import scene_dict
 from vlcrender.rendering.renderer import Renderer
 from vlcrender.scene.loader import load_scene

@@ -24,7 +24,7 @@ import vlcrender as vr
 from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.roi import LedRegions
-from vlcrender.dataset.pose_sampling import AimedPoses, pose_of_frame
+from vlcrender.dataset.recipe.pose_sampling import AimedPoses, pose_of_frame
 from vlcrender.light.lightmap import bake
 from vlcrender.rendering.renderer import Renderer
 from vlcrender.scene.loader import Scene, load_scene

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from target import Targets
 
-from vlcrender.dataset.frame_job import EXPECTED, FRAMES, PREVIEWS, Job, make_frame
-from vlcrender.dataset.plan import load_plan
+from vlcrender.dataset.recipe.plan import load_plan
+from vlcrender.dataset.run.frame_job import EXPECTED, FRAMES, PREVIEWS, Job, make_frame
 
 
 def peak_gib() -> float:

@@ -17,9 +17,9 @@ from pathlib import Path
 
 from target import Targets, alternating_s, ratio
 
-from vlcrender.dataset.files import EXPECTED, FRAMES, PREVIEWS
-from vlcrender.dataset.frame_job import Job, make_frame
-from vlcrender.dataset.plan import load_plan
+from vlcrender.dataset.format.files import EXPECTED, FRAMES, PREVIEWS
+from vlcrender.dataset.recipe.plan import load_plan
+from vlcrender.dataset.run.frame_job import Job, make_frame
 
 ROOT = Path(__file__).parent.parent
 QUICKSTART, REGIONS = ROOT / "datasets/quickstart.toml", ROOT / "datasets/office200.toml"

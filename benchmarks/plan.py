@@ -11,7 +11,7 @@ from pathlib import Path
 from target import Targets
 
 import vlcrender as vr
-from vlcrender.dataset.possible import check_possible
+from vlcrender.dataset.run.possible import check_possible
 
 ROOT = Path(__file__).parent.parent
 SECONDS = 10.0

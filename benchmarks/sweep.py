@@ -16,8 +16,8 @@ from pathlib import Path
 
 from target import Targets, alternating_s, ratio
 
-from vlcrender.dataset.generate import generate
-from vlcrender.dataset.plan import load_plan
+from vlcrender.dataset.recipe.plan import load_plan
+from vlcrender.dataset.run.generate import generate
 
 OFFICE20 = Path(__file__).parent.parent / "datasets/office20.toml"
 CELLS = 10

@@ -10,7 +10,7 @@ from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.rig import mounted_cameras
 from vlcrender.config.toml_model import check, read_toml
-from vlcrender.dataset.motion import Motion, poses_during
+from vlcrender.dataset.recipe.motion import Motion, poses_during
 from vlcrender.rendering.renderer import Renderer
 from vlcrender.scene.loader import Scene, build_scene, load_scene
 from vlcrender.scene.schema import SceneSettings

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from vlcrender.config.presets import KINDS, presets
-from vlcrender.dataset.pose_file import PoseFile
-from vlcrender.dataset.recipe import RecipeFile
+from vlcrender.dataset.recipe.pose_file import PoseFile
+from vlcrender.dataset.recipe.recipe import RecipeFile
 from vlcrender.scene.led_map_file import LedMapFile
 from vlcrender.scene.schema import SceneSettings
 

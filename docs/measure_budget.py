@@ -22,9 +22,9 @@ import estimator as est
 import vlcrender as vr
 from estimator.camera.leveling import tilt_from_gravity
 from vlcrender.api import renderer_of
-from vlcrender.dataset.bound_uncertainty import uncertainty_of
-from vlcrender.dataset.error_budget import spot_errors_at
-from vlcrender.dataset.pose_sampling import pose_of_frame
+from vlcrender.dataset.recipe.pose_sampling import pose_of_frame
+from vlcrender.dataset.world.bound_uncertainty import uncertainty_of
+from vlcrender.dataset.world.error_budget import spot_errors_at
 
 RECIPE = "calibrated"
 UNKNOWNS: Mapping[str, Mapping[str, object]] = {

@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 
 import vlcrender as vr
 from vlcrender.config.toml_model import check, read_toml
-from vlcrender.dataset.frame_job import Job, make_frame
-from vlcrender.dataset.timeline import Burst
+from vlcrender.dataset.recipe.timeline import Burst
+from vlcrender.dataset.run.frame_job import Job, make_frame
 from vlcrender.modulation.codes import code_book
 from vlcrender.modulation.flicker import flicker_of
 from vlcrender.modulation.keys import Downlink

@@ -20,7 +20,7 @@ from estimator_synthetic import small_dataset
 import vlcrender as vr
 from estimator.cli import main as estimator_main
 from vlcrender.cli import main as vlcrender_main
-from vlcrender.dataset.manifest import seal_dataset
+from vlcrender.dataset.format.manifest import seal_dataset
 
 os.environ.setdefault("VLCRENDER_CACHE", tempfile.mkdtemp(prefix="vlcrender-tests-"))
 # No bake of an earlier run is taken, and processes that tests start share this one's.

@@ -8,7 +8,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 import vlcrender as vr
-from vlcrender.dataset.files import read_dataset_file
+from vlcrender.dataset.format.files import read_dataset_file
 
 MAX_ERROR_PX = 1e-6
 """Tests ask for 1e-6 px; doubles of 10 m and 2000 px leave some 1e-12 px."""

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from vlcrender.camera.intrinsics import Pose, rotation_cam_world
 from vlcrender.config.toml_model import check, override, read_toml
 from vlcrender.core.random_keys import stream
-from vlcrender.dataset.files import read_dataset_file
-from vlcrender.dataset.generate import generate
-from vlcrender.dataset.plan import load_plan
-from vlcrender.dataset.recipe import Recipe
+from vlcrender.dataset.format.files import read_dataset_file
+from vlcrender.dataset.recipe.plan import load_plan
+from vlcrender.dataset.recipe.recipe import Recipe
+from vlcrender.dataset.run.generate import generate
 from vlcrender.errors import InputError
 from vlcrender.sensor.accelerometer import STANDARD_GRAVITY_M_S2 as G
 from vlcrender.sensor.accelerometer import Imu, TiltError

@@ -14,8 +14,8 @@ from estimator.methods.catalogue import VARIANTS, variant_named
 from estimator.solvers.ranging import law_of_sines, led_ranges
 from estimator.solvers.trilateration import position_from_ranges
 from vlcrender.camera.intrinsics import Camera
-from vlcrender.dataset.generate import generate
-from vlcrender.dataset.plan import load_plan
+from vlcrender.dataset.recipe.plan import load_plan
+from vlcrender.dataset.run.generate import generate
 
 
 @pytest.fixture(scope="module")

@@ -10,11 +10,11 @@ from conftest import ROOT, SMALL
 
 import vlcrender as vr
 from vlcrender.camera.roi import RegionImage, Roi
-from vlcrender.dataset.added_noise import AddedNoise
-from vlcrender.dataset.plan import load_plan
-from vlcrender.dataset.recipe import Recipe, scaled
-from vlcrender.dataset.schema import FrameRow, TruthRow
-from vlcrender.dataset.tables import read_table
+from vlcrender.dataset.format.schema import FrameRow, TruthRow
+from vlcrender.dataset.format.tables import read_table
+from vlcrender.dataset.recipe.added_noise import AddedNoise
+from vlcrender.dataset.recipe.plan import load_plan
+from vlcrender.dataset.recipe.recipe import Recipe, scaled
 from vlcrender.errors import InputError
 from vlcrender.sensor.sensor import Sensor
 from vlcrender.sensor.signal_chain import AddedDn, expose_regions, variance_e2

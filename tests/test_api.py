@@ -13,7 +13,7 @@ from conftest import ROOT, SMALL
 
 import vlcrender as vr
 from vlcrender.config.packaged import packaged_names
-from vlcrender.dataset.plan import load_plan
+from vlcrender.dataset.recipe.plan import load_plan
 
 POSE = vr.Pose((3.15, 3.10, 0.60), tilt_x_deg=6, tilt_y_deg=-8)
 HEAVY = ("mitsuba", "drjit", "cv2", "matplotlib", "scipy", "colour", "OpenEXR", "pyarrow")

@@ -10,10 +10,10 @@ from conftest import ROOT, SMALL
 from pydantic import TypeAdapter
 
 from vlcrender.camera.roi import Roi
-from vlcrender.dataset.auto_exposure import Metering, NoiseLevelMetering, PeakMetering
-from vlcrender.dataset.generate import generate
-from vlcrender.dataset.plan import load_plan
-from vlcrender.dataset.verify import verify
+from vlcrender.dataset.recipe.auto_exposure import Metering, NoiseLevelMetering, PeakMetering
+from vlcrender.dataset.recipe.plan import load_plan
+from vlcrender.dataset.run.generate import generate
+from vlcrender.dataset.verify.verify import verify
 from vlcrender.rendering.expected_image import ExpectedImage, ExpectedRegion, LedPatch
 
 

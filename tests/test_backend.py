@@ -116,8 +116,8 @@ variant, workers, out = sys.argv[1], int(sys.argv[2]), Path(sys.argv[3])
 if variant != "unset":
     import mitsuba
     mitsuba.set_variant(variant)
-from vlcrender.dataset.generate import generate
-from vlcrender.dataset.plan import load_plan
+from vlcrender.dataset.run.generate import generate
+from vlcrender.dataset.recipe.plan import load_plan
 plan = load_plan(Path("datasets/quickstart.toml"), sys.argv[4:])
 seen = []
 generate(plan, out, workers, progress=lambda report: seen.append(variant == "unset" or mitsuba.variant()))

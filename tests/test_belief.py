@@ -16,16 +16,16 @@ from vlcrender.camera.distortion import Distortion
 from vlcrender.camera.intrinsics import Camera, Pose, transform
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.core.backend import dr
-from vlcrender.dataset.files import read_dataset_file
-from vlcrender.dataset.frame_job import Job, _rendered, make_frame
-from vlcrender.dataset.generate import generate
-from vlcrender.dataset.plan import Plan, load_plan
-from vlcrender.dataset.schema import DeviceTruthRow, FrameRow, MapTruthRow, TruthRow
-from vlcrender.dataset.tables import read_table, write_table
-from vlcrender.dataset.true_world import (
+from vlcrender.dataset.format.files import read_dataset_file
+from vlcrender.dataset.format.schema import DeviceTruthRow, FrameRow, MapTruthRow, TruthRow
+from vlcrender.dataset.format.tables import read_table, write_table
+from vlcrender.dataset.recipe.plan import Plan, load_plan
+from vlcrender.dataset.run.frame_job import Job, _rendered, make_frame
+from vlcrender.dataset.run.generate import generate
+from vlcrender.dataset.verify.verify import verify
+from vlcrender.dataset.world.true_world import (
     built_leds,
 )
-from vlcrender.dataset.verify import verify
 from vlcrender.rendering.renderer import Renderer
 from vlcrender.scene.as_built import luminaires_of
 from vlcrender.scene.loader import Scene, build_scene

@@ -9,9 +9,9 @@ from test_belief import CALIBRATED, Array, plan
 
 from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.config.presets import presets
-from vlcrender.dataset.belief import CAMERA_PARAMETERS, Belief
-from vlcrender.dataset.plan import Plan, load_plan
-from vlcrender.dataset.true_world import (
+from vlcrender.dataset.recipe.belief import CAMERA_PARAMETERS, Belief
+from vlcrender.dataset.recipe.plan import Plan, load_plan
+from vlcrender.dataset.world.true_world import (
     built_leds,
     device_sensor,
     reading_m_s2,

@@ -15,7 +15,7 @@ from input_files import mutated, read_or_refused
 import vlcrender as vr
 from estimator.photo.calibration import read_calibration as read_by_estimator
 from vlcrender.camera.calibration import read_calibration
-from vlcrender.dataset.plan import load_plan
+from vlcrender.dataset.recipe.plan import load_plan
 from vlcrender.errors import InputError
 
 FILES = ROOT / "tests/calibrations"

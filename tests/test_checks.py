@@ -23,7 +23,7 @@ from estimator.errors import InputError as ReaderError
 from estimator.io.dataset import read_dataset, read_frame
 from estimator.io.truth import read_truth
 from vlcrender.core.digest import sha256_of
-from vlcrender.dataset.verify import verify
+from vlcrender.dataset.verify.verify import verify
 from vlcrender.errors import InputError
 
 Tree = dict[str, Any]

@@ -84,7 +84,7 @@ GENERATE_MISTAKES: dict[str, tuple[list[str], list[str]]] = {
 
 @pytest.mark.parametrize("mistake", GENERATE_MISTAKES)
 def test_generate_refuses(tmp_path: Path, mistake: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vlcrender.dataset.pose_sampling.TRIES", 100)  # no more are needed to find no pose
+    monkeypatch.setattr("vlcrender.dataset.recipe.pose_sampling.TRIES", 100)  # no more are needed to find no pose
     options, mentions = GENERATE_MISTAKES[mistake]
     assert_refused(run("vlcrender", "generate", RECIPE, "--out", str(tmp_path / "x"), *SETS, *options), *mentions)
     assert not (tmp_path / "x").exists()

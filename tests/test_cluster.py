@@ -11,12 +11,12 @@ from conftest import ROOT, SMALL
 from distributed import LocalCluster
 
 from vlcrender.core.digest import sha256_of
-from vlcrender.dataset import workers
-from vlcrender.dataset.frame_job import Job
-from vlcrender.dataset.generate import generate
-from vlcrender.dataset.plan import load_plan
-from vlcrender.dataset.progress import Progress
-from vlcrender.dataset.verify import verify
+from vlcrender.dataset.recipe.plan import load_plan
+from vlcrender.dataset.run import workers
+from vlcrender.dataset.run.frame_job import Job
+from vlcrender.dataset.run.generate import generate
+from vlcrender.dataset.run.progress import Progress
+from vlcrender.dataset.verify.verify import verify
 from vlcrender.errors import InputError
 
 

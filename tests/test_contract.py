@@ -19,9 +19,9 @@ from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.rig import mounted_cameras
 from vlcrender.core.random_keys import stream
-from vlcrender.dataset.generate import generate
-from vlcrender.dataset.plan import load_plan
-from vlcrender.dataset.schema import camera_entry
+from vlcrender.dataset.format.schema import camera_entry
+from vlcrender.dataset.recipe.plan import load_plan
+from vlcrender.dataset.run.generate import generate
 from vlcrender.sensor.accelerometer import TiltError
 
 

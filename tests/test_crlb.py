@@ -12,7 +12,7 @@ from vlcrender.camera.rig import Mounted, mounted_cameras, pose_of
 from vlcrender.camera.roi import LedRegions, RegionImage, Roi
 from vlcrender.camera.vignetting import relative_illumination
 from vlcrender.config.toml_model import check, read_toml
-from vlcrender.dataset.plan import load_plan
+from vlcrender.dataset.recipe.plan import load_plan
 from vlcrender.errors import InputError
 from vlcrender.rendering import crlb
 from vlcrender.rendering.crlb import MARGIN_PX, Render, position_bound_m2

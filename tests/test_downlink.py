@@ -5,7 +5,7 @@ import pytest
 
 from vlcrender.camera.roi import Roi
 from vlcrender.core.random_keys import stream
-from vlcrender.dataset.downlink import decoded_spots
+from vlcrender.dataset.world.downlink import decoded_spots
 from vlcrender.rendering.expected_image import ExpectedRegion, LedPatch
 
 COUNT = 1000

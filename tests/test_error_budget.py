@@ -10,8 +10,8 @@ from conftest import ROOT, SMALL, run
 from matplotlib.figure import Figure
 
 import vlcrender as vr
-from vlcrender.dataset.budget_plot import draw_budget
-from vlcrender.dataset.error_budget import _parts
+from vlcrender.dataset.world.budget_plot import draw_budget
+from vlcrender.dataset.world.error_budget import _parts
 
 RECIPE = str(ROOT / "datasets/quickstart.toml")
 OVERRIDES = [*SMALL, "poses.count=3", "belief.preset=calibrated"]

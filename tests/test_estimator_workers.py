@@ -18,7 +18,7 @@ from estimator.evaluate.workers import _interrupts_deferred, estimate_with_worke
 from estimator.io.dataset import FrameRecord, read_dataset
 from estimator.io.estimates import EstimateRow
 from estimator.methods.catalogue import VARIANTS
-from vlcrender.dataset.workers import _interrupts_deferred as _interrupts_of_generate_deferred
+from vlcrender.dataset.run.workers import _interrupts_deferred as _interrupts_of_generate_deferred
 
 
 @pytest.fixture(scope="module")

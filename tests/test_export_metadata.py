@@ -18,8 +18,8 @@ from export_reading import exported
 import vlcrender as vr
 from vlcrender.camera.roi import RegionImage, Roi
 from vlcrender.core.backend import mi
-from vlcrender.dataset.exr import write_exr
-from vlcrender.dataset.files import read_dataset_file
+from vlcrender.dataset.format.exr import write_exr
+from vlcrender.dataset.format.files import read_dataset_file
 from vlcrender.export.card import card
 from vlcrender.export.source import Source
 

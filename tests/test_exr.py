@@ -9,7 +9,7 @@ import pytest
 
 from vlcrender.camera.intrinsics import Camera
 from vlcrender.camera.roi import Roi
-from vlcrender.dataset.exr import exr_attributes, read_exr_parts, write_exr
+from vlcrender.dataset.format.exr import exr_attributes, read_exr_parts, write_exr
 from vlcrender.errors import InputError
 
 SENSOR = Roi(0, 0, 300, 400)

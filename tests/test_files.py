@@ -9,13 +9,13 @@ import pytest
 from conftest import ROOT, SMALL
 
 from vlcrender.camera.roi import RegionImage, Roi
-from vlcrender.dataset.exr import write_exr
-from vlcrender.dataset.files import whole_file, write_json
-from vlcrender.dataset.generate import generate
-from vlcrender.dataset.plan import load_plan
-from vlcrender.dataset.progress import Progress
-from vlcrender.dataset.schema import FrameRecord, FrameRow
-from vlcrender.dataset.tables import write_table
+from vlcrender.dataset.format.exr import write_exr
+from vlcrender.dataset.format.files import whole_file, write_json
+from vlcrender.dataset.format.schema import FrameRecord, FrameRow
+from vlcrender.dataset.format.tables import write_table
+from vlcrender.dataset.recipe.plan import load_plan
+from vlcrender.dataset.run.generate import generate
+from vlcrender.dataset.run.progress import Progress
 from vlcrender.errors import InputError
 
 ROI = Roi(0, 0, 2, 3)

@@ -10,11 +10,11 @@ import OpenEXR
 import pytest
 from conftest import ROOT, SMALL
 
-from vlcrender.dataset.files import read_dataset_file
-from vlcrender.dataset.generate import generate
-from vlcrender.dataset.plan import Plan, load_plan
-from vlcrender.dataset.schema import DATA_VERSION, led_map
-from vlcrender.dataset.verify import verify
+from vlcrender.dataset.format.files import read_dataset_file
+from vlcrender.dataset.format.schema import DATA_VERSION, led_map
+from vlcrender.dataset.recipe.plan import Plan, load_plan
+from vlcrender.dataset.run.generate import generate
+from vlcrender.dataset.verify.verify import verify
 from vlcrender.errors import InputError
 from vlcrender.scene.loader import Scene
 

@@ -9,8 +9,8 @@ from conftest import ROOT, copy_of, small_plan
 import estimator as est
 import vlcrender as vr
 from vlcrender.camera.roi import RegionImage, Roi
-from vlcrender.dataset.file_settings import FileSettings
-from vlcrender.dataset.frame_files import read_frame_parts, write_frame
+from vlcrender.dataset.format.frame_files import read_frame_parts, write_frame
+from vlcrender.dataset.recipe.file_settings import FileSettings
 
 REGIONS = ('regions.kind="leds"', "regions.margin_px=6.0", "poses.count=2")
 ATTRIBUTES = {

@@ -10,12 +10,12 @@ from conftest import ROOT, SMALL
 import vlcrender as vr
 from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.roi import RegionImage, Roi
-from vlcrender.dataset import frame_job
-from vlcrender.dataset.frame_job import Job, _white_balance
-from vlcrender.dataset.generate import generate
-from vlcrender.dataset.plan import Plan, load_plan
-from vlcrender.dataset.schema import FrameRow, TruthRow
-from vlcrender.dataset.tables import read_table
+from vlcrender.dataset.format.schema import FrameRow, TruthRow
+from vlcrender.dataset.format.tables import read_table
+from vlcrender.dataset.recipe.plan import Plan, load_plan
+from vlcrender.dataset.run import frame_job
+from vlcrender.dataset.run.frame_job import Job, _white_balance
+from vlcrender.dataset.run.generate import generate
 from vlcrender.rendering.crlb import position_bound_m2
 from vlcrender.rendering.renderer import Renderer
 from vlcrender.scene.loader import load_scene

@@ -19,14 +19,14 @@ import pyarrow.parquet as pq
 import pytest
 from conftest import HANG_S, ROOT, SMALL, small_plan, started, wait_until
 
-from vlcrender.dataset.generate import generate
-from vlcrender.dataset.manifest import read_manifest
-from vlcrender.dataset.plan import load_plan
-from vlcrender.dataset.progress import Progress, ProgressCallback
-from vlcrender.dataset.schema import DATA_VERSION, FrameRecord
-from vlcrender.dataset.unfinished import _line
-from vlcrender.dataset.verify import verify
-from vlcrender.dataset.workers import Done, Task
+from vlcrender.dataset.format.manifest import read_manifest
+from vlcrender.dataset.format.schema import DATA_VERSION, FrameRecord
+from vlcrender.dataset.recipe.plan import load_plan
+from vlcrender.dataset.run.generate import generate
+from vlcrender.dataset.run.progress import Progress, ProgressCallback
+from vlcrender.dataset.run.unfinished import _line
+from vlcrender.dataset.run.workers import Done, Task
+from vlcrender.dataset.verify.verify import verify
 from vlcrender.errors import InputError
 
 RECIPE = ROOT / "datasets/quickstart.toml"
@@ -66,7 +66,7 @@ def test_one_thread_gives_the_same_bytes_as_all(made: Path, tmp_path: Path) -> N
     """In a process of its own with every library held to one thread."""
     code = (
         "from pathlib import Path; from conftest import small_plan; from vlcrender.core.backend import dr; "
-        "from vlcrender.dataset.generate import generate; dr.set_thread_count(1); "
+        "from vlcrender.dataset.run.generate import generate; dr.set_thread_count(1); "
         f"generate(small_plan('expected=true'), Path({str(tmp_path / 'one')!r}))"
     )
     single = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL")}
@@ -171,7 +171,7 @@ def test_a_set_of_another_version_is_left_alone(
     """The recipe gives other bits since: a finished set does not count as made, an unfinished one is not resumed."""
     provenance = json.loads((made / "dataset.json").read_text())["provenance"]
     (tmp_path / file).write_text(json.dumps({"provenance": provenance}))
-    monkeypatch.setattr("vlcrender.dataset.unfinished.DATA_VERSION", DATA_VERSION + 1)
+    monkeypatch.setattr("vlcrender.dataset.run.unfinished.DATA_VERSION", DATA_VERSION + 1)
     with pytest.raises(InputError, match="another recipe, scene or version; nothing was changed"):
         generate(small_plan("expected=true"), tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == [file]
@@ -194,7 +194,7 @@ def test_a_frame_is_in_the_journal_before_it_is_reported(
     def done_frames(tasks: Iterable[Task], *_: object) -> Iterator[Done]:
         yield from zip((job for task in tasks for job, _ in task), records_of(made), strict=True)
 
-    monkeypatch.setattr("vlcrender.dataset.generate.done_frames", done_frames)
+    monkeypatch.setattr("vlcrender.dataset.run.generate.done_frames", done_frames)
     lines: list[int] = []
 
     def count(report: Progress) -> None:
@@ -206,7 +206,7 @@ def test_a_frame_is_in_the_journal_before_it_is_reported(
 
 
 def test_impossible_poses_are_refused_before_the_first_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vlcrender.dataset.pose_sampling.TRIES", 100)
+    monkeypatch.setattr("vlcrender.dataset.recipe.pose_sampling.TRIES", 100)
     plan = load_plan(RECIPE, [*SMALL, "poses.min_leds=500"])
     with pytest.raises(InputError, match=r"frame 0: no position .* 500 LEDs"):
         generate(plan, tmp_path / "never")

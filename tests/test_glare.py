@@ -12,7 +12,7 @@ from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.rig import mounted_cameras
 from vlcrender.camera.roi import LedRegions, RegionImage, Roi, led_regions
 from vlcrender.config.toml_model import check
-from vlcrender.dataset.plan import load_plan
+from vlcrender.dataset.recipe.plan import load_plan
 from vlcrender.errors import InputError
 from vlcrender.rendering.bayer import MosaicRenderer, colour_of_pixels
 from vlcrender.rendering.crlb import position_bound_m2

@@ -13,8 +13,8 @@ from PIL import Image
 
 import vlcrender as vr
 from vlcrender.core.program import program_sha256
-from vlcrender.dataset.frame_job import Job, make_frames
-from vlcrender.dataset.unfinished import _record_of
+from vlcrender.dataset.run.frame_job import Job, make_frames
+from vlcrender.dataset.run.unfinished import _record_of
 from vlcrender.scene.scene_files import scene_sources
 
 CUBE = "v 3 3 0\nv 4 3 0\nv 4 4 0\nv 3 4 0\nv 3 3 {h}\nv 4 3 {h}\nv 4 4 {h}\nv 3 4 {h}\n" + "".join(
@@ -135,18 +135,18 @@ def test_another_program_does_not_go_on_but_takes_a_finished_set_for_complete(
     with pytest.raises(Crash):
         vr.generate(small_plan(), tmp_path / "set", progress=interrupt)
     with monkeypatch.context() as changed:
-        changed.setattr("vlcrender.dataset.unfinished.program_sha256", lambda: "0" * 64)
+        changed.setattr("vlcrender.dataset.run.unfinished.program_sha256", lambda: "0" * 64)
         with pytest.raises(vr.InputError, match="they differ in the program: the source of vlcrender was changed"):
             vr.generate(small_plan(), tmp_path / "set")
     assert vr.generate(small_plan(), tmp_path / "set")
-    monkeypatch.setattr("vlcrender.dataset.unfinished.program_sha256", lambda: "0" * 64)
+    monkeypatch.setattr("vlcrender.dataset.run.unfinished.program_sha256", lambda: "0" * 64)
     assert vr.generate(small_plan(), tmp_path / "set") is False
 
 
 def test_a_worker_with_another_program_makes_no_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     job = Job.of(small_plan(), tmp_path)
     assert job.program == program_sha256()
-    monkeypatch.setattr("vlcrender.dataset.frame_job.program_sha256", lambda: "0" * 64)
+    monkeypatch.setattr("vlcrender.dataset.run.frame_job.program_sha256", lambda: "0" * 64)
     with pytest.raises(vr.InputError, match="a worker runs another program"):
         make_frames([(job, 0)])
 

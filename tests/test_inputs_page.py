@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from conftest import ROOT
 
-from vlcrender.dataset.plan import load_plan
+from vlcrender.dataset.recipe.plan import load_plan
 
 
 def test_the_files_of_the_page_are_a_recipe(tmp_path: Path) -> None:

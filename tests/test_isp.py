@@ -8,8 +8,8 @@ from conftest import ROOT, SMALL
 from PIL import Image
 from test_bayer import QE
 
-from vlcrender.dataset.generate import generate
-from vlcrender.dataset.plan import load_plan
+from vlcrender.dataset.recipe.plan import load_plan
+from vlcrender.dataset.run.generate import generate
 from vlcrender.sensor.isp import Processed
 from vlcrender.sensor.sensor import Sensor
 from vlcrender.sensor.signal_chain import expose

@@ -15,14 +15,14 @@ import pytest
 from conftest import ROOT, SMALL, copy_of, run, small_plan
 
 import estimator.io.lock
-import vlcrender.dataset.lock
+import vlcrender.dataset.format.lock
 from estimator.errors import InputError as EstimatorError
-from vlcrender.dataset.generate import generate
+from vlcrender.dataset.run.generate import generate
 from vlcrender.errors import InputError as RendererError
 
 Locked = Callable[[Path, str], AbstractContextManager[None]]
 REFUSED = (EstimatorError, RendererError)
-LOCKS = {"vlcrender": vlcrender.dataset.lock, "estimator": estimator.io.lock}
+LOCKS = {"vlcrender": vlcrender.dataset.format.lock, "estimator": estimator.io.lock}
 FILE = ".vlcrender.lock"
 
 
@@ -36,7 +36,7 @@ def locked(request: pytest.FixtureRequest) -> Locked:
 def held_by_a_process(folder: Path) -> Iterator[subprocess.Popen[str]]:
     """A process that holds the lock of a folder until it is killed."""
     code = (
-        "import sys, time; from pathlib import Path; from vlcrender.dataset.lock import locked\n"
+        "import sys, time; from pathlib import Path; from vlcrender.dataset.format.lock import locked\n"
         "with locked(Path(sys.argv[1]), 'vlcrender generate'):\n"
         "    print('held', flush=True); time.sleep(600)"
     )
@@ -165,7 +165,7 @@ def test_cells_are_used_at_once_and_never_beside_their_sweep(locked: Locked, tmp
 
 
 def test_a_folder_of_a_refused_run_is_not_left_behind(tmp_path: Path) -> None:
-    with vlcrender.dataset.lock.locked(tmp_path / "a/b", "one"):
+    with vlcrender.dataset.format.lock.locked(tmp_path / "a/b", "one"):
         assert (tmp_path / "a/b" / FILE).exists()
     assert list(tmp_path.iterdir()) == []
 

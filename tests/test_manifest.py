@@ -13,9 +13,9 @@ from conftest import ROOT, SMALL, copy_of, run, sealed, small_plan, unchanged
 
 import vlcrender as vr
 from vlcrender.core.digest import sha256_of
-from vlcrender.dataset.files import read_json_object
-from vlcrender.dataset.manifest import MANIFEST, read_manifest, seal_of
-from vlcrender.dataset.verify import verify
+from vlcrender.dataset.format.files import read_json_object
+from vlcrender.dataset.format.manifest import MANIFEST, read_manifest, seal_of
+from vlcrender.dataset.verify.verify import verify
 
 ASSIGNMENTS = ("expected=true", "processed.format=png")
 
@@ -91,7 +91,7 @@ def test_damage_of_the_manifest_and_of_files_is_repaired_together(made: Path, co
 
 def test_a_file_of_other_bits_is_not_put_in_place(copied: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A program that makes other frames leaves the damaged one: a mixed set is worse than a missing frame."""
-    monkeypatch.setattr("vlcrender.dataset.frame_job.random_key", lambda *_: (1, 2))
+    monkeypatch.setattr("vlcrender.dataset.run.frame_job.random_key", lambda *_: (1, 2))
     (copied / "frames/000001.exr").write_bytes(b"x")
     (line,) = vr.repair(copied)
     assert line == "frames/000001.exr: this program and its libraries make another one; it was left as it is"

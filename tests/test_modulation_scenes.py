@@ -12,8 +12,8 @@ from conftest import ROOT
 import vlcrender as vr
 from vlcrender.config.toml_model import check, read_toml
 from vlcrender.core.warn_once import warn_once
-from vlcrender.dataset.downlink_entry import CodeEntry, PacketEntry, ToneEntry, downlink_entry
-from vlcrender.dataset.generate import _warn_of_flicker
+from vlcrender.dataset.format.downlink_entry import CodeEntry, PacketEntry, ToneEntry, downlink_entry
+from vlcrender.dataset.run.generate import _warn_of_flicker
 from vlcrender.modulation import packet
 from vlcrender.modulation.codes import code_book
 from vlcrender.modulation.flicker import (

@@ -7,7 +7,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.rig import mounted_cameras
-from vlcrender.dataset.motion import Motion, poses_during
+from vlcrender.dataset.recipe.motion import Motion, poses_during
 from vlcrender.errors import InputError
 from vlcrender.rendering.readout import LinePoses
 from vlcrender.rendering.renderer import LedPatch, Renderer

@@ -10,11 +10,11 @@ import pyarrow.parquet as pq
 import pytest
 from conftest import ROOT, SMALL
 
-from vlcrender.dataset.frame_job import Job, make_frame
-from vlcrender.dataset.generate import generate
-from vlcrender.dataset.plan import Plan, load_plan
-from vlcrender.dataset.progress import Progress
-from vlcrender.dataset.verify import verify
+from vlcrender.dataset.recipe.plan import Plan, load_plan
+from vlcrender.dataset.run.frame_job import Job, make_frame
+from vlcrender.dataset.run.generate import generate
+from vlcrender.dataset.run.progress import Progress
+from vlcrender.dataset.verify.verify import verify
 
 LEFT = "rig=[{ name = 'left', offset_m = [-0.1, 0.0, 0.0], tilt_x_deg = 0.0, tilt_y_deg = 1.0 }]"
 NOISY = (

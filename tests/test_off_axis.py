@@ -12,7 +12,7 @@ from vlcrender.camera.psf import DISC_OF_GAUSSIAN, off_axis_sigma_px, split_for,
 from vlcrender.camera.roi import LedRegions, Roi
 from vlcrender.config.toml_model import check
 from vlcrender.core.planar_shapes import Rectangle
-from vlcrender.dataset.plan import load_plan
+from vlcrender.dataset.recipe.plan import load_plan
 from vlcrender.errors import InputError
 from vlcrender.rendering.bayer import MosaicRenderer, colour_of_pixels
 from vlcrender.rendering.led_blur import LedKernel

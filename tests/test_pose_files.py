@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 import estimator as est
 from vlcrender.camera.intrinsics import rotation_cam_world
-from vlcrender.dataset.plan import load_plan
-from vlcrender.dataset.pose_file import read_poses
+from vlcrender.dataset.recipe.plan import load_plan
+from vlcrender.dataset.recipe.pose_file import read_poses
 from vlcrender.errors import InputError
 
 TUM = """# timestamp tx ty tz qx qy qz qw

@@ -13,9 +13,9 @@ from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.config.toml_model import check, read_toml
 from vlcrender.core.random_keys import stream
-from vlcrender.dataset import pose_sampling
-from vlcrender.dataset.plan import load_plan
-from vlcrender.dataset.pose_sampling import (
+from vlcrender.dataset.recipe import pose_sampling
+from vlcrender.dataset.recipe.plan import load_plan
+from vlcrender.dataset.recipe.pose_sampling import (
     AimedPoses,
     GridPoses,
     ListedPoses,

@@ -11,8 +11,8 @@ from pydantic import BaseModel
 from vlcrender.camera.intrinsics import Camera
 from vlcrender.config.presets import preset, presets, with_presets
 from vlcrender.config.toml_model import RENAMED_KEYS
-from vlcrender.dataset.plan import load_plan
-from vlcrender.dataset.recipe import Recipe
+from vlcrender.dataset.recipe.plan import load_plan
+from vlcrender.dataset.recipe.recipe import Recipe
 from vlcrender.errors import InputError
 from vlcrender.scene.schema import SceneSettings
 from vlcrender.sensor.radiometry import detectors, electron_rate_per_cd_m2

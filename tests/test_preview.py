@@ -8,7 +8,7 @@ from matplotlib.image import imread
 from PIL import Image
 
 from vlcrender.camera.roi import Roi
-from vlcrender.dataset.preview import MAX_SIDE_PX, write_preview
+from vlcrender.dataset.format.preview import MAX_SIDE_PX, write_preview
 
 
 def shown(path: Path, *images: tuple[Roi, np.ndarray], sensor: Roi, white_dn: int, black_dn: int = 0) -> np.ndarray:

@@ -21,9 +21,9 @@ import estimator.cli
 import estimator.io.process
 import vlcrender.cli
 import vlcrender.core.process
-from vlcrender.dataset.generate import generate
-from vlcrender.dataset.verify import verify
-from vlcrender.dataset.workers import Task
+from vlcrender.dataset.run.generate import generate
+from vlcrender.dataset.run.workers import Task
+from vlcrender.dataset.verify.verify import verify
 
 PROCESS = {"vlcrender": vlcrender.core.process, "estimator": estimator.io.process}
 
@@ -107,7 +107,7 @@ def test_an_interrupt_ends_workers_before_the_lock_is_released(
 ) -> None:
     """An orphan would write into the folder of the next run. No process has to be started for it."""
     order: list[str] = []
-    monkeypatch.setattr("vlcrender.dataset.lock._remove", lambda *_: order.append("lock"))
+    monkeypatch.setattr("vlcrender.dataset.format.lock._remove", lambda *_: order.append("lock"))
 
     def done_frames(*_: object) -> Iterator[object]:
         try:
@@ -116,7 +116,7 @@ def test_an_interrupt_ends_workers_before_the_lock_is_released(
         finally:
             order.append("workers")
 
-    monkeypatch.setattr("vlcrender.dataset.generate.done_frames", done_frames)
+    monkeypatch.setattr("vlcrender.dataset.run.generate.done_frames", done_frames)
     with pytest.raises(KeyboardInterrupt):
         generate(small_plan(), tmp_path / "set")
     assert order == ["workers", "lock"]
@@ -199,7 +199,7 @@ def test_a_cluster_gets_absolute_folders(rendered_set: Path, tmp_path: Path, mon
         raise KeyboardInterrupt
         yield
 
-    monkeypatch.setattr("vlcrender.dataset.generate.done_frames", done_frames)
+    monkeypatch.setattr("vlcrender.dataset.run.generate.done_frames", done_frames)
     monkeypatch.chdir(tmp_path)
     with pytest.raises(KeyboardInterrupt):
         generate(small_plan(), Path("set"), scheduler="tcp://nowhere")

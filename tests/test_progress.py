@@ -6,8 +6,8 @@ import itertools
 import pytest
 from rich.console import Console
 
-from vlcrender.dataset.progress import FIRST_LINE_S, MAX_INTERVAL_S, Pace, Progress, duration_text
-from vlcrender.dataset.progress_display import ProgressDisplay
+from vlcrender.dataset.run.progress import FIRST_LINE_S, MAX_INTERVAL_S, Pace, Progress, duration_text
+from vlcrender.dataset.run.progress_display import ProgressDisplay
 
 
 class Clock:
@@ -77,7 +77,7 @@ def test_durations_have_two_digits(seconds: float, text: str) -> None:
 
 
 def test_a_pipe_gets_plain_lines(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr("vlcrender.dataset.progress.FIRST_LINE_S", 0.0)
+    monkeypatch.setattr("vlcrender.dataset.run.progress.FIRST_LINE_S", 0.0)
     with ProgressDisplay("set", 10, Console(file=io.StringIO())) as display:
         display.show(Progress("reflected light", 0.5, 1.0))
         display.show(frames(10, 10))

@@ -8,8 +8,8 @@ from conftest import ROOT
 from scipy import stats
 
 from vlcrender.core.warn_once import warn_once
-from vlcrender.dataset import generate as generate_module
-from vlcrender.dataset.plan import load_plan
+from vlcrender.dataset.recipe.plan import load_plan
+from vlcrender.dataset.run import generate as generate_module
 from vlcrender.light.lightmap import bake
 from vlcrender.sensor.quantisation import MIN_NOISE_STEPS, noise_steps
 from vlcrender.sensor.sensor import Sensor

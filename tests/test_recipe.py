@@ -2,7 +2,7 @@
 
 from conftest import ROOT
 
-from vlcrender.dataset.plan import load_plan
+from vlcrender.dataset.recipe.plan import load_plan
 from vlcrender.sensor.accelerometer import TiltError
 
 

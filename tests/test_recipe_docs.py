@@ -3,12 +3,12 @@
 import pytest
 from pydantic import BaseModel
 
-from vlcrender.dataset.added_noise import AddedNoise
-from vlcrender.dataset.auto_exposure import NoiseLevelMetering, PeakMetering
-from vlcrender.dataset.motion import Motion
-from vlcrender.dataset.pose_sampling import AimedPoses, GridPoses, ListedPoses, PoseEntry, TiltGridPoses
-from vlcrender.dataset.recipe import RecipeFile
-from vlcrender.dataset.sweep import SweepTable
+from vlcrender.dataset.recipe.added_noise import AddedNoise
+from vlcrender.dataset.recipe.auto_exposure import NoiseLevelMetering, PeakMetering
+from vlcrender.dataset.recipe.motion import Motion
+from vlcrender.dataset.recipe.pose_sampling import AimedPoses, GridPoses, ListedPoses, PoseEntry, TiltGridPoses
+from vlcrender.dataset.recipe.recipe import RecipeFile
+from vlcrender.dataset.recipe.sweep import SweepTable
 from vlcrender.sensor.accelerometer import Imu, TiltError
 from vlcrender.sensor.isp import Processed
 from vlcrender.sensor.quantum_efficiency import QuantumEfficiency

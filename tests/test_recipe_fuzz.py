@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from vlcrender.config.presets import presets
 from vlcrender.config.toml_model import read_toml
-from vlcrender.dataset.plan import Plan, load_plan
-from vlcrender.dataset.recipe import Recipe, scaled
+from vlcrender.dataset.recipe.plan import Plan, load_plan
+from vlcrender.dataset.recipe.recipe import Recipe, scaled
 from vlcrender.errors import InputError
 from vlcrender.sensor.sensor import Sensor
 

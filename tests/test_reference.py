@@ -14,7 +14,7 @@ from jsonschema import Draft202012Validator
 from vlcrender.config.packaged import packaged_folder
 from vlcrender.config.presets import with_presets
 from vlcrender.config.toml_model import check
-from vlcrender.dataset.recipe import Recipe
+from vlcrender.dataset.recipe.recipe import Recipe
 from vlcrender.errors import InputError
 
 

@@ -15,9 +15,9 @@ from estimator.io.dataset import read_dataset
 from estimator.methods.catalogue import VARIANTS
 from vlcrender.camera.intrinsics import Pose
 from vlcrender.camera.rig import pose_of
-from vlcrender.dataset.generate import generate
-from vlcrender.dataset.plan import load_plan
-from vlcrender.dataset.verify import verify
+from vlcrender.dataset.recipe.plan import load_plan
+from vlcrender.dataset.run.generate import generate
+from vlcrender.dataset.verify.verify import verify
 
 angles = st.floats(-179, 179)
 

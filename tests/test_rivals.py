@@ -12,8 +12,8 @@ from estimator.evaluate.batch import estimate_dataset
 from estimator.io.dataset import read_dataset
 from estimator.io.estimates import EstimateRow
 from estimator.methods.catalogue import OWN
-from vlcrender.dataset.generate import generate
-from vlcrender.dataset.plan import load_plan
+from vlcrender.dataset.recipe.plan import load_plan
+from vlcrender.dataset.run.generate import generate
 
 STEREO = (*SMALL, "regions.margin_px=8", "poses.count=2", "accelerometer.error_deg=0")
 FISH_EYE = (

@@ -28,8 +28,8 @@ from estimator.methods.catalogue import PUBLISHED_SINCE, VARIANTS
 from estimator.spots.correspondences import find_correspondences
 from estimator.spots.detect import detect
 from estimator.spots.led_light import Readout
-from vlcrender.dataset.generate import generate
-from vlcrender.dataset.plan import load_plan
+from vlcrender.dataset.recipe.plan import load_plan
+from vlcrender.dataset.run.generate import generate
 
 SIZE = (800, 600, 3000.0)
 RADIUS_M = 0.01

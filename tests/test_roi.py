@@ -13,9 +13,9 @@ from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.roi import LedRegions, Roi, led_regions
 from vlcrender.core.backend import dr
-from vlcrender.dataset.generate import generate
-from vlcrender.dataset.plan import load_plan
-from vlcrender.dataset.verify import verify
+from vlcrender.dataset.recipe.plan import load_plan
+from vlcrender.dataset.run.generate import generate
+from vlcrender.dataset.verify.verify import verify
 from vlcrender.errors import InputError
 from vlcrender.rendering.background import _edges
 from vlcrender.rendering.renderer import Renderer

@@ -13,9 +13,9 @@ from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.rig import mounted_cameras
 from vlcrender.camera.roi import Roi
 from vlcrender.camera.vignetting import relative_illumination
-from vlcrender.dataset.light_checks import light_warnings
-from vlcrender.dataset.motion import Motion, poses_during
-from vlcrender.dataset.plan import Plan
+from vlcrender.dataset.recipe.light_checks import light_warnings
+from vlcrender.dataset.recipe.motion import Motion, poses_during
+from vlcrender.dataset.recipe.plan import Plan
 from vlcrender.errors import InputError
 from vlcrender.modulation.exposure import LineGains, MeanWave
 from vlcrender.modulation.transmission import led_waves

@@ -15,10 +15,10 @@ import vlcrender as vr
 from vlcrender.camera.intrinsics import Pose
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.roi import RegionImage, Roi
-from vlcrender.dataset import frame_job
-from vlcrender.dataset.schema import FrameRow, MapTruthRow, TruthRow
-from vlcrender.dataset.tables import read_table, write_table
-from vlcrender.dataset.true_world import gyro_rad_s
+from vlcrender.dataset.format.schema import FrameRow, MapTruthRow, TruthRow
+from vlcrender.dataset.format.tables import read_table, write_table
+from vlcrender.dataset.run import frame_job
+from vlcrender.dataset.world.true_world import gyro_rad_s
 from vlcrender.modulation.exposure import LineGains
 from vlcrender.modulation.transmission import led_waves
 from vlcrender.rendering.crlb import position_bound_m2

@@ -8,8 +8,8 @@ from conftest import ROOT
 
 from vlcrender.camera.intrinsics import Pose
 from vlcrender.camera.posed_camera import PosedCamera
-from vlcrender.dataset.plan import load_plan
-from vlcrender.dataset.recipe import Recipe, ScaleMode
+from vlcrender.dataset.recipe.plan import load_plan
+from vlcrender.dataset.recipe.recipe import Recipe, ScaleMode
 from vlcrender.errors import InputError
 from vlcrender.rendering.renderer import Renderer
 from vlcrender.scene.loader import Scene

@@ -17,12 +17,12 @@ import vlcrender as vr
 from estimator.io import dataset as reader
 from estimator.io.shard import frame_of_shard
 from vlcrender.camera.roi import RegionImage, Roi
-from vlcrender.dataset import frame_job
-from vlcrender.dataset.generate import _tasks
-from vlcrender.dataset.schema import FrameRecord
-from vlcrender.dataset.shard import Shard, incomplete
-from vlcrender.dataset.unfinished import Unfinished
-from vlcrender.dataset.verify import verify
+from vlcrender.dataset.format.schema import FrameRecord
+from vlcrender.dataset.format.shard import Shard, incomplete
+from vlcrender.dataset.run import frame_job
+from vlcrender.dataset.run.generate import _tasks
+from vlcrender.dataset.run.unfinished import Unfinished
+from vlcrender.dataset.verify.verify import verify
 
 REGIONS = 'regions={ kind = "leds", margin_px = 2 }'
 

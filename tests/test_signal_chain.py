@@ -392,8 +392,8 @@ def test_each_term_adds_its_variance(term: dict[str, float], added_e2: float) ->
 def test_the_same_exposure_has_the_same_numbers_in_every_version() -> None:
     """Pinned numbers hold the signs, the order and the keys that no law of the noise tells apart.
 
-    If they change, so does every dataset: raise DATA_VERSION (vlcrender/dataset/schema.py), so that no unfinished set
-    goes on with other bits.
+    If they change, so does every dataset: raise DATA_VERSION (dataset/format/schema.py), so that no unfinished
+    set goes on with other bits.
     """
     means = np.array([[0, 1, 5, 20, 300, 1500], [0, 2, 9, 40, 800, 1200]], dtype=np.float32)
     numbers = {

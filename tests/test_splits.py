@@ -5,7 +5,7 @@ import pytest
 from conftest import small_plan
 
 import vlcrender as vr
-from vlcrender.dataset.splits import NAMES, Split, blocks_of
+from vlcrender.dataset.recipe.splits import NAMES, Split, blocks_of
 from vlcrender.errors import InputError
 
 ROOM_M = np.array([7.0, 5.2])

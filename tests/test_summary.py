@@ -13,12 +13,12 @@ from conftest import ROOT, SMALL, copy_of, run, small_plan
 import vlcrender as vr
 from vlcrender.config.presets import with_presets
 from vlcrender.config.toml_model import check, read_toml
-from vlcrender.dataset.dry_run import dry_run, file_counts
-from vlcrender.dataset.frame_numbers import FrameNumbers
-from vlcrender.dataset.possible import MAX_POSES, check_possible, poses_to_check
-from vlcrender.dataset.recipe import RecipeFile
-from vlcrender.dataset.recipe_warnings import recipe_warnings
-from vlcrender.dataset.summary import disk_use, size_text
+from vlcrender.dataset.format.frame_numbers import FrameNumbers
+from vlcrender.dataset.recipe.recipe import RecipeFile
+from vlcrender.dataset.recipe.recipe_warnings import recipe_warnings
+from vlcrender.dataset.run.dry_run import dry_run, file_counts
+from vlcrender.dataset.run.possible import MAX_POSES, check_possible, poses_to_check
+from vlcrender.dataset.format.summary import disk_use, size_text
 
 
 def summary(folder: Path) -> dict[str, object]:
@@ -119,7 +119,7 @@ def test_a_scaled_recipe_keeps_its_preset() -> None:
 def test_the_median_number_of_leds_is_numpys() -> None:
     from collections import Counter
 
-    from vlcrender.dataset.summary import _counts
+    from vlcrender.dataset.format.summary import _counts
 
     for numbers in ([3], [1, 2], [0, 0, 7], [5, 1, 1, 9], [2, 2, 2, 8, 9]):
         counts = _counts(Counter(numbers))
@@ -169,7 +169,7 @@ def test_a_thousand_of_many_poses_are_checked() -> None:
 
 def test_every_listed_place_is_checked_however_many(monkeypatch: pytest.MonkeyPatch) -> None:
     """One place in 5000 is in a wall, and none of the poses that are made before the first frame."""
-    monkeypatch.setattr("vlcrender.dataset.possible.MAX_POSES", 2)
+    monkeypatch.setattr("vlcrender.dataset.run.possible.MAX_POSES", 2)
     poses = [{"position_m": [2.0, 2.0, 1.0]}] * 5000
     poses[1234] = {"position_m": [2.0, 7.0, 1.0]}
     plan = vr.load_recipe(ROOT / "datasets/quickstart.toml", {"poses": {"kind": "list", "pose": poses}})
@@ -179,8 +179,8 @@ def test_every_listed_place_is_checked_however_many(monkeypatch: pytest.MonkeyPa
 
 def test_an_impossible_pose_among_many_stops_its_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Pose 1 of 3 is not checked before; its frame is refused by name, and the others are in the journal."""
-    monkeypatch.setattr("vlcrender.dataset.possible.MAX_POSES", 2)
-    from vlcrender.dataset import pose_sampling
+    monkeypatch.setattr("vlcrender.dataset.run.possible.MAX_POSES", 2)
+    from vlcrender.dataset.recipe import pose_sampling
 
     found = pose_sampling._aimed_pose
 
@@ -196,7 +196,7 @@ def test_an_impossible_pose_among_many_stops_its_frame(tmp_path: Path, monkeypat
 
 
 def test_numbers_that_are_not_known_leave_their_lines_out(rendered_set: Path, tmp_path: Path) -> None:
-    from vlcrender.dataset.summary import Summary, summary_lines
+    from vlcrender.dataset.format.summary import Summary, summary_lines
 
     found = Summary.model_validate(summary(copy_of(rendered_set, tmp_path / "set")))
     unknown = found.model_copy(update={"saturated_share": None, "brightest_e": None, "background_e": None})

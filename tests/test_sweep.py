@@ -16,11 +16,12 @@ from scipy import stats
 
 import vlcrender as vr
 from vlcrender.core.digest import sha256_of
-from vlcrender.dataset import files, frame_job
-from vlcrender.dataset.dependence import keyed_recipe
-from vlcrender.dataset.plan import load_plan
-from vlcrender.dataset.progress import Progress
-from vlcrender.dataset.sweep import SweepTable
+from vlcrender.dataset.format import files
+from vlcrender.dataset.recipe.dependence import keyed_recipe
+from vlcrender.dataset.recipe.plan import load_plan
+from vlcrender.dataset.recipe.sweep import SweepTable
+from vlcrender.dataset.run import frame_job
+from vlcrender.dataset.run.progress import Progress
 from vlcrender.errors import InputError
 
 QUICKSTART = ROOT / "datasets/quickstart.toml"

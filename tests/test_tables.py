@@ -9,8 +9,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from vlcrender.dataset import tables
-from vlcrender.dataset.schema import (
+from vlcrender.dataset.format import tables
+from vlcrender.dataset.format.schema import (
     FRAMES_SCHEMA,
     TRUTH_SCHEMA,
     DeviceTruthRow,
@@ -24,7 +24,7 @@ from vlcrender.dataset.schema import (
     arrow_schema,
     flat9,
 )
-from vlcrender.dataset.tables import read_table, write_table
+from vlcrender.dataset.format.tables import read_table, write_table
 from vlcrender.errors import InputError
 
 SPOT = [("led", pa.int64()), ("u_px", pa.float64()), ("v_px", pa.float64())]

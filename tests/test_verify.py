@@ -10,12 +10,12 @@ from conftest import ROOT, SMALL, sealed
 
 from vlcrender.camera.roi import RegionImage, Roi
 from vlcrender.core.digest import sha256_of
-from vlcrender.dataset.exr import write_exr
-from vlcrender.dataset.generate import generate
-from vlcrender.dataset.plan import load_plan
-from vlcrender.dataset.schema import FrameRow, TruthRow, flat9
-from vlcrender.dataset.tables import read_table, write_table
-from vlcrender.dataset.verify import verify
+from vlcrender.dataset.format.exr import write_exr
+from vlcrender.dataset.format.schema import FrameRow, TruthRow, flat9
+from vlcrender.dataset.format.tables import read_table, write_table
+from vlcrender.dataset.recipe.plan import load_plan
+from vlcrender.dataset.run.generate import generate
+from vlcrender.dataset.verify.verify import verify
 
 SENSOR = Roi(0, 0, 300, 400)
 

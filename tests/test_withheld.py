@@ -19,8 +19,8 @@ import estimator as est
 import vlcrender as vr
 from estimator.evaluate.submission import score_bundles, submit
 from estimator.io.estimates import EstimateRow, write_estimates
-from vlcrender.dataset.manifest import read_manifest, seal_dataset
-from vlcrender.dataset.progress import FRAMES_STAGE, Progress
+from vlcrender.dataset.format.manifest import read_manifest, seal_dataset
+from vlcrender.dataset.run.progress import FRAMES_STAGE, Progress
 from vlcrender.errors import InputError
 
 REGIONS = ("regions.kind=leds", "files.previews=1")

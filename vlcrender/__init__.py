@@ -33,10 +33,10 @@ if TYPE_CHECKING:
     from vlcrender.camera.intrinsics import Camera, Pose
     from vlcrender.camera.posed_camera import PosedCamera
     from vlcrender.camera.roi import LedRegions, Roi
-    from vlcrender.dataset.error_budget import BudgetRow, ErrorBudget
-    from vlcrender.dataset.plan import Plan
-    from vlcrender.dataset.progress import Progress
-    from vlcrender.dataset.recipe import Recipe
+    from vlcrender.dataset.recipe.plan import Plan
+    from vlcrender.dataset.recipe.recipe import Recipe
+    from vlcrender.dataset.run.progress import Progress
+    from vlcrender.dataset.world.error_budget import BudgetRow, ErrorBudget
     from vlcrender.errors import InputError
     from vlcrender.rendering.expected_image import ExpectedImage
     from vlcrender.scene.loader import Scene
@@ -59,12 +59,12 @@ _MODULES = {
     "ExpectedFrame": "vlcrender.api",
     "RawFrame": "vlcrender.api",
     "RawRegion": "vlcrender.api",
-    "BudgetRow": "vlcrender.dataset.error_budget",
-    "ErrorBudget": "vlcrender.dataset.error_budget",
-    "Progress": "vlcrender.dataset.progress",
+    "BudgetRow": "vlcrender.dataset.world.error_budget",
+    "ErrorBudget": "vlcrender.dataset.world.error_budget",
+    "Progress": "vlcrender.dataset.run.progress",
     "Scene": "vlcrender.scene.loader",
-    "Recipe": "vlcrender.dataset.recipe",
-    "Plan": "vlcrender.dataset.plan",
+    "Recipe": "vlcrender.dataset.recipe.recipe",
+    "Plan": "vlcrender.dataset.recipe.plan",
     "Camera": "vlcrender.camera.intrinsics",
     "Pose": "vlcrender.camera.intrinsics",
     "PosedCamera": "vlcrender.camera.posed_camera",

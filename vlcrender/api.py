@@ -25,11 +25,11 @@ from vlcrender.scene.loader import Scene
 from vlcrender.sensor.sensor import Sensor
 
 if TYPE_CHECKING:
-    from vlcrender.dataset.downlink_entry import Demodulation
-    from vlcrender.dataset.error_budget import ErrorBudget
-    from vlcrender.dataset.plan import Plan
-    from vlcrender.dataset.progress import ProgressCallback
-    from vlcrender.dataset.schema import SpotRow
+    from vlcrender.dataset.format.downlink_entry import Demodulation
+    from vlcrender.dataset.format.schema import SpotRow
+    from vlcrender.dataset.recipe.plan import Plan
+    from vlcrender.dataset.run.progress import ProgressCallback
+    from vlcrender.dataset.world.error_budget import ErrorBudget
     from vlcrender.rendering.bayer import MosaicRenderer
     from vlcrender.rendering.renderer import Renderer
     from vlcrender.sensor.accelerometer import Imu, TiltError
@@ -135,9 +135,9 @@ class RawFrame:
         region.
         """
         from vlcrender.camera.rig import mounted_cameras
-        from vlcrender.dataset.camera_entries import SensorEntry
-        from vlcrender.dataset.downlink_entry import downlink_entry
-        from vlcrender.dataset.schema import accelerometer_entry, camera_entry, led_map
+        from vlcrender.dataset.format.camera_entries import SensorEntry
+        from vlcrender.dataset.format.downlink_entry import downlink_entry
+        from vlcrender.dataset.format.schema import accelerometer_entry, camera_entry, led_map
 
         (mounted,) = mounted_cameras(self.camera, ())
         downlink = downlink_entry(self.scene.leds, self.demodulation)
@@ -182,7 +182,7 @@ def load_recipe(
     `--set`. With `scale` N, N x N pixels are binned into one; `scale_mode` says whether larger pixels keep all photons
     ("binned") or the exposure is shortened ("same-photons"). Raises InputError naming file, key and value.
     """
-    from vlcrender.dataset.plan import load_plan
+    from vlcrender.dataset.recipe.plan import load_plan
 
     return load_plan(find_file("recipe", name_or_path), _assignments(overrides), scale, scale_mode)
 
@@ -233,7 +233,7 @@ def expose(
     that is not allowed.
     """
     from vlcrender.core.random_keys import random_key, stream
-    from vlcrender.dataset.downlink import decoded_spots
+    from vlcrender.dataset.world.downlink import decoded_spots
     from vlcrender.sensor.accelerometer import TiltError
     from vlcrender.sensor.signal_chain import expose_regions
 
@@ -310,7 +310,7 @@ def generate(
     if workers < 1:
         raise InputError(f"workers = {workers}: has to be 1 or more")
     plan = _plan(recipe, overrides, scale, scale_mode)
-    from vlcrender.dataset.generate import generate as make  # loads Mitsuba: after the recipe is known to be good
+    from vlcrender.dataset.run.generate import generate as make  # loads Mitsuba: after the recipe is known to be good
 
     key_file = None if withhold_truth is None else Path(withhold_truth)
     return make(plan, Path(out), workers, scheduler, progress, key_file)
@@ -332,7 +332,7 @@ def budget(
     cost. `progress` is called with the numbers of finished and of all poses. Raises InputError for bad input, for a
     recipe with motion or without noise, and if no pose determines a position.
     """
-    from vlcrender.dataset.error_budget import error_budget
+    from vlcrender.dataset.world.error_budget import error_budget
 
     plan = _plan(recipe, overrides)
     return error_budget(plan, lambda: renderer_of(plan), poses, camera, bound, progress)
@@ -343,7 +343,7 @@ def verify(directory: str | Path) -> list[str]:
 
     Returns a line for each problem, or no line. Raises InputError if the folder has no readable dataset.json.
     """
-    from vlcrender.dataset.verify import verify as problems_of
+    from vlcrender.dataset.verify.verify import verify as problems_of
 
     return problems_of(Path(directory))
 
@@ -354,7 +354,7 @@ def release(directory: str | Path, key_file: str | Path) -> None:
     `key_file` is that of `generate(..., withhold_truth=...)`. Raises InputError if the dataset has its truth, the key
     is not its key, or the sealed truth is damaged.
     """
-    from vlcrender.dataset.withheld import release as write
+    from vlcrender.dataset.world.withheld import release as write
 
     write(Path(directory), Path(key_file))
 
@@ -368,7 +368,7 @@ def repair(directory: str | Path, *, scene_folder: str | Path | None = None, wor
     furniture. Returns a line for each file that was made again or could not be. Raises InputError if dataset.json is
     damaged, which alone says what the set is made of, or if files of the scene are not those of the set.
     """
-    from vlcrender.dataset.repair import repair as repaired  # loads Mitsuba
+    from vlcrender.dataset.run.repair import repair as repaired  # loads Mitsuba
 
     return repaired(Path(directory), None if scene_folder is None else Path(scene_folder), workers)
 

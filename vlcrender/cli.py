@@ -21,8 +21,8 @@ from vlcrender.report.report_command import report
 from vlcrender.report.show_command import show
 
 if TYPE_CHECKING:
-    from vlcrender.dataset.error_budget import ErrorBudget
-    from vlcrender.dataset.plan import Plan
+    from vlcrender.dataset.recipe.plan import Plan
+    from vlcrender.dataset.world.error_budget import ErrorBudget
     from vlcrender.emva1288.datasheet import Datasheet
 
 
@@ -83,14 +83,14 @@ def generate(
         Print what would be made, and estimates of time and size from a few frames; write nothing in the folder.
     """
     from vlcrender import api
-    from vlcrender.dataset.progress_display import ProgressDisplay
+    from vlcrender.dataset.run.progress_display import ProgressDisplay
 
     if workers < 1:
         raise InputError(f"--workers {workers}: has to be 1 or more")
     plan = api.load_recipe(recipe, set_, scale=scale, scale_mode=scale_mode)
     if dry_run:
         if withhold_truth is not None:
-            from vlcrender.dataset.withheld import check_withholdable
+            from vlcrender.dataset.world.withheld import check_withholdable
 
             check_withholdable(plan)
         _dry_run(plan, workers, out)
@@ -102,8 +102,8 @@ def generate(
     cells = "" if plan.cells is None else f"{len(plan.cells)} cells, "
     print(f"{out}: {cells}{plan.frame_count} frames{'' if made else ' (was already complete and intact)'}")
     if made and plan.cells is None:
-        from vlcrender.dataset.files import read_dataset_file
-        from vlcrender.dataset.summary import summary_lines
+        from vlcrender.dataset.format.files import read_dataset_file
+        from vlcrender.dataset.format.summary import summary_lines
 
         if (summary := read_dataset_file(out).summary) is not None:
             print(*summary_lines(summary), sep="\n")
@@ -111,9 +111,9 @@ def generate(
 
 def _dry_run(plan: "Plan", workers: int, out: Path) -> None:
     """Print what a plan would make in a folder."""
-    from vlcrender.dataset.dry_run import dry_run
-    from vlcrender.dataset.progress import Progress
-    from vlcrender.dataset.progress_display import ProgressDisplay
+    from vlcrender.dataset.run.dry_run import dry_run
+    from vlcrender.dataset.run.progress import Progress
+    from vlcrender.dataset.run.progress_display import ProgressDisplay
 
     with ProgressDisplay(plan.recipe.name, plan.frame_count) as display:
         found = dry_run(plan, workers, lambda stage, share: display.show(Progress(stage, share, 1.0)))
@@ -147,8 +147,8 @@ def verify(
         With --repair: processes that make frames.
     """
     from vlcrender import api
-    from vlcrender.dataset.files import read_dataset_file, read_sweep_file
-    from vlcrender.dataset.sweep import SWEEP_FILE
+    from vlcrender.dataset.format.files import read_dataset_file, read_sweep_file
+    from vlcrender.dataset.recipe.sweep import SWEEP_FILE
 
     if (directory / SWEEP_FILE).is_file():
         content, unchecked = f"{len(read_sweep_file(directory).cells)} cells", ""
@@ -346,7 +346,7 @@ def budget(
     else:
         _print_budget(found)
     if plot is not None:
-        from vlcrender.dataset.budget_plot import draw_budget
+        from vlcrender.dataset.world.budget_plot import draw_budget
 
         draw_budget(found, plot)
         if not json_:

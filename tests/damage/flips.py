@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 import vlcrender as vr
-from vlcrender.dataset.files import read_json_object
+from vlcrender.dataset.format.files import read_json_object
 from vlcrender.errors import InputError
 
 RECIPE = Path(__file__).parent.parent.parent / "datasets/quickstart.toml"

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from vlcrender.dataset.files import whole_file
+from vlcrender.dataset.format.files import whole_file
 from vlcrender.export.source import Source
 
 HUB_LICENCES = (

@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlcrender.core.digest import sha256_of
-from vlcrender.dataset.camera_entries import CameraEntry
-from vlcrender.dataset.files import read_dataset_file
-from vlcrender.dataset.frame_files import read_frame_parts
-from vlcrender.dataset.schema import DatasetFile, FrameRow, MapTruthRow, TruthRow, five
-from vlcrender.dataset.shard import parts_of_frame
-from vlcrender.dataset.sweep import SWEEP_FILE, sweep_columns
-from vlcrender.dataset.tables import read_table
+from vlcrender.dataset.format.camera_entries import CameraEntry
+from vlcrender.dataset.format.files import read_dataset_file
+from vlcrender.dataset.format.frame_files import read_frame_parts
+from vlcrender.dataset.format.schema import DatasetFile, FrameRow, MapTruthRow, TruthRow, five
+from vlcrender.dataset.format.shard import parts_of_frame
+from vlcrender.dataset.format.tables import read_table
+from vlcrender.dataset.recipe.sweep import SWEEP_FILE, sweep_columns
 from vlcrender.errors import InputError
 from vlcrender.export.conventions import Array, Five, Intrinsics
 

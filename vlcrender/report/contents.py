@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vlcrender.dataset.files import read_dataset_file
-from vlcrender.dataset.schema import DatasetFile, DeviceTruthRow, FrameRow, MapTruthRow, TruthRow
-from vlcrender.dataset.sweep import SWEEP_FILE, sweep_columns
-from vlcrender.dataset.tables import read_table
+from vlcrender.dataset.format.files import read_dataset_file
+from vlcrender.dataset.format.schema import DatasetFile, DeviceTruthRow, FrameRow, MapTruthRow, TruthRow
+from vlcrender.dataset.format.tables import read_table
+from vlcrender.dataset.recipe.sweep import SWEEP_FILE, sweep_columns
 from vlcrender.errors import InputError
 
 Floats = NDArray[np.float64]

@@ -15,7 +15,7 @@ def report(directory: Path, /, *, out: Path | None = None) -> None:
     out
         The page to write; by default the folder's name with -dataset.html in the current folder.
     """
-    from vlcrender.dataset.files import whole_file
+    from vlcrender.dataset.format.files import whole_file
     from vlcrender.report.page import page
 
     path = out or Path(f"{directory.resolve().name}-dataset.html")

@@ -54,9 +54,9 @@ def show(
 
     from vlcrender.camera.intrinsics import Camera
     from vlcrender.config.packaged import find_file, is_recipe
-    from vlcrender.dataset.plan import load_plan
-    from vlcrender.dataset.progress import Progress
-    from vlcrender.dataset.progress_display import ProgressDisplay
+    from vlcrender.dataset.recipe.plan import load_plan
+    from vlcrender.dataset.run.progress import Progress
+    from vlcrender.dataset.run.progress_display import ProgressDisplay
     from vlcrender.scene.loader import load_scene
     from vlcrender.scene.visibility import ENOUGH_LEDS, level_visibility, tilted_visibility
 
@@ -111,7 +111,7 @@ def show(
 
         draw(loaded, camera, path, reference, light)
     else:
-        from vlcrender.dataset.recipe_plot import draw_frame
+        from vlcrender.dataset.run.recipe_plot import draw_frame
 
         print(draw_frame(plan, frame, path))
     print(f"{path}: written")

@@ -1,0 +1,1 @@
+"""Runs that make datasets: frames, workers, resuming, repair."""

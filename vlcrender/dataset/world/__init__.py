@@ -1,0 +1,1 @@
+"""True cameras, LEDs and instruments behind the told ones, their views, and the bounds of both."""
