@@ -14,11 +14,11 @@ import vlcrender as vr
 from vlcrender.config.presets import with_presets
 from vlcrender.config.toml_model import check, read_toml
 from vlcrender.dataset.format.frame_numbers import FrameNumbers
+from vlcrender.dataset.format.summary import disk_use, size_text
 from vlcrender.dataset.recipe.recipe import RecipeFile
 from vlcrender.dataset.recipe.recipe_warnings import recipe_warnings
 from vlcrender.dataset.run.dry_run import dry_run, file_counts
 from vlcrender.dataset.run.possible import MAX_POSES, check_possible, poses_to_check
-from vlcrender.dataset.format.summary import disk_use, size_text
 
 
 def summary(folder: Path) -> dict[str, object]:

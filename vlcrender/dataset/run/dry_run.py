@@ -12,12 +12,12 @@ from pathlib import Path
 
 from vlcrender.dataset.format.files import EXPECTED, FRAMES, PREVIEWS, PROCESSED
 from vlcrender.dataset.format.schema import FrameRecord
+from vlcrender.dataset.format.summary import disk_use, size_text
 from vlcrender.dataset.recipe.plan import Plan
 from vlcrender.dataset.recipe.recipe import Recipe
 from vlcrender.dataset.run.frame_job import Job, make_frame
 from vlcrender.dataset.run.possible import check_possible
 from vlcrender.dataset.run.progress import duration_text
-from vlcrender.dataset.format.summary import disk_use, size_text
 from vlcrender.light.lightmap import bake
 
 TIMED_FRAMES = 3

@@ -38,13 +38,13 @@ from vlcrender.dataset.format.schema import (
     map_datum_entry,
 )
 from vlcrender.dataset.format.shard import incomplete
+from vlcrender.dataset.format.summary import summary_of
 from vlcrender.dataset.format.tables import write_table
 from vlcrender.dataset.format.withheld_entry import Withheld
 from vlcrender.dataset.recipe.file_settings import FilesEntry
 from vlcrender.dataset.recipe.plan import Plan
 from vlcrender.dataset.recipe.recipe import Recipe
 from vlcrender.dataset.run.frame_job import Job
-from vlcrender.dataset.format.summary import summary_of
 from vlcrender.dataset.verify.verify import verify
 from vlcrender.dataset.world.truth_tables import write_truth
 from vlcrender.dataset.world.withheld import Seal, same_file_times

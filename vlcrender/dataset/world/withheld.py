@@ -23,11 +23,11 @@ from vlcrender.dataset.format.frame_numbers import Summary
 from vlcrender.dataset.format.lock import LOCK, locked
 from vlcrender.dataset.format.manifest import DATASET_FILE, frames_per_file, manifest_of_files, write_sealed
 from vlcrender.dataset.format.schema import DatasetFile, TruthRow
+from vlcrender.dataset.format.summary import disk_use
 from vlcrender.dataset.format.tables import write_table
 from vlcrender.dataset.format.withheld_entry import Withheld
 from vlcrender.dataset.recipe.plan import Plan
 from vlcrender.dataset.recipe.pose_sampling import AimedPoses
-from vlcrender.dataset.format.summary import disk_use
 from vlcrender.dataset.world.truth_tables import TRUTH, TRUTH_TABLES, write_truth
 from vlcrender.errors import InputError
 from vlcrender.sensor.accelerometer import Imu
