@@ -19,7 +19,7 @@ DOCS = Path(__file__).parent
 PAGE = DOCS / "tutorial_hall.md"
 PICTURE = DOCS / "pictures/tutorial_hall.png"
 BLOCK = re.compile(r'^```(toml title="(?P<name>[^"]+)"|sh|text)\n(?P<body>.*?)^```$', re.MULTILINE | re.DOTALL)
-COLUMNS = 100
+COLUMNS = 80
 UNSTEADY = re.compile(r"disk use")
 """Lines whose figures depend on versions of libraries: they are left out."""
 
