@@ -168,7 +168,7 @@ def test_the_saturation_of_an_adc_agrees_with_random_draws(rng: np.random.Genera
 
 
 def test_the_error_of_the_saturation_is_how_far_a_variance_may_pass_for_the_largest() -> None:
-    """6400 pixels know a variance to sqrt(2 / 6400), a difference of two to 1 / 40: four of these are 10 %. The error is
+    """6400 pixels know a variance to sqrt(2 / 6400), a difference of two to 1 / 40: four are 10 %. The error is
     a fourth of the way to where a well of Poisson numbers has lost 10 % of its largest variance, to half a level.
     """
     sensor = Sensor(**{**FULL, "prnu": 0.0, "dsnu_e": 0.0, "read_noise_e": 0.0, "adc_noise_dn": 0.0})
@@ -367,8 +367,8 @@ def test_the_grids_of_the_plots_fill_their_frames(full: Datasheet) -> None:
 
 
 def test_a_curve_below_the_plot_begins_at_its_lower_border(full: Datasheet) -> None:
-    """60 e of read noise: one photon has a signal-to-noise ratio of 0.01, where the plot begins at 0.1. The first of 200
-    points that is shown is at most one step of the curve above the border: at these ratios as many decades up as across.
+    """60 e of read noise: one photon has a signal-to-noise ratio of 0.01, where the plot begins: 0.1. The first of 200
+    points that is shown is at most one step of the curve above the border: there as many decades up as across.
     """
     noisy = dataclasses.replace(full, sensor=Sensor(**{**FULL, "read_noise_e": 60.0}))
     plot = page(noisy).split("<svg")[2]

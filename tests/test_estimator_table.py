@@ -268,7 +268,7 @@ def test_json_has_null_where_a_value_is_infinite(plain: Path) -> None:
 
 
 def test_json_with_a_number_that_json_has_not_is_refused() -> None:
-    """"NaN" in a file would be read by Python alone. A statistic that there is not is null; a setting is a number."""
+    """ "NaN" in a file would be read by Python alone. A statistic that there is not is null; a setting is a number."""
     made = Table("error_3d_m", ("sigma",), (), (), (TableRow((Key(float("nan")),), (), 1, 1, (), {}),))
     with pytest.raises(ValueError, match="JSON"):
         table_json(made)
