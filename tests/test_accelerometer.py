@@ -241,3 +241,10 @@ def test_a_part_in_a_dataset(tmp_path: Path) -> None:
         assert device["accelerometer_m_s2"] == pytest.approx(alone)
         assert np.abs(np.subtract(device["accelerometer_m_s2"], pose.rotation @ [0, 0, G])).max() > 0.01
     assert read_dataset_file(tmp_path / "set").accelerometer.error_deg == plan.recipe.accelerometer.error_deg
+
+
+def test_an_offset_is_the_device_s_own_normal_numbers_times_its_size() -> None:
+    """Of the device's stream, with their sign: another release reads the same accelerations. Rounded to half a step."""
+    numbers = stream(3, 0, "imu bias").standard_normal(3)
+    reading = read(Imu(**FINE, bias_m_s2=0.2, serial=3))
+    assert np.abs(reading - [0.0, 0.0, G] - 0.2 * numbers).max() <= 0.5 * STEP + 1e-14

@@ -5,6 +5,7 @@ encoding, its output, and arguments as bytes.
 """
 
 import json
+import logging
 import os
 import re
 import subprocess
@@ -14,6 +15,8 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 from conftest import ROOT, SMALL, Finished, copy_of, run
+
+from vlcrender.cli import _log_on_stderr
 
 RECIPE = str(ROOT / "datasets/quickstart.toml")
 TABLE1 = str(ROOT / "scenes/table1.toml")
@@ -247,6 +250,15 @@ def test_messages_with_line_breaks_are_one_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_warnings_of_any_package_are_lines_on_stderr_while_a_command_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    """And no longer: a second command in the same process would show them twice."""
+    with _log_on_stderr():
+        logging.getLogger("another.package").warning("no cache:\n%s", "folder")
+        logging.getLogger("another.package").info("not shown")
+    logging.getLogger("another.package").warning("after")
+    assert capsys.readouterr().err == "vlcrender: no cache: folder\n"
+
+
 def test_a_folder_whose_name_is_not_utf_8_is_refused(tmp_path: Path) -> None:
     out = os.fsencode(tmp_path) + b"/x\xff"
     assert_refused(script("vlcrender", "generate", RECIPE, "--out", out, *SETS), "--out", "UTF-8")

@@ -167,6 +167,19 @@ def test_the_saturation_of_an_adc_agrees_with_random_draws(rng: np.random.Genera
     assert abs(levels[int(np.argmax(draws.var(axis=0)))] - best) <= 4 * error < 500
 
 
+def test_the_error_of_the_saturation_is_how_far_a_variance_may_pass_for_the_largest() -> None:
+    """6400 pixels know a variance to sqrt(2 / 6400), a difference of two to 1 / 40: four are 10 %. The error is
+    a fourth of the way to where a well of Poisson numbers has lost 10 % of its largest variance, to half a level.
+    """
+    sensor = Sensor(**{**FULL, "prnu": 0.0, "dsnu_e": 0.0, "read_noise_e": 0.0, "adc_noise_dn": 0.0})
+    levels = np.linspace(0.7, 1.0, 601) * 5500
+    variances = clipped(levels, np.sqrt(levels), 5500)[1]
+    far = levels[variances >= 0.9 * variances.max()]
+    best, error = saturation_e(sensor, 0.0, levels, 6400)
+    assert best == pytest.approx(levels[np.argmax(variances)], abs=levels[1] - levels[0])
+    assert error == pytest.approx(np.abs(far - best).max() / 4, abs=(levels[1] - levels[0]) / 2 / 4)
+
+
 @pytest.mark.parametrize("z", [-1.0, 0.0, 0.7, 3.0])
 def test_clipped_normal_moments_agree_with_random_draws(z: float, rng: np.random.Generator) -> None:
     """Mean and variance of a million, each to 5 standard errors from the draws' own moments."""
@@ -351,6 +364,22 @@ def test_the_grids_of_the_plots_fill_their_frames(full: Datasheet) -> None:
             assert places[:, 0].max() <= WIDTH - RIGHT
             assert places[:, 1].min() >= TOP
             assert places[:, 1].max() <= HEIGHT - BOTTOM
+
+
+def test_a_curve_below_the_plot_begins_at_its_lower_border(full: Datasheet) -> None:
+    """60 e of read noise: one photon has a signal-to-noise ratio of 0.01, where the plot begins: 0.1. The first of 200
+    points that is shown is at most one step of the curve above the border: there as many decades up as across.
+    """
+    noisy = dataclasses.replace(full, sensor=Sensor(**{**FULL, "read_noise_e": 60.0}))
+    plot = page(noisy).split("<svg")[2]
+    curve, limit = (
+        np.array([place.split(",") for place in re.findall(f'class="{kind}" d="M([^"]*)"', plot)[0].split()], float)
+        for kind in ("set", "limit")
+    )
+    assert len(limit) == 200
+    # The limit is the root of the photons: half as many decades up as across.
+    step_px = 2 * np.abs(np.diff(limit[:, 1])).mean()
+    assert 0 <= HEIGHT - BOTTOM - curve[0, 1] <= step_px + 0.1  # places have one decimal
 
 
 def test_the_text_of_the_page_is_the_data_sheet(full: Datasheet) -> None:

@@ -14,7 +14,7 @@ import estimator
 from estimator.cli import main
 from estimator.io.estimates import EstimateRow, write_estimates
 from estimator.methods.catalogue import OWN, VARIANTS
-from estimator.report.terminal import fitting
+from estimator.report.terminal import fitting, print_table
 
 
 @pytest.fixture(scope="module")
@@ -85,6 +85,13 @@ def test_a_table_is_split_where_the_terminal_is_narrow() -> None:
     assert fitting(headers, rows, 37) == [[0, 1, 2, 3], [0, 4]]
     assert fitting(headers, rows, 24) == [[0, 1, 2], [0, 3, 4]]
     assert fitting(headers, rows, 5) == [[0, 1, 2], [0, 3], [0, 4]]
+
+
+def test_a_table_is_followed_by_its_note_as_written(capsys: pytest.CaptureFixture[str]) -> None:
+    print_table("errors", ["variant", "p50"], [["a", "1.25"]], "p50: median [m]; of 3 frames")
+    printed = " ".join(capsys.readouterr().out.split())  # a note longer than the table has several lines
+    assert "1.25" in printed
+    assert printed.endswith("p50: median [m]; of 3 frames")
 
 
 def test_score_prints_json(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:

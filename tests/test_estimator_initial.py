@@ -10,7 +10,7 @@ from test_estimator_maximum_likelihood import SIX, TARGET, frame_of, misread, mo
 from estimator.camera.pose import Pose
 from estimator.io.device import DeviceFrame
 from estimator.pixels.initial import gravity_of, start_at_spots
-from estimator.pixels.nuisances import NO_COMPONENTS, Priors
+from estimator.pixels.nuisances import NO_COMPONENTS, PROFILE, Priors
 from estimator.spots.correspondences import find_correspondences
 
 DIM_VIEW = view_of(TARGET, 3.0, 25.0, -15.0, 30.0, size=(320, 240, 1500.0))
@@ -66,3 +66,19 @@ def test_the_start_accounts_for_the_eccentricity_of_large_faces() -> None:
     priors = Priors.of(frame, tuple(frame.leds.values()))
     start = start_at_spots(frame, gravity_of(frame), priors, find_correspondences(frame), away, NO_COMPONENTS)
     assert np.abs(start.pose.position_m - view.position_m).max() < 0.2e-3
+
+
+def test_a_gradient_of_luminance_moves_a_spot_as_a_shift_of_its_led_does() -> None:
+    """Luminance 1 + g x / r over a disc of radius r has its centroid at g r / 4: gradients of sigma 0.05 are shifts of
+    0.05 r / 4, 0.125 mm, and the spots' pose is as uncertain by either, but for the light.s centre, some 1e-5 here.
+    """
+    frame = with_exact_camera(dim_frames()[0])
+    radius_m = 0.01
+    covariances = []
+    for columns, sigma in ((PROFILE, 0.05), (slice(0, 3), 0.05 * radius_m / 4)):
+        priors = Priors.of(frame, tuple(frame.leds.values()))
+        priors.leds[:, columns][:, :2] = sigma
+        truth = Pose(np.array(DIM_VIEW.position_m), DIM_VIEW.R_cam_world)
+        start = start_at_spots(frame, gravity_of(frame), priors, find_correspondences(frame), truth, NO_COMPONENTS)
+        covariances.append(start.covariance)
+    np.testing.assert_allclose(covariances[1], covariances[0], rtol=1e-3)

@@ -11,14 +11,25 @@ import pyarrow.parquet as pq
 import pytest
 from conftest import copy_of
 from downlink_signals import Sent, balanced_codes, remainder
-from estimator_synthetic import FRAMES_SCHEMA, TRUTH_SCHEMA, grid, poisson, render, view_of, write_dataset, write_exr
+from estimator_synthetic import (
+    FRAMES_SCHEMA,
+    TRUTH_SCHEMA,
+    description,
+    grid,
+    poisson,
+    render,
+    view_of,
+    write_dataset,
+    write_exr,
+)
 
 import estimator as est
 from estimator.errors import EstimationFailure, InputError
 from estimator.evaluate.batch import bursts, estimate_dataset
-from estimator.evaluate.identities import score_identities
+from estimator.evaluate.identities import _Frame, score_identities
+from estimator.io.camera import Camera
 from estimator.io.device import DeviceFrame
-from estimator.io.truth import read_true_map, read_truth
+from estimator.io.truth import TrueLed, TruthRow, read_true_map, read_truth
 from estimator.methods.catalogue import VARIANTS
 from estimator.methods.maximum_likelihood import ml
 from estimator.methods.variant import DeviceMethod, Estimate, Variant
@@ -313,3 +324,21 @@ def test_scores_tell_wrong_from_rejected_from_missed(by_codes: Path, by_packets:
     unseen = [row.model_copy(update={"identities": None}) for row in rows]
     assert score_identities(unseen, truth, dataset, ()) is None
     assert len(read_true_map(by_packets / "truth_map.parquet")) == 12
+
+
+@pytest.mark.parametrize("yaw_deg", [0.0, 3.75, 7.5, 11.25, 15.0])
+def test_an_led_image_spans_its_diameter_of_lines_however_the_camera_is_turned(yaw_deg: float) -> None:
+    """A disc of 80 mm, 3 m above a level camera of 1500 px: 80 lines. Points every 15 deg miss its top by 7.5 deg at
+    most, a share of 1 - cos(7.5 deg) of the radius.
+    """
+    view = view_of(CENTRE_M, 3.0, 0.0, 0.0, yaw_deg, size=(800, 600, 1500.0))
+    described = description(view, 1, LEDS_M, RADIUS_M)
+    camera = Camera.model_validate_json(json.dumps(described["cameras"]["main"]))
+    truth = TruthRow(
+        **{"frame": 0, "position_m": view.position_m, "bound_m2": None, "bound_exact_m2": None, "map": 0, "leds": ()},
+        R_cam_world=tuple(view.R_cam_world.ravel().tolist()),
+    )
+    led = TrueLed(led=1, u_px=400.0, v_px=300.0, bits=None, visible_fraction=1.0)
+    lines, distance_m, tilt_deg = _Frame(truth, camera, {1: (np.array(CENTRE_M), RADIUS_M)}).geometry(led)
+    assert 80 * np.cos(np.radians(7.5)) - 1e-9 <= lines <= 80 + 1e-9
+    assert (distance_m, tilt_deg) == (pytest.approx(3.0), pytest.approx(0.0, abs=1e-6))

@@ -2,15 +2,17 @@
 
 import numpy as np
 import pytest
-from estimator_synthetic import Array
-from test_estimator_likelihood import drawn, gathered, true_pose
+from estimator_synthetic import Array, poisson, render, view_of
+from test_estimator_likelihood import SIX, TARGET, drawn, gathered, true_pose
+from test_estimator_maximum_likelihood import frame_of
 
+from estimator.camera.pose import Pose
 from estimator.pixels import search
 from estimator.pixels.initial import gravity_of
 from estimator.pixels.led_model import RenderedLeds
 from estimator.pixels.led_pixels import LedPixels
 from estimator.pixels.likelihood import Noise, PhotometricFit, fit_photometry, score
-from estimator.pixels.nuisances import NO_COMPONENTS, Nuisances, Priors, Solution
+from estimator.pixels.nuisances import NO_COMPONENTS, SIZE, Nuisances, Priors, Solution
 from estimator.pixels.search import ScoringResult, Search, step_factor, unexplained
 
 
@@ -70,6 +72,44 @@ def test_a_step_is_by_amplitudes_and_background_at_its_own_pose(
     expected = fit_photometry(pixels, rendered, used, Noise.of(frame))
     np.testing.assert_array_equal(photometry.amplitude, expected.amplitude)
     np.testing.assert_array_equal(photometry.background, expected.background)
+
+
+def test_the_hold_on_the_start_is_gone_at_the_maximum() -> None:
+    """Steps that are short are right, and each holds the next one less: the search ends where it ends without a hold,
+    to the tenth of a standard deviation at which it is converged.
+    """
+    frame = drawn(4000.0, 3)
+    pose = true_pose(frame)
+    pixels, priors = gathered(frame, pose), Priors.of(frame, tuple(frame.leds.values()))
+    used, zero = np.ones(len(pixels.leds), dtype=bool), Nuisances.zero(priors)
+
+    def searched(information: Array, damping: float) -> ScoringResult:
+        made = Search(frame, pixels, gravity_of(frame), priors, information, damping)
+        return made.run(used, pose, zero, NO_COMPONENTS)
+
+    free = searched(np.eye(6), 0.0)
+    held = searched(free.solution.information, 1.0)
+    assert held.converged
+    assert held.damping == 0.0
+    moved_m = held.pose.position_m - free.pose.position_m
+    assert moved_m @ np.linalg.solve(free.solution.covariance[:3, :3], moved_m) < 0.1**2
+
+
+def test_a_background_makes_the_size_of_a_small_image_uncertain() -> None:
+    """Edges displaced by 0.02 px times the background's share: of discs of 10 mm, 3 m above a level camera of 1500 px,
+    5 px in radius, wherever in the image. The map is level and so is the camera: rounding alone differs.
+    """
+    view = view_of(TARGET, 3.0, 0.0, 0.0, 30.0)
+    image = poisson(render(view, SIX, 0.01, 4000.0, samples=8), 1)
+    frame = frame_of(view, SIX, image.astype(np.uint32))
+    pose = Pose(np.array(view.position_m), view.R_cam_world)
+    pixels, priors = gathered(frame, pose), Priors.of(frame, tuple(frame.leds.values()))
+    made = Search(frame, pixels, gravity_of(frame), priors, np.eye(6), 0.0)
+    photometry = fit_photometry(pixels, pixels.rendered, np.ones(6, dtype=bool), Noise.of(frame))
+    radius_px = 5 * np.sqrt(np.pi / 2)  # to the vertices of a square of the same area, which stand for the rim
+    share = np.array([(photometry.background / photometry.amplitude)[pixels.led == k].max() for k in range(6)])
+    sizes = made._with_edge_errors(photometry).leds[:, SIZE]
+    np.testing.assert_allclose(sizes, np.hypot(priors.leds[:, SIZE], 0.02 * share / radius_px), rtol=1e-6)
 
 
 def result_of(excess: Array, used: Array, faint: Array) -> ScoringResult:

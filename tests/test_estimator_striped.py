@@ -8,9 +8,11 @@ from striped_images import Array, code, coverage, gains, readout
 from estimator.spots.glow import _isophote
 from estimator.spots.led_light import Readout
 from estimator.spots.line_edges import LineEdges
+from estimator.spots.line_profile import profile_of
 from estimator.spots.outlines import EdgeEllipse, EdgeParallelogram
 from estimator.spots.parallelogram_fit import _Ends, _TurnedModel
 from estimator.spots.striped import Lamp, find_lamps
+from estimator.spots.striped_blobs import BlobLight, StripedBlob, TurnedRegion
 
 ROW_US, EXPOSURE_US, CHIP_US = 10.0, 40.0, 25.0
 STRIPE_PX = (4 * CHIP_US + EXPOSURE_US) / ROW_US
@@ -245,3 +247,36 @@ def test_turned_squares_are_first_tried_in_the_middle_of_their_edges() -> None:
     edges = LineEdges(lines, 57.0 - half, 57.0 + half, np.full(20, 0.01), np.full(20, 1000.0), 0.0)
     starts = _TurnedModel.starts(edges, _Ends(10.0, 30.0, 2.0))
     assert [one.start[:2].tolist() for one in starts] == [pytest.approx([57.0, 20.0], abs=1e-9)] * 2
+
+
+def test_a_band_within_a_lamp_without_edges_has_the_lamp_s_level() -> None:
+    """Half the chord of 32 px: the 16 columns from 22 to 38, none more."""
+    rows, columns = 40, 60
+    one, light = np.ones((rows, columns), dtype=bool), np.full((rows, columns), 100.0)
+    blob = StripedBlob(0, 0, columns, rows, one, ~one, rows * columns)
+    turned = TurnedRegion(0, 0, light.astype(np.float32), ~one, 0.0, 0.0)
+    outline = EdgeEllipse(x0=30.0, y0=20.0, slope=0.0, half_chord=16.0, half_extent=15.0)
+    profile, level_e = profile_of(turned, blob, BlobLight(light, light, one, np.zeros(rows)), outline, uniform=False)
+    assert profile is not None
+    assert profile.level_e == pytest.approx(np.full(rows, 100.0), rel=1e-12)
+    assert level_e == pytest.approx(100.0, rel=1e-12)
+
+
+@pytest.mark.parametrize("pairs", [slice(None), slice(None, None, -1)], ids=["steep first", "flat first"])
+@pytest.mark.parametrize(("degrees", "lines", "fits"), [(3.0, 2.1, False), (30.0, 20.0, True)])
+def test_a_turned_square_needs_lines_that_each_pair_of_sides_bounds(
+    degrees: float, lines: float, fits: bool, pairs: slice
+) -> None:
+    """A square of 40 px turned by an angle has 40 sin(angle) lines at each end whose edge is a flat side: both ends
+    together need seven, and four are too few. So it is whichever pair of sides stands first.
+    """
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    assert 40 * s == pytest.approx(lines, abs=0.05)
+    sides = np.array([(c, s), (-s, c)])[pairs] / 20
+    top = np.arange(np.floor(50 - 20 * (c + s)), np.ceil(50 + 20 * (c + s)))
+    left, right = EdgeParallelogram(57.0, 50.0, ((c / 20, s / 20), (-s / 20, c / 20))).edges(top)
+    lit = right > left
+    edges = LineEdges(top[lit], left[lit], right[lit], np.full(lit.sum(), 0.01), np.full(lit.sum(), 1000.0), 0.0)
+    start = np.array([57.0, 50.0, *sides.ravel()])
+    found = _TurnedModel(edges, _Ends(top[lit][0], top[lit][-1] + 1, 2.0), start).fit()
+    assert (found is not None) == fits

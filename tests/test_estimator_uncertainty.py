@@ -228,6 +228,8 @@ def test_a_camera_as_sold_moves_the_corner_by_so_many_micrometres() -> None:
         assert moved_um == pytest.approx(AS_SOLD["decentering_um"], rel=1e-12)
     fish_eye = assumed_uncertainty(of.model_copy(update={"projection": "equidistant"}))
     assert not fish_eye.device_sigmas()[4:].any()
+    # What is sold is a camera: its place on the rig is none of it; gravity keeps the accelerometer's error alone.
+    assert (fish_eye.offset_sigma_m, fish_eye.rotation_sigma_deg) == (0.0, 0.0)
 
 
 def test_another_camera_leaves_the_map_as_it_is() -> None:

@@ -261,13 +261,20 @@ def test_an_led_of_a_moving_camera_is_where_its_own_line_sees_it(
     at_rest = Renderer(sending).expected_image(PosedCamera(camera, POSE))
     still = {patch.led_id: patch.center_px for patch in at_rest.patches}
     speed = -1500 * np.radians(20.0)
-    compared = 0
+    compared = whole = 0
     for patch in image.patches:
         (u, v), (u0, v0) = patch.center_px, still[patch.led_id]
         lines = {"down": v - 150, "up": 150 - v, "right": u - 200, "left": 200 - u}[direction]
         assert u - u0 == pytest.approx(speed * lines * 100e-6, abs=0.01 * abs(speed * lines * 100e-6) + 1e-4)
         assert v - v0 == pytest.approx(0, abs=0.1)
         compared += abs(u - u0) > 0.5
+        # Whole at rest and 8 px from the border, as far as images move within the readout: whole in all lines.
+        (top, left), (rows, columns) = (patch.row, patch.column), patch.electrons_per_s.shape
+        if min(top, left, 300 - top - rows, 400 - left - columns) > 8:
+            assert patch.visible_fraction == pytest.approx(1, abs=1e-6)
+            assert patch.imaged_fraction == pytest.approx(1, abs=1e-6)
+            whole += 1
+    assert whole >= 2
     assert compared >= 2
 
 

@@ -202,7 +202,7 @@ def _hypotheses(places: Floats, offsets: Floats, pitch_m: float) -> tuple[Ints, 
     apart = np.linalg.norm(offsets[:, None] - offsets, axis=2)
     own = distance[first, second]
     found: dict[tuple[int, ...], Ints] = {}
-    for one, other in np.argwhere((apart > 0) & (np.abs(apart - own) <= PAIR * np.maximum(apart, own))):
+    for one, other in np.argwhere(np.abs(apart - own) <= PAIR * np.maximum(apart, own)):
         indices = _laid(places, offsets, (first, second), (int(one), int(other)), PLACE * pitch_m)
         if indices is not None:
             found.setdefault(tuple(indices.tolist()), indices)

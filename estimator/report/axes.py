@@ -43,13 +43,10 @@ class Axis:
 
     def share(self, value: float) -> float:
         """Place of a value along the axis, 0 to 1; what lies outside is at the nearer end."""
+        inside = min(max(value, self.low), self.high)
         if self.logarithmic:
-            if value <= self.low:
-                return 0.0
-            found = math.log(value / self.low) / math.log(self.high / self.low) if value < self.high else 1.0
-        else:
-            found = (min(value, self.high) - self.low) / (self.high - self.low)
-        return min(max(found, 0.0), 1.0)
+            return math.log(inside / self.low) / math.log(self.high / self.low)
+        return (inside - self.low) / (self.high - self.low)
 
     def labels(self) -> list[float]:
         """Values to label: 1, 2 and 5 times powers of ten; of a logarithmic axis as many as fit, of texts all."""

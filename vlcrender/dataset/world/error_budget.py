@@ -25,7 +25,7 @@ from vlcrender.dataset.world.true_world import tilt_sigmas_deg
 from vlcrender.errors import InputError
 from vlcrender.rendering.bayer import MosaicRenderer
 from vlcrender.rendering.crlb import FrameSlopes
-from vlcrender.rendering.renderer import Renderer, check_inside
+from vlcrender.rendering.renderer import Renderer
 from vlcrender.rendering.spot_errors import ACCELEROMETER, NOISE, SpotErrors
 from vlcrender.rendering.uncertainty import Uncertainty
 from vlcrender.sensor.signal_chain import variance_e2
@@ -230,7 +230,6 @@ def spot_errors_at(
     recipe, scene = plan.recipe, plan.scene
     main = pose_of_frame(recipe.poses, number, recipe.seed, recipe.camera, scene)
     at = mounted.posed(main)
-    check_inside(scene, at.pose)
     view = renderer.expected_image(at, recipe.regions)
     exposure_s = recipe.time_s(view)
     tilts = tilt_sigmas_deg(recipe, main)
