@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from vlcrender.config.presets import KINDS, presets
+from vlcrender.config.presets import KINDS, PHONES, presets
 from vlcrender.dataset.recipe.pose_file import PoseFile
 from vlcrender.dataset.recipe.recipe import RecipeFile
 from vlcrender.scene.led_map_file import LedMapFile
@@ -101,6 +101,11 @@ def recipe_schema() -> Schema:
     of_camera = _preset("camera")
     of_camera["description"] += " It is whole: the sensor's preset is in it. Under [camera] alone, not in a rig."
     tables["Camera"]["properties"] = {"preset": of_camera, **CALIBRATION, **tables["Camera"]["properties"]}
+    of_phone = {"enum": list(presets(PHONES)), "type": "string"}
+    of_phone["description"] = (
+        "A whole phone: camera, shutter, sensor and accelerometer; the recipe's keys override its."
+    )
+    tree["properties"] = properties = {**properties, "preset": of_phone}
     tables["PoseFile"] = PoseFile.model_json_schema()
     properties["poses"]["oneOf"].append({"$ref": "#/$defs/PoseFile"})
     properties["poses"]["discriminator"]["mapping"]["file"] = "#/$defs/PoseFile"
@@ -284,6 +289,7 @@ def page() -> str:
             text += "| key | type | default | range | unit | description |\n| --- | --- | --- | --- | --- | --- |\n"
             text += "".join(f"| {' | '.join(row)} |\n" for row in table.rows)
     text += "\n## Presets\n"
+    text += f"\n`preset = ...` at the top: {', '.join(f'`{name}`' for name in presets(PHONES))}\n"
     for table, folder in KINDS.items():
         text += f"\n`[{table}] preset = ...`: {', '.join(f'`{name}`' for name in presets(folder))}\n"
     return text

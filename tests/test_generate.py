@@ -428,7 +428,7 @@ def test_a_lost_preview_or_expected_image_is_found(made: Path, tmp_path: Path) -
 def test_a_frame_whose_preview_was_lost_is_made_again(made: Path, tmp_path: Path) -> None:
     """An unfinished run goes on: a journal of all three frames, and one preview gone."""
     generate(small_plan("expected=true"), tmp_path / "set")
-    lines = [_line(record).decode() for record in records_of(tmp_path / "set")]
+    lines = [_line(record, None).decode() for record in records_of(tmp_path / "set")]
     provenance = json.loads((tmp_path / "set/dataset.json").read_text())["provenance"]
     (tmp_path / "set/dataset.json").unlink()
     (tmp_path / "set/plan.json").write_text(json.dumps({"provenance": provenance}))

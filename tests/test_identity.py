@@ -217,7 +217,7 @@ def test_each_changed_byte_of_a_line_is_noticed(half: Path) -> None:
     line = (half / "journal.jsonl").read_bytes().splitlines(keepends=True)[0]
     assert _record_of(line, None) is not None
     for place in range(0, len(line), 7):
-        assert _record_of(line[:place] + bytes([line[place] ^ 4]) + line[place + 1 :]) is None
+        assert _record_of(line[:place] + bytes([line[place] ^ 4]) + line[place + 1 :], None) is None
 
 
 def test_files_are_on_the_disk_before_their_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

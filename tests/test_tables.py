@@ -50,6 +50,7 @@ def test_the_columns_are_those_of_the_format() -> None:
         "gyro_rad_s": pa.list_(pa.float64(), 3),
         "spots": pa.list_(pa.struct(SPOT)),
         "split": pa.string(),
+        "time_s": pa.float64(),
     }
     assert pa.schema(list(expected.items())).equals(FRAMES_SCHEMA)
     expected = {

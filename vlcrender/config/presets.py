@@ -2,7 +2,8 @@
 
 A preset is a TOML file `preset_files/KIND/NAME.toml` beside this module: a partial recipe with the source of each
 number. `preset = "NAME"` in the table of its kind, in a recipe or with --set, inserts the file's tables. A preset of a
-camera is whole: a lens, and a sensor by the name of its preset.
+camera is whole: a lens, and a sensor by the name of its preset. `preset = "NAME"` at the top of a recipe is a phone:
+camera, shutter, sensor and accelerometer.
 """
 
 from collections.abc import Iterable, Mapping
@@ -15,12 +16,16 @@ from vlcrender.errors import InputError
 FOLDER = Path(__file__).parent / "preset_files"
 KINDS = {"camera": "cameras", "sensor": "sensors", "accelerometer": "accelerometers", "belief": "beliefs"}
 """Folder of the presets, by table of a recipe. Cameras come first: they name presets of sensors."""
+PHONES = "phones"
+"""Folder of the presets at the top of a recipe."""
+PHONE_TABLES = ("camera", "sensor", "accelerometer")
+"""Tables of a recipe that a phone named by an assignment replaces."""
 NOT_OF_PRESETS = {"belief": ("devices", "maps", "stated_factor")}
 """Keys of a recipe's table that its presets leave alone, and that stay where an assignment names another preset."""
 
 
 def presets(kind: str) -> tuple[str, ...]:
-    """Names of the presets of a kind, "cameras", "sensors", "accelerometers" or "beliefs", sorted."""
+    """Names of the presets of a kind, "cameras", "sensors", "accelerometers", "beliefs" or "phones", sorted."""
     return tuple(sorted(path.stem for path in (FOLDER / kind).glob("*.toml")))
 
 
@@ -49,8 +54,9 @@ def resolved(
     """
     given = list(assignments)
     chosen = {key: [a for a in given if a.partition("=")[0].strip() == f"{key}.preset"] for key in KINDS}
-    tree = dict(tree)
     names: dict[str, str] = {}
+    phones = [assignment for assignment in given if assignment.partition("=")[0].strip() == "preset"]
+    tree = _with_phone(dict(tree), phones, source, how)
     for key, kind in KINDS.items():
         table = tree.get(key)
         if isinstance(table, dict) and "preset" in table:
@@ -64,8 +70,20 @@ def resolved(
             replaced = named if key == "camera" else (key,)
             # No key of another preset remains.
             tree = _merged({**tree, **{table: _kept(tree, table) for table in replaced}}, named)
-    rest = [a for a in given if not any(a in of_key for of_key in chosen.values())]
+    rest = [a for a in given if not any(a in of_key for of_key in (phones, *chosen.values()))]
     return override(tree, rest, how), names
+
+
+def _with_phone(tree: dict[str, Any], assignments: list[str], source: str, how: str) -> dict[str, Any]:
+    """A recipe's tree with the phone that its key `preset` names, or the last assignment, which replaces its tables."""
+    name = tree.pop("preset", None)
+    for assignment in assignments:
+        name = override({}, [assignment], how)["preset"]
+    if name is None:
+        return tree
+    phone = _named(PHONES, "", name, source)
+    own = {key: value for key, value in tree.items() if key not in PHONE_TABLES} if assignments else tree
+    return _merged(phone, own)
 
 
 def _kept(tree: Mapping[str, Any], key: str) -> dict[str, Any]:
@@ -78,7 +96,7 @@ def _named(kind: str, key: str, name: object, source: str) -> dict[str, Any]:
     try:
         return preset(kind, str(name))
     except InputError as error:
-        raise InputError(f"{source}: {key}.{error}") from None
+        raise InputError(f"{source}: {key and key + '.'}{error}") from None
 
 
 def _merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:

@@ -206,8 +206,7 @@ class Unfinished:
         prepare_folder(self._directory, wanted, "an unfinished dataset of another recipe, scene or version")
         for name in [FRAMES, *extra_folders(recipe.expected, recipe.processed is not None, recipe.files)]:
             (self._directory / name).mkdir(exist_ok=True)
-        for leftover in self._directory.rglob("*.partial"):
-            leftover.unlink()
+        self._remove_partial()
         self._places = _journal(self._directory, recipe, self.seal)
 
     def missing(self, frames: range) -> list[int]:
@@ -235,12 +234,18 @@ class Unfinished:
         assert self._places is not None
         plan = self.plan()
         self._check_scene(plan)
+        self._remove_partial()  # of workers that were killed in this run
         records = partial(_recorded, self._directory / JOURNAL, self._places, self.seal)
         write_dataset(plan, self._directory, records, self.seal)
         (self._directory / PLAN).unlink()
         (self._directory / JOURNAL).unlink()
         if self.seal is not None:
             same_file_times(self._directory)
+
+    def _remove_partial(self) -> None:
+        """Remove files that were not written to their end."""
+        for leftover in self._directory.rglob("*.partial"):
+            leftover.unlink(missing_ok=True)
 
     def _check_scene(self, plan: Plan) -> None:
         """Raise InputError where a plan has another scene than the job: its file was changed and read again."""
