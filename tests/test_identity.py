@@ -14,7 +14,8 @@ from PIL import Image
 import vlcrender as vr
 from vlcrender.core.program import program_sha256
 from vlcrender.dataset.run.frame_job import Job, make_frames
-from vlcrender.dataset.run.unfinished import _record_of
+from vlcrender.dataset.run.unfinished import _line, _record_of
+from vlcrender.dataset.world.withheld import Seal
 from vlcrender.scene.scene_files import scene_sources
 
 CUBE = "v 3 3 0\nv 4 3 0\nv 4 4 0\nv 3 4 0\nv 3 3 {h}\nv 4 3 {h}\nv 4 4 {h}\nv 3 4 {h}\n" + "".join(
@@ -215,9 +216,14 @@ def test_a_damaged_unfinished_set_is_finished_as_if_nothing_had_happened(
 
 def test_each_changed_byte_of_a_line_is_noticed(half: Path) -> None:
     line = (half / "journal.jsonl").read_bytes().splitlines(keepends=True)[0]
-    assert _record_of(line, None) is not None
-    for place in range(0, len(line), 7):
-        assert _record_of(line[:place] + bytes([line[place] ^ 4]) + line[place + 1 :], None) is None
+    record = _record_of(line, None)
+    assert record is not None
+    for seal in (None, Seal(bytes(32))):
+        line = _line(record, seal)
+        assert _record_of(line, seal) == record
+        for place in range(0, len(line), 7):
+            assert _record_of(line[:place] + bytes([line[place] ^ 4]) + line[place + 1 :], seal) is None
+        assert _record_of(line[:-9], seal) is None
 
 
 def test_files_are_on_the_disk_before_their_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

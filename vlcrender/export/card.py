@@ -30,7 +30,7 @@ def card(source: Source) -> str:
     """The card: front matter in YAML, then Markdown."""
     dataset = source.dataset
     recipe = dataset.provenance.get("recipe", {})
-    description = recipe.get("description") or "Rendered images of ceiling LEDs with ground truth."
+    description = recipe.get("description") or "Rendered images of ceiling LEDs."
     size = next((name for limit, name in SIZES if dataset.frame_count < limit), "n>1M")
     head = ["---", f"pretty_name: {json.dumps(dataset.name)}", *_licence_lines(dataset.licence)]
     head += ["size_categories:", f"- {json.dumps(size)}", "tags:"]

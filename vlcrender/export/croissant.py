@@ -71,7 +71,7 @@ def metadata(source: Source, folder: Path) -> dict[str, Any]:
         "@type": "sc:Dataset",
         "conformsTo": "http://mlcommons.org/croissant/1.0",
         "name": dataset.name,
-        "description": recipe.get("description") or "Rendered images of ceiling LEDs with ground truth.",
+        "description": recipe.get("description") or "Rendered images of ceiling LEDs.",
         "version": f"{dataset.version}.0.0",
         "keywords": ["visible light positioning", "synthetic", "camera"],
         "distribution": [

@@ -60,9 +60,10 @@ class Contents:
 
     def gravity_errors_deg(self) -> Floats:
         """Angles between readings of the accelerometer and the true vertical, degrees; none without readings."""
-        found = []
-        for frame, row in zip(self.frames, self.truth, strict=False):
-            if frame.accelerometer_m_s2 is not None:
+        frames, found = {frame.frame: frame for frame in self.frames}, []
+        for row in self.truth:  # where some is withheld, not of every frame
+            frame = frames.get(row.frame)
+            if frame is not None and frame.accelerometer_m_s2 is not None:
                 reading, up = np.array(frame.accelerometer_m_s2), np.array(row.R_cam_world).reshape(3, 3)[:, 2]
                 found.append(np.degrees(np.arctan2(np.linalg.norm(np.cross(reading, up)), reading @ up)))
         return np.array(found)

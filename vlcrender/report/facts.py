@@ -39,8 +39,9 @@ def sentence(contents: Contents) -> str:
     places = len(np.unique(np.round(contents.positions_m(), 6), axis=0))
     leds = [len(row.leds) for row in contents.truth]
     tilt = np.degrees(np.arccos(np.clip(contents.axes()[:, 2], -1, 1))).max()
+    told = f"{count} frames" if len(leds) == count else f"{count} frames, of which {len(leds)} have their truth here,"
     return (
-        f"{count} frames from {places} {'place' if places == 1 else 'places'} in the scene "
+        f"{told} from {places} {'place' if places == 1 else 'places'} in the scene "
         f"{_scene(contents).get('name', 'unknown')}. Half of them show {int(np.median(leds))} LEDs or more, the barest "
         f"{min(leds)}; tilts of the optical axis reach {tilt:.0f}°."
     )

@@ -104,7 +104,6 @@ def _preview(path: Path, contents: Contents) -> Preview:
     encoded = io.BytesIO()
     small.save(encoded, "WEBP", quality=QUALITY)
     text = f"frame {frame}"
-    if frame < len(contents.truth):
-        row = contents.truth[frame]
+    if (row := next((row for row in contents.truth if row.frame == frame), None)) is not None:
         text += f" · {len(row.leds)} LEDs · {np.degrees(np.arccos(np.clip(row.R_cam_world[8], -1, 1))):.0f}°"
     return Preview(base64.b64encode(encoded.getvalue()).decode(), frame, text)
