@@ -14,6 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from conftest import ROOT, SMALL, copy_of, run, small_plan, unchanged
+from PIL import Image
 
 import estimator as est
 import vlcrender as vr
@@ -22,6 +23,8 @@ from estimator.io.estimates import EstimateRow, write_estimates
 from vlcrender.dataset.format.manifest import read_manifest, seal_dataset
 from vlcrender.dataset.run.progress import FRAMES_STAGE, Progress
 from vlcrender.errors import InputError
+from vlcrender.report.contents import Contents
+from vlcrender.report.page import page
 
 REGIONS = ("regions.kind=leds", "files.previews=1")
 SPLIT = ("split.block_m=0.5", "split.train=0.5", "split.validation=0.0", "split.test=0.5", "poses.count=6")
@@ -379,3 +382,20 @@ def test_entrants_score_training_frames_without_a_key(partly: Path, key: Path, t
         assert [row.frame for row in entry.score.rows] == [n for n, own in enumerate(splits) if own == split]
     with pytest.raises(est.InputError, match="has no validation frame"):
         score_bundles([bundle], sealed, None, "validation")
+
+
+def test_the_page_of_a_set_shows_the_poses_of_the_frames_that_have_them(partly: Path, tmp_path: Path) -> None:
+    """Rows of the truth belong to their frames, whatever is withheld between them."""
+    folder = copy_of(partly, tmp_path / "set")
+    (folder / "previews").mkdir(exist_ok=True)
+    for frame in range(6):
+        Image.new("L", (8, 6)).save(folder / f"previews/{frame:06d}.png")
+    rows = {row.frame: row for row in Contents.read(folder).truth}
+    html = page(folder)
+    assert 0 < len(rows) < 6
+    for frame in range(6):
+        assert (f"frame {frame} ·" in html) == (frame in rows)
+    for frame, row in rows.items():
+        tilt_deg = np.degrees(np.arccos(row.R_cam_world[8]))
+        assert f"frame {frame} · {len(row.leds)} LEDs · {tilt_deg:.0f}°" in html
+    assert f"6 frames, of which {len(rows)} have their truth here" in html
