@@ -337,6 +337,9 @@ def test_an_led_image_spans_its_diameter_of_lines_however_the_camera_is_turned(y
     truth = TruthRow(
         **{"frame": 0, "position_m": view.position_m, "bound_m2": None, "bound_exact_m2": None, "map": 0, "leds": ()},
         R_cam_world=tuple(view.R_cam_world.ravel().tolist()),
+        tilt_x_deg=0.0,
+        tilt_y_deg=0.0,
+        yaw_deg=0.0,
     )
     led = TrueLed(led=1, u_px=400.0, v_px=300.0, bits=None, visible_fraction=1.0)
     lines, distance_m, tilt_deg = _Frame(truth, camera, {1: (np.array(CENTRE_M), RADIUS_M)}).geometry(led)

@@ -13,6 +13,7 @@ from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.config.toml_model import check, read_toml
 from vlcrender.core.random_keys import stream
+from vlcrender.dataset.recipe import pose_sampling
 from vlcrender.dataset.recipe.plan import load_plan
 from vlcrender.dataset.recipe.pose_sampling import (
     AimedPoses,
@@ -22,7 +23,6 @@ from vlcrender.dataset.recipe.pose_sampling import (
     TiltGridPoses,
     pose_of_frame,
 )
-from vlcrender.dataset.recipe.recipe import pose_sampling
 from vlcrender.errors import InputError
 from vlcrender.scene.loader import Scene, build_scene
 from vlcrender.scene.schema import SceneSettings

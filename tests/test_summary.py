@@ -180,7 +180,7 @@ def test_every_listed_place_is_checked_however_many(monkeypatch: pytest.MonkeyPa
 def test_an_impossible_pose_among_many_stops_its_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Pose 1 of 3 is not checked before; its frame is refused by name, and the others are in the journal."""
     monkeypatch.setattr("vlcrender.dataset.run.possible.MAX_POSES", 2)
-    from vlcrender.dataset.recipe.recipe import pose_sampling
+    from vlcrender.dataset.recipe import pose_sampling
 
     found = pose_sampling._aimed_pose
 
