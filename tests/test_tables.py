@@ -8,7 +8,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from conftest import copy_of
 
+from estimator.errors import InputError as ReaderError
+from estimator.io.dataset import read_dataset
 from vlcrender.dataset.format import tables
 from vlcrender.dataset.format.schema import (
     FRAMES_SCHEMA,
@@ -224,3 +227,18 @@ def test_a_table_of_several_groups_holds_all_rows_in_order(
     write_table(tmp_path / "truth.parquet", iter(rows), TruthRow)
     assert read_table(tmp_path / "truth.parquet", TruthRow) == rows
     assert pq.ParquetFile(tmp_path / "truth.parquet").num_row_groups == (count + 1) // 2
+
+
+def test_a_text_that_is_no_utf_8_is_refused_in_one_line(rendered_set: Path, tmp_path: Path) -> None:
+    """As a flipped bit makes it: Parquet's own checks do not look at texts."""
+    table = pq.read_table(rendered_set / "frames.parquet")
+    cameras = pa.array([b"ma\xedn"] * len(table), pa.binary()).view(pa.string())
+    path = tmp_path / "frames.parquet"
+    pq.write_table(table.set_column(table.schema.names.index("camera"), "camera", cameras), path)
+    with pytest.raises(InputError, match=r"frames\.parquet: cannot be read as Parquet: .*utf-8") as refusal:
+        read_table(path, FrameRow)
+    assert "\n" not in str(refusal.value)
+    copy_of(rendered_set, tmp_path / "set")
+    (tmp_path / "set/frames.parquet").write_bytes(path.read_bytes())
+    with pytest.raises(ReaderError, match=r"frames\.parquet"):
+        read_dataset(tmp_path / "set")

@@ -68,8 +68,12 @@ def read_table(path: Path, model: type[R], constants: Constants | None = None) -
     if different:
         raise InputError(f"{path}: columns differ from FORMAT.md: {', '.join(different)}")
     names = [field.name for field in schema if field.name in table.schema.names]
+    try:
+        all_cells = table.select(names).to_pylist()
+    except (pa.ArrowException, ValueError) as error:  # a text that is no UTF-8, for one
+        raise InputError(f"{path}: cannot be read as Parquet: {first_line(str(error))}") from None
     rows: list[R] = []
-    for number, cells in enumerate(table.select(names).to_pylist()):
+    for number, cells in enumerate(all_cells):
         row = {name: _known(cell, schema.field(name).type) for name, cell in cells.items()}
         for name, value in constants.items():
             if (found := row.pop(name)) != value:
