@@ -144,6 +144,17 @@ def test_show_refuses(tmp_path: Path) -> None:
     assert_refused(run("vlcrender", "show", TABLE1, "--out", "no/such/x.png", cwd=tmp_path), "no/such")
 
 
+def test_show_refuses_a_hall_whose_light_would_take_long(tmp_path: Path) -> None:
+    """By hand: 700 x 700 x 12 m have 1 013 600 m2, at 0.25 m some 16 million points; 1 225 LEDs on 1e10 / 1 225 points
+    need a texel of sqrt(1 013 600 * 1 225 / 1e10) = 0.352 m.
+    """
+    text = (ROOT / "scenes/office.toml").read_text()
+    assert text.count("size_m = [7.0, 7.0, 3.5]") == 1
+    (tmp_path / "hall.toml").write_text(text.replace("size_m = [7.0, 7.0, 3.5]", "size_m = [700.0, 700.0, 12.0]"))
+    refused = run("vlcrender", "show", "hall.toml", cwd=tmp_path)
+    assert_refused(refused, "hall.toml: bake.texel_m = 0.25: light of 1225 LEDs on 16 million points", "0.4 m or more")
+
+
 def test_show_draws_a_frame_of_a_recipe_with_its_camera_in_any_scene(tmp_path: Path) -> None:
     """Coarse, to be quick. By hand: 4.8 x 3.6 mm at 14.4 mm, 2 atan(1/6) = 18.92 and 2 atan(1/8) = 14.25 deg."""
     small = ["--set", "camera.width_px=200", "--set", "camera.height_px=150", "--set", "camera.pixel_pitch_um=24"]

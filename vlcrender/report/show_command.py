@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+MAX_PAIRS = 1e10
+"""Pairs of an LED and a lit point up to which the light of a room is computed for a picture: a minute or two."""
 HEIGHTS_M = (0.0, 0.75)
 """Heights of the poses that are counted: on the floor and on a table."""
 
@@ -82,6 +84,7 @@ def show(
         raise InputError(f"{what}: is a scene; --set and --frame need a recipe")
     else:
         loaded = load_scene(find_file("scene", what))
+    _check_cost(loaded, shown)
     camera = Camera() if plan is None else plan.recipe.camera
     across, down = camera.view_angles_deg()
     table = Table(
@@ -115,6 +118,18 @@ def show(
 
         print(draw_frame(plan, frame, path))
     print(f"{path}: written")
+
+
+def _check_cost(scene: "Scene", source: str) -> None:
+    """Raise InputError where the room's light would take much longer than a picture is worth."""
+    x_m, y_m, z_m = scene.room_m.tolist()
+    area_m2, leds, texel_m = 2 * (x_m * y_m + (x_m + y_m) * z_m), len(scene.leds), scene.settings.bake.texel_m
+    if area_m2 / texel_m**2 * leds > MAX_PAIRS:
+        enough_m = math.ceil(10 * math.sqrt(area_m2 * leds / MAX_PAIRS)) / 10
+        raise InputError(
+            f"{source}: bake.texel_m = {texel_m:g}: light of {leds} LEDs on {area_m2 / texel_m**2 / 1e6:.0f} million "
+            f"points takes many minutes; {enough_m:g} m or more is drawn at once"
+        )
 
 
 def print_flicker(scene: "Scene") -> None:
