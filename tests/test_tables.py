@@ -238,7 +238,13 @@ def test_a_text_that_is_no_utf_8_is_refused_in_one_line(rendered_set: Path, tmp_
     with pytest.raises(InputError, match=r"frames\.parquet: cannot be read as Parquet: .*utf-8") as refusal:
         read_table(path, FrameRow)
     assert "\n" not in str(refusal.value)
+    # The name of a column that may be missing, in the schema: the first of its places.
+    flipped = (rendered_set / "frames.parquet").read_bytes().replace(b"split", b"sp\xedit", 1)
+    path.write_bytes(flipped)
+    with pytest.raises(InputError, match=r"frames\.parquet: c") as refusal:
+        read_table(path, FrameRow)
+    assert "\n" not in str(refusal.value)
     copy_of(rendered_set, tmp_path / "set")
-    (tmp_path / "set/frames.parquet").write_bytes(path.read_bytes())
+    (tmp_path / "set/frames.parquet").write_bytes(flipped)
     with pytest.raises(ReaderError, match=r"frames\.parquet"):
         read_dataset(tmp_path / "set")

@@ -50,6 +50,7 @@ def read_table(path: Path, model: type[R], constants: Constants | None = None) -
         raise InputError(f"{path}: is missing")
     try:
         table = pq.read_table(path)
+        there = set(table.schema.names)  # decodes them
     except (pa.ArrowException, OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read as Parquet: {first_line(str(error))}") from None
     schema = _schema(model, constants)
@@ -67,7 +68,7 @@ def read_table(path: Path, model: type[R], constants: Constants | None = None) -
                 different.append(f"{field.name}: {kind}, needed {field.type}")
     if different:
         raise InputError(f"{path}: columns differ from FORMAT.md: {', '.join(different)}")
-    names = [field.name for field in schema if field.name in table.schema.names]
+    names = [field.name for field in schema if field.name in there]
     try:
         all_cells = table.select(names).to_pylist()
     except (pa.ArrowException, ValueError) as error:  # a text that is no UTF-8, for one
