@@ -7,9 +7,11 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 from conftest import ROOT, SMALL, copy_of, run, small_plan
@@ -205,3 +207,19 @@ def test_generate_holds_the_lock_until_it_ends(tmp_path: Path) -> None:
     assert not (tmp_path / "set" / FILE).exists()
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.parametrize("of", LOCKS.values(), ids=LOCKS)
+def test_a_holder_that_has_not_written_its_name_yet_is_named(of: ModuleType, tmp_path: Path) -> None:
+    """It does so just after it has the lock: a run that is refused meanwhile looks again."""
+    path = tmp_path / FILE
+    path.write_text("")
+    text = json.dumps({"command": "x", "pid": 1, "host": "h", "since": "t"})
+    timer = threading.Timer(0.05, lambda: path.write_text(text))
+    timer.start()
+    try:
+        assert of._holder(path) == "`x`, process 1 on h since t"
+    finally:
+        timer.join()
+    path.write_text("{")
+    assert of._holder(path) == "another run"

@@ -13,6 +13,7 @@ import json
 import logging
 import os
 import socket
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import datetime
@@ -26,6 +27,8 @@ LOCK = ".vlcrender.lock"
 """File of a folder that a run holds; no part of the dataset."""
 ATTEMPTS = 1000
 """Largest number of times that a lock's file is opened again because its last holder has removed it."""
+LOOKS, LOOK_S = 20, 0.01
+"""Times that a holder's name is looked for, and the seconds between."""
 
 
 @contextmanager
@@ -126,12 +129,14 @@ def _write_holder(descriptor: int, command: str) -> None:
 
 
 def _holder(path: Path) -> str:
-    """Who holds a lock, for a message."""
-    try:
-        tree = json.loads(path.read_text(encoding="utf-8"))
-        return f"`{tree['command']}`, process {tree['pid']} on {tree['host']} since {tree['since']}"
-    except (OSError, ValueError, KeyError, TypeError):
-        return "another run"
+    """Who holds a lock, for a message. The holder writes its name just after it has the lock."""
+    for _ in range(LOOKS):
+        try:
+            tree = json.loads(path.read_text(encoding="utf-8"))
+            return f"`{tree['command']}`, process {tree['pid']} on {tree['host']} since {tree['since']}"
+        except (OSError, ValueError, KeyError, TypeError):
+            time.sleep(LOOK_S)
+    return "another run"
 
 
 def _remove(path: Path, descriptor: int) -> None:
