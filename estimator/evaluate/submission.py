@@ -160,7 +160,7 @@ def read_bundle(path: Path) -> Bundle:
                 files[one.variant] = data
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
-    except (zipfile.BadZipFile, zlib.error, OSError, RuntimeError, NotImplementedError, EOFError) as error:
+    except (zipfile.BadZipFile, zlib.error, OSError, RuntimeError, EOFError) as error:
         raise InputError(f"{path}: not a readable bundle ({first_line(error)})") from None
     return Bundle(str(path), description, files)
 
