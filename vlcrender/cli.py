@@ -270,18 +270,15 @@ def datasheet(
 
 
 def _print_datasheet(name: str, sheet: "Datasheet") -> None:
-    from rich.console import Console
-    from rich.table import Table
-
     from vlcrender.emva1288.datasheet import cells
+    from vlcrender.report.terminal import print_table
 
-    table = Table(title=f"{name}: {'; '.join(sheet.conditions)}")
-    for heading in ("", "", "set", "measured", "tolerance", "", ""):
-        table.add_column(heading, justify="right" if heading else "left")
+    rows = []
     for row in sheet.rows:
         set_text, measured, tolerance, verdict = cells(row)
-        table.add_row(row.key, row.name, set_text, measured, tolerance and f"± {tolerance}", row.unit, verdict)
-    Console(width=max(Console().width, 100)).print(table)
+        rows.append((row.key, row.name, verdict, set_text, measured, tolerance and f"± {tolerance}", row.unit))
+    title = f"{name}: {'; '.join(sheet.conditions)}"
+    print_table(title, ("", "", "", "set", "measured", "tolerance", ""), rows, left=3)
 
 
 @app.command
@@ -353,33 +350,35 @@ def budget(
             print(f"{plot}: written")
 
 
-def _print_budget(found: "ErrorBudget") -> None:
-    from rich.console import Console
-    from rich.table import Table
+def _mm(length_mm: float) -> str:
+    return "< 0.001" if length_mm < 0.001 else f"{length_mm:.3g}"
 
-    table = Table(
-        title=f"{found.recipe}, camera {found.camera}: error of the position, mm, rms over {found.poses} poses "
-        f"(median {found.median_leds:g} LEDs of {found.median_luminaires:g} luminaires)"
-    )
-    for heading in ("unknown", "sigma"):
-        table.add_column(heading)
-    for heading in ("horizontal", "vertical", "in space", "share", "if exact", "trusting"):
-        table.add_column(heading, justify="right")
+
+def _print_budget(found: "ErrorBudget") -> None:
+    from vlcrender.report.terminal import print_table
+
     variance = found.total.total_mm**2
+    rows: list[tuple[str, ...]] = []
     for row in found.rows:
-        own = [f"{x:.4g}" for x in (row.share.horizontal_mm, row.share.vertical_mm, row.share.total_mm)]
+        own = [_mm(x) for x in (row.share.horizontal_mm, row.share.vertical_mm, row.share.total_mm)]
         share = f"{100 * row.share.total_mm**2 / variance:.1f} %"
-        exact = "" if row.exact_mm is None else f"{row.exact_mm:.4g}"
-        table.add_row(row.name, row.sigma, *own, share, exact, f"{row.trusting.total_mm:.4g}")
-    table.add_section()
+        exact = "" if row.exact_mm is None else _mm(row.exact_mm)
+        rows.append((row.name, row.sigma, *own, share, exact, _mm(row.trusting.total_mm)))
+    rows.append(())
     for name, sums, trusting in (
-        ("all", found.total, f"{found.trusting_total.total_mm:.4g}"),
+        ("all", found.total, _mm(found.trusting_total.total_mm)),
         ("bound", found.bound, ""),
     ):
         if sums is not None:
-            own = [f"{x:.4g}" for x in (sums.horizontal_mm, sums.vertical_mm, sums.total_mm)]
-            table.add_row(name, "", *own, "", "", trusting)
-    Console(width=max(Console().width, 130)).print(table)
+            own = [_mm(x) for x in (sums.horizontal_mm, sums.vertical_mm, sums.total_mm)]
+            rows.append((name, "", *own, "", "", trusting))
+    print_table(
+        f"{found.recipe}, camera {found.camera}: error of the position, mm, rms over {found.poses} poses "
+        f"(median {found.median_leds:g} LEDs of {found.median_luminaires:g} luminaires)",
+        ("unknown", "sigma", "horizontal", "vertical", "in space", "share", "if exact", "trusting"),
+        rows,
+        left=2,
+    )
     print("if exact: the error in space without that unknown. trusting: an estimator that takes lens and map as exact.")
     if found.undetermined:
         print(f"{found.undetermined} further poses do not determine a position and are left out")

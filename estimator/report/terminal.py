@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 
+from rich import box
 from rich.cells import cell_len
 from rich.console import Console
 from rich.markup import escape
@@ -72,7 +73,7 @@ def fitting(headers: Sequence[str], rows: Sequence[Sequence[str]], width: int) -
 
 
 def _table(title: str, headers: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
-    table = Table(title=escape(title) if title else None, title_justify="left")
+    table = Table(title=escape(title) if title else None, title_justify="left", box=box.SIMPLE_HEAD, show_edge=False)
     for column, header in enumerate(headers):
         table.add_column(header, justify="right" if column else "left", no_wrap=column == 0)
     for row in rows:

@@ -32,6 +32,8 @@ WHITE_E = 4000.0
 """Electrons that are drawn white."""
 DISC_CORNERS = 16
 """Corners of a disc's outline on the plan."""
+LABEL_ROOM = 0.05
+"""Share of the image at each edge in which the identity of an LED is written on the side that has room."""
 DRAWN_PX = 1000
 """Width to which an image is reduced, about."""
 
@@ -104,7 +106,8 @@ def draw_view(
     figure = Figure(figsize=(14, 6.2), layout="constrained")
     plan, image = figure.subplots(1, 2, width_ratios=[1, 1.25])
     faces = _draw_plan(plan, scene, posed, positions_m)
-    figure.colorbar(faces, ax=plan, label="LED luminance, cd/m$^2$", shrink=0.8)
+    if np.ptp(scene.leds.luminances_cd_m2) > 0:
+        figure.colorbar(faces, ax=plan, label="LED luminance, cd/m$^2$", location="bottom", aspect=40)
     _draw_image(image, posed.camera, regions, places_px)
     image.set_title(title)
     figure.savefig(path, dpi=110)
@@ -143,6 +146,8 @@ def _draw_plan(axes: Axes, scene: Scene, posed: PosedCamera, positions_m: NDArra
     axes.set_aspect("equal")
     others = "" if positions_m is None else f"; green: {len(positions_m)} poses"
     count = f"{len(leds)} LED{'s' * (len(leds) != 1)}"
+    if np.ptp(leds.luminances_cd_m2) == 0:
+        count += f" of {leds.luminances_cd_m2[0]:g} cd/m$^2$"
     title = f"{scene.name}: {x_m:g} x {y_m:g} x {z_m:g} m,\n{count} seen from below; blue: the image{others}"
     axes.set_title(title)
     return faces
@@ -199,14 +204,17 @@ def _draw_image(
         )
     axes.set(xlim=(0, camera.width_px), ylim=(camera.height_px, 0), xlabel="u, px", ylabel="v, px")
     axes.set_aspect("equal")
+    beside = LABEL_ROOM * camera.width_px
     for led_id, (u, v) in places_px.items():
+        below = v < LABEL_ROOM * camera.height_px
         axes.annotate(
             str(led_id),
             (u, v),
-            xytext=(0, 9),
+            xytext=(0, -9 if below else 9),
             textcoords="offset points",
             color="orange",
-            ha="center",
+            ha="left" if u < beside else "right" if u > camera.width_px - beside else "center",
+            va="top" if below else "bottom",
             fontsize=7,
             annotation_clip=True,
         )

@@ -51,14 +51,12 @@ def show(
     reference
         Render the view of a scene alone with Mitsuba's own path integrator: slow, coarse, noisy, and independent.
     """
-    from rich.console import Console
-    from rich.table import Table
-
     from vlcrender.camera.intrinsics import Camera
     from vlcrender.config.packaged import find_file, is_recipe
     from vlcrender.dataset.recipe.plan import load_plan
     from vlcrender.dataset.run.progress import Progress
     from vlcrender.dataset.run.progress_display import ProgressDisplay
+    from vlcrender.report.terminal import print_table
     from vlcrender.scene.loader import load_scene
     from vlcrender.scene.visibility import ENOUGH_LEDS, level_visibility, tilted_visibility
 
@@ -87,14 +85,7 @@ def show(
     _check_cost(loaded, shown)
     camera = Camera() if plan is None else plan.recipe.camera
     across, down = camera.view_angles_deg()
-    table = Table(
-        title=f"{loaded.name}: poses that see {ENOUGH_LEDS} LEDs or more ({across:.2f} x {down:.2f} deg view)"
-    )
-    table.add_column("height, m", justify="right")
-    table.add_column("attitude")
-    table.add_column("poses", justify="right")
-    table.add_column("see enough", justify="right")
-    table.add_column("share", justify="right")
+    rows = []
     for height in HEIGHTS_M:
         for visibility in (
             level_visibility(camera, loaded, height, 0.0),
@@ -102,8 +93,12 @@ def show(
             tilted_visibility(camera, loaded, height),
         ):
             share = f"{100 * visibility.share:.2f} %"
-            table.add_row(f"{height:g}", visibility.attitude, str(visibility.poses), str(visibility.seen), share)
-    Console(width=max(Console().width, 100)).print(table)
+            rows.append((visibility.attitude, f"{height:g}", str(visibility.poses), share))
+    print_table(
+        f"{loaded.name}: poses that see {ENOUGH_LEDS} LEDs or more, by a view of {across:.4g} x {down:.4g} deg",
+        ("attitude", "height, m", "poses", "share"),
+        rows,
+    )
     print_flicker(loaded)
     from vlcrender.light.lightmap import bake  # loads Mitsuba: after scene and recipe are known to be good
 
@@ -134,17 +129,13 @@ def _check_cost(scene: "Scene", source: str) -> None:
 
 def print_flicker(scene: "Scene") -> None:
     """Print how much the LEDs of a scene flicker, and warn where that exceeds low risk; nothing for steady light."""
-    from rich.console import Console
-    from rich.table import Table
-
     from vlcrender.modulation.flicker import flicker_of, flicker_warning
+    from vlcrender.report.terminal import print_table
 
     found = flicker_of(scene.leds.transmitters)
     if not found:
         return
-    table = Table(title=f"{scene.name}: flicker against IEEE 1789, worst line of the spectra of all LEDs")
-    for heading in ("sends", "LEDs", "limit", "modulation", "at", "allowed", "of limit", "LEDs beyond"):
-        table.add_column(heading, justify="left" if heading in ("sends", "limit") else "right")
+    rows = []
     for one in found:
         for name, line, beyond in (
             ("low risk", one.worst.low_risk, one.low_risk_exceeded),
@@ -152,8 +143,13 @@ def print_flicker(scene: "Scene") -> None:
         ):
             allowed = "any" if math.isinf(line.limit_percent) else f"{line.limit_percent:.3g} %"
             own = [f"{line.percent:.3g} %", f"{line.frequency_hz:.5g} Hz", allowed, f"{line.share:.2f}", str(beyond)]
-            table.add_row(one.send, str(one.leds), name, *own)
-    Console(width=max(Console().width, 100)).print(table)
+            rows.append((one.send, name, str(one.leds), *own))
+    print_table(
+        f"{scene.name}: flicker against IEEE 1789, worst line of the spectra of all LEDs",
+        ("sends", "limit", "LEDs", "modulation", "at", "allowed", "of limit", "LEDs beyond"),
+        rows,
+        left=2,
+    )
     warning = flicker_warning(found)
     if warning is not None:
         log.warning("%s", warning)
