@@ -1,7 +1,9 @@
 """A dask cluster makes the same bytes as one process."""
 
+import logging
 import os
 import signal
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -92,3 +94,30 @@ def test_a_cluster_is_given_no_more_tasks_than_it_needs(tmp_path: Path, monkeypa
             done += 1
             assert len(waiting) <= done + 2
     assert (done, len(waiting)) == (10, 10)
+
+
+def test_a_run_without_a_worker_says_that_it_waits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The only worker of a scheduler joins once the run has said so: it makes the frames, and nothing is said again."""
+    (tmp_path / "frame").touch()
+    monkeypatch.setattr(workers, "DESERTED_S", 0.1)
+    monkeypatch.setattr(workers, "make_frames", lambda _: [SimpleNamespace(device=SimpleNamespace(file="frame"))])
+    tasks: list[workers.Task] = [[(Job("", "", "", str(tmp_path)), number)] for number in range(2)]
+    with LocalCluster(
+        n_workers=0, threads_per_worker=1, processes=False, dashboard_address=None, protocol="tcp"
+    ) as cluster:
+        address = cluster.scheduler_address
+
+        def join_when_told(record: logging.LogRecord) -> bool:
+            if record.name == workers.__name__:
+                threading.Thread(target=cluster.scale, args=(1,)).start()
+            return True
+
+        caplog.handler.addFilter(join_when_told)
+        otherwise = threading.Timer(20, cluster.scale, (1,))
+        otherwise.start()
+        assert len(list(workers.done_frames(iter(tasks), 2, 1, address, tmp_path))) == 2
+        otherwise.cancel()
+    told = [record.getMessage() for record in caplog.records if record.name == workers.__name__]
+    assert told == [f"--scheduler {address}: has no worker; the run goes on when one joins"]

@@ -2,9 +2,9 @@
 
     python tests/damage/kills.py [--count 50] [--frames 12] [--seed 1]
 
-The runs take turns: one worker, two workers, and a local dask cluster, of which the client, and in some turns a worker
-too, is killed. A run is killed up to three times before it may end. Prints one line a turn and exits with 1 where a
-resumed run fails, where `verify` finds damage, or where one file of a dataset differs.
+The runs take turns: one worker, two workers, and a local dask cluster, of which the client, and in some turns one of
+the two workers too, is killed. A run is killed up to three times before it may end. Prints one line a turn and exits
+with 1 where a resumed run fails, where `verify` finds damage, or where one file of a dataset differs.
 """
 
 import argparse
@@ -19,15 +19,17 @@ import psutil
 from runs import end, generate_command, journal_size, manifest, start, verified, work_folder
 
 KINDS = ("1 worker", "2 workers", "cluster")
+WORKERS = 2
+"""Workers of the cluster; one that is killed is followed by no other until there are as many again."""
 HANG_S = 600.0
 """A run that takes longer hangs."""
 
 
 def cluster_address(stack: ExitStack) -> str:
-    """Address of a local dask cluster with two worker processes."""
+    """Address of a local dask cluster with WORKERS processes."""
     from distributed import LocalCluster
 
-    cluster = stack.enter_context(LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None))
+    cluster = stack.enter_context(LocalCluster(n_workers=WORKERS, threads_per_worker=1, dashboard_address=None))
     return str(cluster.scheduler_address)
 
 
@@ -83,17 +85,15 @@ def main() -> int:
         if manifest(work / "again") != wanted:
             print("two runs without a kill differ")
             return 1
-        address = cluster_address(stack) if "cluster" in kinds else ""
-        options: dict[str, list[str]] = {
-            "1 worker": [],
-            "2 workers": ["--workers", "2"],
-            "cluster": ["--scheduler", address],
-        }
         while kills < given.count:
             kind = kinds[turn % len(kinds)]
             turn += 1
             folder = work / f"turn-{turn}"
-            command = generate_command(folder, given.frames, options[kind])
+            stack.close()  # the last turn's cluster; a worker that is killed while it starts is not started again
+            options: tuple[str, ...] = ("--workers", "1" if kind == "1 worker" else "2")
+            if kind == "cluster":
+                options = ("--scheduler", cluster_address(stack))
+            command = generate_command(folder, given.frames, options)
             killed: list[str] = []
             for _ in range(min(chance.randint(1, 3), given.count - kills)):
                 after_s = kill_at_random(command, folder, chance, usual_s)
@@ -101,7 +101,7 @@ def main() -> int:
                     break
                 kills += 1
                 killed.append(f"{after_s:.2f} s ({journal_size(folder)} bytes of journal)")
-                if kind == "cluster" and turn % 2 and (found := workers_of_cluster()):
+                if kind == "cluster" and turn % 2 and len(found := workers_of_cluster()) == WORKERS:
                     chance.choice(found).kill()
             process = start(command)
             try:

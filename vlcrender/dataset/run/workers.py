@@ -1,5 +1,6 @@
 """Processes that make frames: this one, a pool of its own, or the workers of a dask scheduler. Same bytes for any."""
 
+import logging
 import multiprocessing
 import os
 import signal
@@ -18,10 +19,14 @@ from vlcrender.dataset.run.frame_job import Job, made_frames, make_frames
 from vlcrender.errors import InputError
 from vlcrender.rendering.renderer import share_cores
 
+log = logging.getLogger(__name__)
+
 Task = Sequence[tuple[Job, int]]
 """Frames that one process makes, one after another, since they share views or files."""
 TASKS_ON_CLUSTER = 1000
 """Tasks that a scheduler knows at a time: more than the threads of a cluster, and memory does not grow with the set."""
+DESERTED_S = 5.0
+"""Time between two looks at whether a scheduler has workers."""
 Done = tuple[Job, FrameRecord]
 """A frame that is made, with its dataset's job."""
 
@@ -119,7 +124,7 @@ def _on_cluster(tasks: Iterator[Task], address: str) -> Iterator[Done]:
         client = Client(address, timeout="10s")
     except (OSError, ValueError) as error:
         raise InputError(f"--scheduler {address}: no answer from a scheduler: {error}") from None
-    with client:
+    with client, _telling_when_deserted(client, address):
         finished, of_future = as_completed(), dict[Any, Task]()
 
         def submit(count: int) -> None:
@@ -146,3 +151,25 @@ def _on_cluster(tasks: Iterator[Task], address: str) -> Iterator[Done]:
                     raise InputError(f"--scheduler {address}: its workers do not see the folder {job.directory}")
                 yield job, record
             submit(1)
+
+
+@contextmanager
+def _telling_when_deserted(client: Any, address: str) -> Iterator[None]:
+    """Warn within this block where a scheduler has no worker: a run waits for one, however long that takes."""
+    ended = threading.Event()
+
+    def look() -> None:
+        told = False
+        while not ended.wait(DESERTED_S):
+            deserted = not client.scheduler_info()["workers"]
+            if deserted and not told:
+                log.warning("--scheduler %s: has no worker; the run goes on when one joins", address)
+            told = deserted
+
+    thread = threading.Thread(target=look, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
