@@ -3,9 +3,12 @@
 Where neither is installed tests are skipped by name; BROWSER_REQUIRED=1, as CI sets it, makes that a failure.
 """
 
+import base64
 import os
+import re
 import shutil
-from collections.abc import Iterator
+import zlib
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -56,6 +59,29 @@ def show(browser: Any, path: Path, width: int, dark: bool = False) -> None:
 def console(browser: Any) -> list[str]:
     """Messages of the console since the last call."""
     return [str(entry["message"]) for entry in browser.get_log("browser")]
+
+
+def printed(browser: Any) -> bytes:
+    """The page as PDF, on the paper that its style sheet names."""
+    options = {"preferCSSPageSize": True, "printBackground": True}
+    return base64.b64decode(browser.execute_cdp_cmd("Page.printToPDF", options)["data"])
+
+
+def page_streams(pdf: bytes) -> list[bytes]:
+    """What draws each page of a PDF of chromium, whose objects stand one after another and uncompressed."""
+    objects = {int(number): body for number, body in re.findall(rb"(?ms)^(\d+) 0 obj\s(.*?)^endobj", pdf)}
+    streams = []
+    for body in objects.values():
+        if re.search(rb"/Type\s*/Page\b", body):
+            (content,) = re.findall(rb"/Contents (\d+) 0 R", body)
+            streams.append(zlib.decompress(objects[int(content)].split(b"stream", 1)[1].lstrip(b"\r\n")))
+    return streams
+
+
+def fills(pages: Iterable[bytes]) -> set[tuple[int, ...]]:
+    """Colours, in bytes of red, green and blue, with which `page_streams` fill letters and areas."""
+    found = {one for page in pages for one in re.findall(rb"([\d.]+) ([\d.]+) ([\d.]+) rg", page)}
+    return {tuple(round(255 * float(part)) for part in one) for one in found}
 
 
 OVERFLOWING = """
