@@ -78,6 +78,12 @@ def page_streams(pdf: bytes) -> list[bytes]:
     return streams
 
 
+def points_per_pixel(page: bytes) -> float:
+    """Size of a CSS pixel on one of `page_streams`: 0.75 points, less where chromium shrinks what is too wide."""
+    outer, inner = re.findall(rb"([\d.]+) 0 0 -?[\d.]+ [-\d.]+ [-\d.]+ cm", page)[:2]
+    return float(outer) * float(inner)
+
+
 def fills(pages: Iterable[bytes]) -> set[tuple[int, ...]]:
     """Colours, in bytes of red, green and blue, with which `page_streams` fill letters and areas."""
     found = {one for page in pages for one in re.findall(rb"([\d.]+) ([\d.]+) ([\d.]+) rg", page)}
@@ -93,6 +99,15 @@ return [...document.body.querySelectorAll("*")].filter((node) => {
 }).map((node) => `${node.tagName} ${node.className.baseVal ?? node.className}`);
 """
 """Script: elements beyond the sides of the page that no scrolling box holds."""
+
+SQUEEZED = """
+const scrolls = (node) => node && (getComputedStyle(node).overflowX !== "visible" || scrolls(node.parentElement));
+return [...document.querySelectorAll("table")].filter((node) => {
+  const [own, around] = [node.getBoundingClientRect(), node.parentElement.getBoundingClientRect()];
+  return own.width && own.right > around.right + 0.5 && !scrolls(node);
+}).map((node) => node.className);
+"""
+"""Script: tables that end beyond the box they stand in."""
 
 UNREACHED = """
 const parts = 'button, select, input, summary, a[href], [tabindex="0"]';

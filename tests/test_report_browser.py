@@ -7,7 +7,18 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browsing import OVERFLOWING, console, fills, open_browser, page_streams, printed, reached_by_tab, show
+from browsing import (
+    OVERFLOWING,
+    SQUEEZED,
+    console,
+    fills,
+    open_browser,
+    page_streams,
+    points_per_pixel,
+    printed,
+    reached_by_tab,
+    show,
+)
 from test_estimator_report import BOUND, many_frames, scored, scores_of
 
 from estimator.evaluate.score import Scores
@@ -59,6 +70,7 @@ def test_the_page_is_silent_and_within_the_window(browser: Any, odd_sets: Path, 
         tab.click()
         browser.execute_script("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
         assert browser.execute_script(OVERFLOWING) == []
+        assert browser.execute_script(SQUEEZED) == []
         assert browser.execute_script("return document.documentElement.scrollWidth") <= width
     assert console(browser) == []
 
@@ -240,6 +252,7 @@ def test_two_hundred_frames_print_on_three_light_pages(browser: Any, two_hundred
         assert len(pages) <= PAGES
         assert (0x1B, 0x1F, 0x24) in fills(pages)  # --ink of the light theme
         assert (0xEC, 0xEF, 0xF2) not in fills(pages)  # of the dark one
+        assert [points_per_pixel(one) for one in pages] == pytest.approx([0.75] * len(pages), rel=1e-3)
     # The same drawing whatever the window's width and theme.
     assert page_streams(pdfs[0]) == page_streams(pdfs[1])
     assert console(browser) == []
@@ -252,12 +265,15 @@ def test_the_printed_page_has_no_controls_and_keeps_within_the_paper(browser: An
     browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
     try:
         assert browser.execute_script(OVERFLOWING) == []
+        assert browser.execute_script(SQUEEZED) == []
         controls = browser.find_elements("css selector", "button, select, input, summary")
         assert controls
         assert not any(one.is_displayed() for one in controls)
         assert len(browser.find_elements("css selector", ".curves path.curve")) > 0
     finally:
         browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": ""})
+    pages = page_streams(printed(browser))
+    assert [points_per_pixel(one) for one in pages] == pytest.approx([0.75] * len(pages), rel=1e-3)
     assert console(browser) == []
 
 

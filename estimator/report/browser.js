@@ -359,7 +359,7 @@
         const cells = size > diagonal
           ? ["out", "out", "out"]
           : [Numbers.three(inUnit(size)), Numbers.three(inUnit(Math.hypot(error[0], error[1]))), Numbers.signed(inUnit(error[2]))];
-        if (set.bound) cells.push(bound ? Numbers.three(size / bound) : "–");
+        if (set.bound) cells.push(!bound ? "–" : size > diagonal ? "out" : Numbers.three(size / bound));
         cells.push(Numbers.three(variant.ms[number]));
         return html("tr", { "data-variant": variant.name }, name, ...cells.map((cell) => html("td", null, cell)));
       });

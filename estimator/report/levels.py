@@ -91,7 +91,7 @@ def level_plot(levels: Sequence[Level]) -> str:
                 failed.append((x(level.bound_rms_m) + 8, y(size) - 4, f"{of_variant.failed} failed"))
         parts.append(look_mark(LEFT + WIDTH + 40, TOP + LINE * (index + 0.5), 4, look))
         parts.append(text(LEFT + WIDTH + 52, TOP + LINE * (index + 0.5) + 4, variant, "start"))
-    parts += [text(*place, words, "start") for *place, words in _apart(failed)]
+    parts += [text(across_px, down_px, words, "start") for across_px, down_px, words in _apart(failed)]
     return picture(LEFT + WIDTH + LEGEND, TOP + height + BOTTOM, "RMSE of each variant by the datasets' bounds", parts)
 
 

@@ -76,7 +76,7 @@ const Pictures = (() => {
   function curves(box, set, shown, range, cursor) {
     const width = box.clientWidth;
     const small = width < 500;
-    const height = small ? 300 : 380;
+    const height = small ? 280 : 380;
     const [left, right, top, bottom] = [44, width - 14, 12, height - 40];
     const across = axis(...range, left, right, true);
     const up = axis(0, 1, bottom, top, false);
