@@ -23,6 +23,7 @@ from paper_sets import (
     Clock,
     OutOfTime,
     cpu_s,
+    draw,
     keep_scores,
     keep_view,
     measure,
@@ -86,13 +87,18 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=Path("out/paper"), help="folder of the sets")
     parser.add_argument("--seeds", type=int, default=3, help="number of seeds, 1, 2, ...")
     parser.add_argument("--workers", type=int, default=2, help="processes")
-    parser.add_argument("--pages", action="store_true", help="write the pages from what is kept; measure nothing")
+    parser.add_argument(
+        "--pages", action="store_true", help="draw and write the pages from what is kept; measure nothing"
+    )
     chosen = parser.parse_args()
     unknown = [name for name in chosen.items if name not in ITEMS]
     if unknown:
         parser.error(f"ITEM {unknown[0]}: unknown; allowed: {', '.join(ITEMS)}")
     chosen.out.mkdir(parents=True, exist_ok=True)
     clock = Clock(time.monotonic() + 60 * chosen.minutes)
+    for item in ITEMS.values() if chosen.pages else ():
+        for view in item.views:
+            draw(item.name, view, PAGE)
     for name in () if chosen.pages else chosen.items or ITEMS:
         start, start_cpu_s = time.monotonic(), cpu_s()
         try:

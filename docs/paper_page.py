@@ -24,6 +24,21 @@ NAMES = {
 }
 """Short names of the variants of the paper's stages, for the heads of tables."""
 
+KEYS = {
+    "radius_m": "radius",
+    "level_db": "noise, dB",
+    "width_px": "width, px",
+    "border_px": "distance from the border, px",
+    "error_deg": "accelerometer error, °",
+    "illuminance_lux": "ambient light, lux",
+    "luminance_cd_m2": "luminance, cd/m²",
+    "tilt_deg": "tilt, °",
+    "tilt_x_deg": "tilt x, °",
+    "tilt_y_deg": "tilt y, °",
+    "yaw_deg": "yaw, °",
+}
+"""Heads of the columns of keys; lengths in metres have their unit in each cell."""
+
 
 @dataclass(frozen=True)
 class Claim:
@@ -235,16 +250,21 @@ def view_table(view: Mapping[str, Any]) -> dict[str, Any]:
     cells = []
     for line in lines:
         of_line = [by_key[line].get(one) if along else by_key[one].get(line) for one in columns]
-        first = [key_text(one) for one in line] if along else [NAMES.get(line, line)]
+        first = list(map(_key, view["x"], line)) if along else [NAMES.get(line, line)]
         cells.append([*first, *(_statistic(view, row) for row in of_line)])
-    heads = [NAMES.get(one, one) if along else ", ".join(map(key_text, one)) for one in columns]
+    heads = [NAMES.get(one, one) if along else ", ".join(map(_key, view["x"], one)) for one in columns]
+    keys = [KEYS.get(name, name) for name in view["x"]]
     frames = sorted({row["frames"] for row in view["rows"]})
     return {
-        "head": [*(view["x"] if along else ["variant"]), *heads],
+        "head": [*(keys if along else [f"variant; {'; '.join(keys)}"]), *heads],
         "rows": cells,
         "frames": " to ".join(str(one) for one in dict.fromkeys((frames[0], frames[-1]))),
         "failures": failures(view),
     }
+
+
+def _key(name: str, value: float | str) -> str:
+    return value_text(name, value) if name.endswith("_m") and not isinstance(value, str) else key_text(value)
 
 
 def _statistic(view: Mapping[str, Any], row: Mapping[str, Any] | None) -> str:

@@ -22,7 +22,7 @@ import numpy as np
 import estimator as est
 import vlcrender as vr
 from estimator.evaluate.frame_columns import FrameColumns, read_frame_columns
-from estimator.evaluate.table import Table, TableRow, table_of_columns
+from estimator.evaluate.table import Key, Statistic, Table, TableRow, table_of_columns
 from estimator.evaluate.table_text import table_csv
 from estimator.io.sweep import dataset_folders
 from estimator.report.plot import plot
@@ -213,13 +213,41 @@ def kept_row(row: TableRow) -> dict[str, Any]:
 def keep_view(item: str, view: View, folder: Path, kept_in: Path) -> dict[str, Any]:
     """Table and plot of a view, written to the folder `kept_in`; returns the kept table."""
     table = table_of(view, folder)
-    stem = kept_in / f"{item}-{view.name}"
-    drawn = with_statistic(table, view.shown)
-    stem.with_suffix(".svg").write_text(plot(drawn, view.log, view.lines if len(view.x) == 1 else ()))
-    stem.with_suffix(".csv").write_text(table_csv(table))
+    (kept_in / f"{item}-{view.name}.csv").write_text(table_csv(table))
+    draw(item, view, kept_in)
     rows = [kept_row(row) for row in table.rows]
     names = {"name": view.name, "title": view.title, "x": list(view.x), "metric": view.metric, "shown": view.shown}
     return {**names, "rows": rows, "seeds": seeds_inside(view, folder, rows)}
+
+
+def draw(item: str, view: View, kept_in: Path) -> None:
+    """Draw the plot of a view from its table of all statistics, both in the folder `kept_in`."""
+    stem = kept_in / f"{item}-{view.name}"
+    column = f"{view.metric}_{view.shown}"
+    rows = []
+    with stem.with_suffix(".csv").open(newline="") as file:
+        for record in csv.DictReader(file):
+            keys = tuple(
+                Key(_number(record[name]), *(_end(record.get(f"{name}{end}")) for end in ("_low", "_high")))
+                for name in view.x
+            )
+            value, low, high = (float(record[f"{column}{end}"] or "nan") for end in ("", "_low", "_high"))
+            counts = int(record["frames"]), int(record["answered"])
+            group = tuple(record[name] for name in view.by)
+            rows.append(TableRow(keys, group, *counts, (Statistic(value, low, high),), {}))
+    drawn = with_statistic(Table(view.metric, view.x, view.by, (view.shown,), tuple(rows)), view.shown)
+    stem.with_suffix(".svg").write_text(plot(drawn, view.log, view.lines if len(view.x) == 1 else ()))
+
+
+def _number(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def _end(text: str | None) -> float | None:
+    return float(text) if text else None
 
 
 def seeds_inside(view: View, folder: Path, rows: Sequence[Mapping[str, Any]]) -> list[int]:

@@ -3,9 +3,12 @@
 Where neither is installed tests are skipped by name; BROWSER_REQUIRED=1, as CI sets it, makes that a failure.
 """
 
+import base64
 import os
+import re
 import shutil
-from collections.abc import Iterator
+import zlib
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -58,6 +61,35 @@ def console(browser: Any) -> list[str]:
     return [str(entry["message"]) for entry in browser.get_log("browser")]
 
 
+def printed(browser: Any) -> bytes:
+    """The page as PDF, on the paper that its style sheet names."""
+    options = {"preferCSSPageSize": True, "printBackground": True}
+    return base64.b64decode(browser.execute_cdp_cmd("Page.printToPDF", options)["data"])
+
+
+def page_streams(pdf: bytes) -> list[bytes]:
+    """What draws each page of a PDF of chromium, whose objects stand one after another and uncompressed."""
+    objects = {int(number): body for number, body in re.findall(rb"(?ms)^(\d+) 0 obj\s(.*?)^endobj", pdf)}
+    streams = []
+    for body in objects.values():
+        if re.search(rb"/Type\s*/Page\b", body):
+            (content,) = re.findall(rb"/Contents (\d+) 0 R", body)
+            streams.append(zlib.decompress(objects[int(content)].split(b"stream", 1)[1].lstrip(b"\r\n")))
+    return streams
+
+
+def points_per_pixel(page: bytes) -> float:
+    """Size of a CSS pixel on one of `page_streams`: 0.75 points, less where chromium shrinks what is too wide."""
+    outer, inner = re.findall(rb"([\d.]+) 0 0 -?[\d.]+ [-\d.]+ [-\d.]+ cm", page)[:2]
+    return float(outer) * float(inner)
+
+
+def fills(pages: Iterable[bytes]) -> set[tuple[int, ...]]:
+    """Colours, in bytes of red, green and blue, with which `page_streams` fill letters and areas."""
+    found = {one for page in pages for one in re.findall(rb"([\d.]+) ([\d.]+) ([\d.]+) rg", page)}
+    return {tuple(round(255 * float(part)) for part in one) for one in found}
+
+
 OVERFLOWING = """
 const wide = document.documentElement.clientWidth;
 const scrolls = (node) => node && (getComputedStyle(node).overflowX !== "visible" || scrolls(node.parentElement));
@@ -67,6 +99,15 @@ return [...document.body.querySelectorAll("*")].filter((node) => {
 }).map((node) => `${node.tagName} ${node.className.baseVal ?? node.className}`);
 """
 """Script: elements beyond the sides of the page that no scrolling box holds."""
+
+SQUEEZED = """
+const scrolls = (node) => node && (getComputedStyle(node).overflowX !== "visible" || scrolls(node.parentElement));
+return [...document.querySelectorAll("table")].filter((node) => {
+  const [own, around] = [node.getBoundingClientRect(), node.parentElement.getBoundingClientRect()];
+  return own.width && own.right > around.right + 0.5 && !scrolls(node);
+}).map((node) => node.className);
+"""
+"""Script: tables that end beyond the box they stand in."""
 
 UNREACHED = """
 const parts = 'button, select, input, summary, a[href], [tabindex="0"]';

@@ -2,6 +2,7 @@
 
 import re
 import xml.etree.ElementTree as ET
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -93,6 +94,16 @@ def test_the_picture_says_how_many_frames_failed() -> None:
     words = [one.text for one in ET.fromstring(level_picture(found)).iter(f"{SVG}text")]
     assert "1 failed" in words
     assert {"a", "b", "easy", "hard"} <= set(words)
+
+
+def test_counts_of_failed_frames_do_not_cover_each_other() -> None:
+    """Of three variants with one error, at one bound."""
+    variants = [scored([0.1, None], name, bound(0.01)) for name in ("a", "b", "c")]
+    root = ET.fromstring(level_picture(levels_of([level("x", *variants), EASY])))
+    places = sorted(float(one.attrib["y"]) for one in root.iter(f"{SVG}text") if one.text == "1 failed")
+    assert len(places) == 3
+    # Letters are 12 px high.
+    assert min(b - a for a, b in pairwise(places)) >= 12
 
 
 def test_the_command_writes_a_picture_and_prints_a_table(

@@ -201,6 +201,24 @@ def test_bad_input_is_one_line(tmp_path: Path, arguments: list[str], message: st
     assert "a.png: needed the name of an .svg file" in finished.stderr
 
 
+def test_heat_maps_stand_three_to_a_row() -> None:
+    """Seven maps: three rows, each below the one before, and no map beyond the picture."""
+    rows = [
+        TableRow((Key(x), Key(y)), (f"v{number}",), 1, 1, (Statistic(x + y, nan, nan),), {})
+        for number in range(7)
+        for x in (1.0, 2.0)
+        for y in (1.0, 2.0)
+    ]
+    root = ET.fromstring(plot(Table("error_3d_m", ("a", "b"), ("variant",), ("median",), tuple(rows))))
+    wide, high = (float(part) for part in root.attrib["viewBox"].split()[2:])
+    cells = [one for one in root.iter(f"{SVG}rect") if one.find(f"{SVG}title") is not None]
+    corners = [(float(one.attrib["x"]), float(one.attrib["y"])) for one in cells]
+    assert len({x for x, _ in corners}) == len({y for _, y in corners}) == 3 * 2
+    assert len(set(corners)) == len(cells) == 7 * 4
+    assert max(x for x, _ in corners) + PANEL / 2 < wide
+    assert max(y for _, y in corners) + PANEL / 2 < high
+
+
 def test_too_many_heat_maps_are_refused() -> None:
     rows = [TableRow((Key(0.0), Key(0.0)), (str(group),), 1, 1, (Statistic(1.0, nan, nan),), {}) for group in range(21)]
     with pytest.raises(InputError, match="21 groups: a figure has room for 20 heat maps"):

@@ -142,7 +142,7 @@ def test_the_first_sentence_says_who_is_nearest_and_who_failed() -> None:
     text = re.sub("<[^>]*>", "", lede(scores, ordered(scores)[0])).replace("\u00a0", " ")
     assert text == (
         "Nearest is a: half of the 4 frames within 100 mm, 95 % within 100 mm. As near: b. Next: c, 300 mm; last: d, "
-        "beyond the room. Failed frames: d 2, of 4."
+        "beyond the room. Failed frames, of 4: 2 of d."
     )
     none = [scored([None, None, 0.1], "a")]
     assert "No variant answers half of the 3 frames" in lede(scores_of(none), none)
@@ -248,21 +248,27 @@ def test_pictures_end_with_their_budget(tmp_path: Path, rng: np.random.Generator
         pictures(tmp_path, [0])
 
 
-def thousand_frames(folder: Path, rng: np.random.Generator, variants: int = 3) -> Scores:
-    """Scores of a thousand frames in a room, with pictures of noise, which are large, for a tenth of them."""
+def many_frames(folder: Path, rng: np.random.Generator, variants: int = 3, count: int = 1000) -> Scores:
+    """Scores of many frames in a room, with pictures of noise, which are large, for a tenth of them."""
     (folder / "previews").mkdir()
-    for k in range(0, 1000, 10):
+    for k in range(0, count, 10):
         Image.fromarray(rng.integers(0, 255, (300, 400), dtype=np.uint8)).save(folder / f"previews/{k:06}.png")
     truth = [
-        row.model_copy(update={"position_m": tuple(rng.uniform(0.5, 3.5, 3).tolist())}) for row in truths(1000, BOUND)
+        row.model_copy(update={"position_m": tuple(rng.uniform(0.5, 3.5, 3).tolist())}) for row in truths(count, BOUND)
     ]
+    names = ("tilt_deg", "distance_m", "snr")
+    measures = [dict(zip(names, rng.uniform(1.0, 60.0, len(names)).tolist(), strict=True)) for _ in truth]
+    found = rng.integers(4, 100, count).tolist()
     scores = []
     for k in range(variants):
         places = [np.array(row.position_m) + rng.normal(0, 0.01 * (k + 1), 3) for row in truth]
         rows = [ok(frame, tuple(place.tolist())) for frame, place in enumerate(places)]
         # The summaries are those of the first variant: their bootstraps take most of the time, and no picture has them.
         first = scores[0] if scores else score_variant("v0", rows, truth, LEDS_M)
-        of_rows = tuple(score_frame(row, true, LEDS_M) for row, true in zip(rows, truth, strict=True))
+        of_rows = tuple(
+            score_frame(row, true, LEDS_M).model_copy(update={**measured, "spots_found": spots})
+            for row, true, measured, spots in zip(rows, truth, measures, found, strict=True)
+        )
         scores.append(first.model_copy(update={"variant": f"v{k}", "rows": of_rows}))
     return scores_of(scores)
 

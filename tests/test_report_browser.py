@@ -1,13 +1,25 @@
 """The page of scores in a real browser: silent, within the window, right in its figures, usable by the keyboard."""
 
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from browsing import OVERFLOWING, console, open_browser, reached_by_tab, show
-from test_estimator_report import BOUND, scored, scores_of, thousand_frames
+from browsing import (
+    OVERFLOWING,
+    SQUEEZED,
+    console,
+    fills,
+    open_browser,
+    page_streams,
+    points_per_pixel,
+    printed,
+    reached_by_tab,
+    show,
+)
+from test_estimator_report import BOUND, many_frames, scored, scores_of
 
 from estimator.evaluate.score import Scores
 from estimator.evaluate.scores_file import read_or_score
@@ -58,6 +70,7 @@ def test_the_page_is_silent_and_within_the_window(browser: Any, odd_sets: Path, 
         tab.click()
         browser.execute_script("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
         assert browser.execute_script(OVERFLOWING) == []
+        assert browser.execute_script(SQUEEZED) == []
         assert browser.execute_script("return document.documentElement.scrollWidth") <= width
     assert console(browser) == []
 
@@ -187,7 +200,7 @@ def test_the_policy_stops_what_comes_from_outside(browser: Any, one_set: Path) -
 def thousand(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("thousand")
     path = folder / "page.html"
-    path.write_text(page([(folder, thousand_frames(folder, np.random.Generator(np.random.Philox(1000))))]))
+    path.write_text(page([(folder, many_frames(folder, np.random.Generator(np.random.Philox(1000))))]))
     return path
 
 
@@ -203,6 +216,64 @@ def test_a_thousand_frames_are_drawn(browser: Any, thousand: Path) -> None:
     steps = browser.execute_script("return document.querySelector('.curves path[data-variant]').getAttribute('d')")
     assert steps.count("V") > 900
     assert browser.execute_script("return document.querySelectorAll('.plot canvas').length") >= 1
+    assert console(browser) == []
+
+
+@pytest.fixture(scope="module")
+def two_hundred(scored_set: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Five variants, every part of the page, and the facts of a set."""
+    folder = tmp_path_factory.mktemp("two_hundred")
+    scores = many_frames(folder, np.random.Generator(np.random.Philox(200)), 5, 200)
+    shutil.copy(scored_set / "dataset.json", folder)
+    path = folder / "page.html"
+    path.write_text(page([(folder, scores)]))
+    return path
+
+
+PAGES = 3
+"""Pages of A4 for 200 frames and five variants: facts, errors and curves; the room and what errors depend on; a frame.
+
+A section that is not broken leaves up to its own height free on the page before, so a page less full costs a page.
+"""
+
+
+def test_two_hundred_frames_print_on_three_light_pages(browser: Any, two_hundred: Path) -> None:
+    """From any window and theme: the pages are the same, in the light theme's ink, and the window's own come back."""
+    pdfs = []
+    for width, dark in ((1280, False), (400, True)):
+        show(browser, two_hundred, width, dark)
+        before = browser.execute_script("return document.querySelector('.curves svg').getAttribute('viewBox')")
+        pdfs.append(printed(browser))
+        after = browser.execute_script("return document.querySelector('.curves svg').getAttribute('viewBox')")
+        assert before == after
+        assert not browser.execute_script("return document.documentElement.className")
+    for pdf in pdfs:
+        pages = page_streams(pdf)
+        assert len(pages) <= PAGES
+        assert (0x1B, 0x1F, 0x24) in fills(pages)  # --ink of the light theme
+        assert (0xEC, 0xEF, 0xF2) not in fills(pages)  # of the dark one
+        assert [points_per_pixel(one) for one in pages] == pytest.approx([0.75] * len(pages), rel=1e-3)
+    # The same drawing whatever the window's width and theme.
+    assert page_streams(pdfs[0]) == page_streams(pdfs[1])
+    assert console(browser) == []
+
+
+def test_the_printed_page_has_no_controls_and_keeps_within_the_paper(browser: Any, odd_sets: Path) -> None:
+    """Laid out as for paper in a window as wide as A4's text."""
+    show(browser, odd_sets, 688)
+    browser.execute_script("window.dispatchEvent(new Event('beforeprint'))")
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
+    try:
+        assert browser.execute_script(OVERFLOWING) == []
+        assert browser.execute_script(SQUEEZED) == []
+        controls = browser.find_elements("css selector", "button, select, input, summary")
+        assert controls
+        assert not any(one.is_displayed() for one in controls)
+        assert len(browser.find_elements("css selector", ".curves path.curve")) > 0
+    finally:
+        browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": ""})
+    pages = page_streams(printed(browser))
+    assert [points_per_pixel(one) for one in pages] == pytest.approx([0.75] * len(pages), rel=1e-3)
     assert console(browser) == []
 
 

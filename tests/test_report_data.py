@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from browsing import OVERFLOWING, console, open_browser, show
+from browsing import OVERFLOWING, console, open_browser, page_streams, printed, show
 from conftest import ROOT, run
 from test_estimator_score import LEDS_M, TRUTH, ok, truths
 
@@ -135,4 +135,6 @@ def test_the_page_of_a_set_is_silent_and_within_the_window(
         show(browser, path, width, dark)
         assert browser.execute_script(OVERFLOWING) == []
         assert browser.execute_script("return document.documentElement.scrollWidth") <= width
+        # Of A4: facts, plan and the first histograms; the other histograms and up to 24 previews.
+        assert len(page_streams(printed(browser))) <= 2
         assert console(browser) == []

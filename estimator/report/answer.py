@@ -189,9 +189,9 @@ def lede(scores: Scores, variants: Sequence[VariantScore]) -> Markup:
     failing = [one for one in variants if one.failed]
     if not failing:
         return text + Markup("No frame failed.")
-    words = [f"{one.variant} {one.failed}" for one in failing[:3]]
+    words = [f"{one.failed} of {one.variant}" for one in failing[:3]]
     more = f" and {len(failing) - 3} variants more" if len(failing) > 3 else ""
-    return text + Markup("Failed frames: {}{}, of {}.").format(", ".join(words), more, frames)
+    return text + Markup("Failed frames, of {}: {}{}.").format(frames, ", ".join(words), more)
 
 
 def failure_rows(variants: Sequence[VariantScore]) -> list[tuple[VariantScore, Markup, list[tuple[str, int]]]]:

@@ -160,10 +160,10 @@
 
     function room() {
       if (!set.room || !state.chosen) return;
-      const factor = Pictures.plan(find(".plan"), set, state.chosen, [0, 1], frame(), choose);
+      const { factor, scale } = Pictures.plan(find(".plan"), set, state.chosen, [0, 1], frame(), choose);
       Pictures.plan(find(".side"), set, state.chosen, [0, 2], frame(), choose);
-      const times = factor >= 2 ? `Arrows are drawn ${Numbers.three(factor)} times too long.` : "Arrows have the scale of the room.";
-      find(".scale").replaceChildren(times);
+      const times = factor >= 2 ? `Arrows are drawn ${factor < 100 ? Axes.plain(factor) : Numbers.three(factor)} times too long.` : "Arrows have the scale of the room.";
+      find(".scale").replaceChildren(...Pictures.scaleKey(state.chosen, factor, scale), times);
       axes();
     }
 
@@ -181,6 +181,8 @@
         const cells = [Numbers.three(inUnit(Numbers.median(along.map(Math.abs)))), `${Numbers.signed(inUnit(mean))}${biased ? " *" : ""}`, Numbers.three(inUnit(spread))];
         return html("tr", null, html("th", { scope: "row" }, name), ...cells.map((cell) => html("td", null, cell)));
       });
+      const level = html("td", null, errors.length < 2 ? "–" : Numbers.three(inUnit(Numbers.median(errors.map(([x, y]) => Math.hypot(x, y))))));
+      rows.push(html("tr", null, html("th", { scope: "row" }, "horizontal"), level, html("td"), html("td")));
       const heads = ["median size", "mean (bias)", "spread (1 σ)"].map((head) => html("th", { scope: "col" }, head));
       const caption = html("caption", { class: "note" }, `Where the error of ${state.chosen.name} lies, ${state.unit}; ${errors.length} frames`);
       find(".axes").replaceChildren(caption, html("thead", null, html("tr", null, html("td", { class: "l" }), ...heads)), html("tbody", null, ...rows));
@@ -345,7 +347,7 @@
     }
 
     function table(number) {
-      const heads = ["3D", "horizontal", "height", ...(set.bound ? ["÷ bound"] : []), "ms"];
+      const heads = ["3D", "horizontal", "height", ...(set.bound ? ["÷\u00a0bound"] : []), "ms"];
       const rows = shown().map((variant) => {
         const name = html("th", { scope: "row" }, Axes.key(variant, set.shapes), Axes.named(variant.name));
         const error = variant.errors[number];
@@ -357,7 +359,7 @@
         const cells = size > diagonal
           ? ["out", "out", "out"]
           : [Numbers.three(inUnit(size)), Numbers.three(inUnit(Math.hypot(error[0], error[1]))), Numbers.signed(inUnit(error[2]))];
-        if (set.bound) cells.push(bound ? `${Numbers.three(size / bound)} ×` : "–");
+        if (set.bound) cells.push(!bound ? "–" : size > diagonal ? "out" : Numbers.three(size / bound));
         cells.push(Numbers.three(variant.ms[number]));
         return html("tr", { "data-variant": variant.name }, name, ...cells.map((cell) => html("td", null, cell)));
       });
@@ -420,7 +422,8 @@
     }
 
     function draw() {
-      if (article.hidden || !set.variants.length || !set.count) return;
+      // A window that has no size yet, in a tab behind others, gets its pictures with its size.
+      if (article.hidden || !article.clientWidth || !set.variants.length || !set.count) return;
       strips();
       curves();
       linked();
@@ -478,4 +481,12 @@
     });
   });
   window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
+
+  // report.css has a layout of the width of paper, in light colours, for `printing`.
+  const print = (on) => {
+    document.documentElement.classList.toggle("printing", on);
+    draw();
+  };
+  window.addEventListener("beforeprint", () => print(true));
+  window.addEventListener("afterprint", () => print(false));
 })();

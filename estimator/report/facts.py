@@ -36,14 +36,13 @@ def facts(folder: Path, scores: Scores) -> list[tuple[str, str]]:
             ("Exposure", _exposure),
             ("Accelerometer", _accelerometer),
             ("What the device is told", _told),
-            ("Recipe, seed", _recipe),
             ("Made with", _made_with),
         ):
             try:
                 found.append((heading, part(description, scores)))
             except (KeyError, TypeError, ValueError, AttributeError, IndexError):
                 continue  # another program's set may leave out what only people read
-    found.append(("Digest of frames.parquet", digest(folder)))
+    found.append(("Recipe, seed, digest", ", ".join(filter(None, (_recipe(description or {}), _digest_named(folder))))))
     found.append(("Scored with", _scored_with(scores.made_by)))
     return [(heading, text) for heading, text in found if text]
 
@@ -215,9 +214,14 @@ def _recipe_of(description: Mapping[str, Any]) -> Mapping[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-def _recipe(description: Mapping[str, Any], scores: Scores) -> str:
+def _recipe(description: Mapping[str, Any]) -> str:
     recipe = _recipe_of(description)
-    return f"{recipe['name']}, seed {recipe['seed']}" if "seed" in recipe else ""
+    return f"{recipe.get('name')}, seed {recipe['seed']}" if "seed" in recipe else ""
+
+
+def _digest_named(folder: Path) -> str:
+    found = digest(folder)
+    return f"frames.parquet {found}" if found else ""
 
 
 def _made_with(description: Mapping[str, Any], scores: Scores) -> str:

@@ -14,6 +14,7 @@ WIDTH, HEIGHT = 560, 420
 LEFT, TOP, BOTTOM = 72, 44, 44
 LEGEND = 250
 LINE = 18
+LABEL = 13
 MIN_SHOWN_M = 1e-6
 MAX_LABELS = 12
 
@@ -74,6 +75,7 @@ def level_plot(levels: Sequence[Level]) -> str:
     first, last = 10.0 ** max(up.low, across.low), 10.0 ** min(up.high, across.high)
     if last > first:
         parts.append(line(x(first), y(first), x(last), y(last), "bound"))
+    failed: list[tuple[float, float, str]] = []
     for index, variant in enumerate(variants):
         look = _look(levels, variant)
         places = [(level, size) for level in levels if (size := level.rmse_m(variant)) is not None]
@@ -86,10 +88,20 @@ def level_plot(levels: Sequence[Level]) -> str:
             title = f"{variant}, {level.name}: {length_text(size)}{lost}"
             parts.append(look_mark(x(level.bound_rms_m), y(size), 4, look, title))
             if of_variant.failed:
-                parts.append(text(x(level.bound_rms_m) + 8, y(size) - 4, f"{of_variant.failed} failed", "start"))
+                failed.append((x(level.bound_rms_m) + 8, y(size) - 4, f"{of_variant.failed} failed"))
         parts.append(look_mark(LEFT + WIDTH + 40, TOP + LINE * (index + 0.5), 4, look))
         parts.append(text(LEFT + WIDTH + 52, TOP + LINE * (index + 0.5) + 4, variant, "start"))
+    parts += [text(across_px, down_px, words, "start") for across_px, down_px, words in _apart(failed)]
     return picture(LEFT + WIDTH + LEGEND, TOP + height + BOTTOM, "RMSE of each variant by the datasets' bounds", parts)
+
+
+def _apart(labels: Sequence[tuple[float, float, str]]) -> list[tuple[float, float, str]]:
+    """Labels (x, y, words) of which those of a column are at least LABEL apart, moved down where they are not."""
+    placed: list[tuple[float, float, str]] = []
+    for x, y, words in sorted(labels):
+        low = placed[-1][1] + LABEL if placed and placed[-1][0] == x else y
+        placed.append((x, max(y, low), words))
+    return placed
 
 
 def _look(levels: Sequence[Level], variant: str) -> Look:

@@ -76,7 +76,7 @@ const Pictures = (() => {
   function curves(box, set, shown, range, cursor) {
     const width = box.clientWidth;
     const small = width < 500;
-    const height = small ? 300 : 380;
+    const height = small ? 280 : 380;
     const [left, right, top, bottom] = [44, width - 14, 12, height - 40];
     const across = axis(...range, left, right, true);
     const up = axis(0, 1, bottom, top, false);
@@ -183,7 +183,15 @@ const Pictures = (() => {
     if (points[chosen]) parts.push(svg("circle", { class: "chosen", cx: fixed(points[chosen][0]), cy: fixed(points[chosen][1]), r: 7 }));
     const root = Axes.picture(box, width, height, b === 1 ? "The room from above" : "The room from the side", parts);
     root.addEventListener("click", (event) => onChoose(nearest(points, event, root, 14)));
-    return factor;
+    return { factor, scale };
+  }
+
+  /** Arrow of a round length beside what it stands for: an error of this many metres at a factor and a scale in pixels. */
+  function scaleKey(variant, factor, scale) {
+    const metres = exaggeration(1, 60 / (factor * scale));
+    const long = metres * factor * scale;
+    const arrow = svg("path", { class: "arrow", d: `M1 1v8M1 5h${fixed(long)}l-4 -2m4 2l-4 2` });
+    return [svg("svg", { class: `scale-key ${variant.look}`, width: fixed(long + 3), height: 10, "aria-hidden": "true" }, arrow), ` = ${Numbers.tick(metres)} of error. `];
   }
 
   /** Index of the point nearest to an event, null beyond `most` pixels. */
@@ -241,7 +249,7 @@ const Pictures = (() => {
     const hues = new Map(shown.map((variant) => [variant, Axes.hue(box, variant)]));
     for (const [variant, [x, y]] of pen.marks) Axes.drawMark(brush, set.shapes[variant.mark], x, y, 2.2, hues.get(variant), variant.hollow);
     for (const [variant, [x, y], frame] of pen.marks) {
-      if (frame === chosen) root.append(svg("g", { class: variant.look }, svg("circle", { class: "chosen", cx: fixed(x), cy: fixed(y), r: 5 })));
+      if (frame === chosen) root.append(svg("g", { class: variant.look }, svg("path", { class: `mark picked${variant.hollow ? " hollow" : ""}`, d: Axes.markPath(set.shapes[variant.mark], x, y, 4.5) })));
     }
     root.addEventListener("click", (event) => {
       const found = nearest(points, event, root, 12);
@@ -298,10 +306,10 @@ const Pictures = (() => {
       line("rule", 10, 75, 140, 75),
       line("rule", 75, 10, 75, 140),
       ...offsets.map(([u, v]) => svg("circle", { class: "offset", cx: fixed(at(u)), cy: fixed(at(v)), r: 2 })),
-      text(75, 148, "middle", `ring: ${Axes.plain(ring)} px`),
+      text(75, 145, "middle", `ring: ${Axes.plain(ring)} px`),
     ];
     Axes.picture(box, size, size, `Offsets of ${offsets.length} spots, within a ring of ${Axes.plain(ring)} pixels`, parts);
   }
 
-  return { strip, stripHead, curves, moveCursor, plan, scatter, timeline, target };
+  return { strip, stripHead, curves, moveCursor, plan, scaleKey, scatter, timeline, target };
 })();

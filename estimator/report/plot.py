@@ -13,9 +13,11 @@ from estimator.report.svg import cross, line, mark, picture, slots_of, style_of_
 
 WIDTH, HEIGHT = 560, 360
 LEFT, TOP, BOTTOM = 84, 40, 48
-LEGEND = 270
+LEGEND, LETTER = 36, 7.3
+"""Width of the legend's marks, and of a letter of its names at most on average."""
 LINE = 18
 PANEL, CELL_GAP = 360, 1
+PANELS_ACROSS = 3
 MAX_PANELS = 20
 COLOUR_MAP = ((68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37))
 """Red, green and blue of matplotlib's viridis at 0, 1/4, ... 1."""
@@ -160,7 +162,8 @@ def _line_plot(table: Table, log: Collection[str] | None, lines: Sequence[Line])
     for place, (slot, group) in enumerate(zip(slots, groups, strict=True)):
         parts.append(mark(LEFT + WIDTH + 24, TOP + LINE * (place + 0.5), 4, slot))
         parts.append(text(LEFT + WIDTH + 36, TOP + LINE * (place + 0.5) + 4, ", ".join(group), "start"))
-    whole = picture(LEFT + WIDTH + LEGEND, TOP + height + BOTTOM, f"{_name(table)} by {table.x[0]}", parts)
+    legend = LEGEND + LETTER * max(len(", ".join(group)) for group in groups)
+    whole = picture(LEFT + WIDTH + legend, TOP + height + BOTTOM, f"{_name(table)} by {table.x[0]}", parts)
     return svg_file(whole, f"{style_of_variants(max(slots) + 1)}\n{BAND}")
 
 
@@ -196,9 +199,11 @@ def _heat_maps(table: Table, log: Collection[str] | None) -> str:
     across, down = (sorted({row.keys[index] for row in table.rows}, key=_order) for index in (0, 1))
     scale = Axis.of([row.statistics[0].value for row in table.rows], _asked(log, "value"), pad=0.0)
     width, height = PANEL / len(across), PANEL / len(down)
+    deep = TOP + PANEL + BOTTOM
     parts = [text(LEFT, 18, _name(table), "start")]
     for number, (group, rows) in enumerate(groups.items()):
-        left, top = LEFT + number * (PANEL + LEFT), TOP + 20
+        left = LEFT + number % PANELS_ACROSS * (PANEL + LEFT)
+        top = TOP + 20 + number // PANELS_ACROSS * deep
         parts.append(text(left + PANEL / 2, top - 8, ", ".join(group), "middle"))
         for row in rows:
             x = left + width * across.index(row.keys[0])
@@ -217,9 +222,10 @@ def _heat_maps(table: Table, log: Collection[str] | None) -> str:
             parts.append(text(left - 6, top + PANEL - height * (index + 0.5) + 4, words, "end"))
         parts.append(text(left + PANEL / 2, top + PANEL + 36, table.x[0], "middle"))
         parts.append(text(left - 6, top - 8, table.x[1], "end"))
-    left = LEFT + len(groups) * (PANEL + LEFT) - LEFT + 24
+    left = min(len(groups), PANELS_ACROSS) * (PANEL + LEFT) + 24
     parts += _colour_scale(table, scale, left)
-    whole = picture(left + 110, TOP + 20 + PANEL + BOTTOM, f"{_name(table)} by {table.x[0]} and {table.x[1]}", parts)
+    down_px = math.ceil(len(groups) / PANELS_ACROSS) * deep
+    whole = picture(left + 110, 20 + down_px, f"{_name(table)} by {table.x[0]} and {table.x[1]}", parts)
     return svg_file(whole, BAND)
 
 

@@ -5,7 +5,7 @@ from markupsafe import Markup
 from estimator.evaluate.score import Scores
 
 SIDE = 176.0
-MAX_DOTS = 400
+MAX_DOTS = 2000
 
 
 def thumbnail(scores: Scores) -> Markup:
@@ -16,17 +16,13 @@ def thumbnail(scores: Scores) -> Markup:
     scale = SIDE / max(across, deep)
     width, height = across * scale, deep * scale
 
-    def dots(places: list[tuple[float, float]], radius: float) -> str:
+    def dots(places: list[tuple[float, float]]) -> str:
         shown = places[:: -(-len(places) // MAX_DOTS)] if places else []
-        return "".join(
-            f"M{x * scale - radius:.1f} {height - y * scale:.1f}a{radius} {radius} 0 1 0 {2 * radius} 0"
-            f"a{radius} {radius} 0 1 0 {-2 * radius} 0"
-            for x, y in shown
-        )
+        return "".join(f"M{x * scale:.1f} {height - y * scale:.1f}h0" for x, y in shown)
 
-    leds = dots([led.position_m[:2] for led in scores.led_map], 1.2)
+    leds = dots([led.position_m[:2] for led in scores.led_map])
     rows = scores.variants[0].rows if scores.variants else ()
-    true = dots([row.true_m[:2] for row in rows], 1.6)
+    true = dots([row.true_m[:2] for row in rows])
     return Markup(
         f'<svg class="thumb" viewBox="-1 -1 {width + 2:.0f} {height + 2:.0f}" role="img" '
         f'aria-label="The room from above"><rect class="wall" width="{width:.1f}" height="{height:.1f}"/>'

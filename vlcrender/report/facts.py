@@ -72,6 +72,11 @@ def _room(contents: Contents) -> str:
     )
 
 
+def _grouped(number: float) -> str:
+    """A whole number with narrow spaces between groups of three digits."""
+    return f"{number:,.0f}".replace(",", "\N{NARROW NO-BREAK SPACE}")
+
+
 def _leds(contents: Contents) -> str:
     leds = contents.dataset.led_map
     if leds is None:
@@ -83,11 +88,13 @@ def _leds(contents: Contents) -> str:
         sizes.setdefault("squares" if entry["shape"] == "square" else "discs", []).append(1e3 * side_m)
     panels = sum(int(one.get("columns", 1)) * int(one.get("rows", 1)) for one in _scene(contents).get("panels") or ())
     inside = f" in {panels} panels" if panels else ""
-    return f"{len(leds)} LEDs{inside}, " + " and ".join(f"{name} of {span(some)} mm" for name, some in sizes.items())
+    return f"{_grouped(len(leds))} LEDs{inside}, " + " and ".join(
+        f"{name} of {span(some)} mm" for name, some in sizes.items()
+    )
 
 
 def _poses(contents: Contents, recipe: Mapping[str, Any]) -> str:
-    parts = [f"{len(contents.frames)} frames"]
+    parts = [f"{_grouped(len(contents.frames))} frames"]
     devices = len({row.device for row in contents.frames})
     if devices > 1:
         parts[0] += f" of {devices} devices"
@@ -122,7 +129,7 @@ def _lens(one: Any) -> str:
 
 def _sensor(contents: Contents) -> str:
     one = contents.dataset.sensor
-    parts = [f"{one.bits} bit", f"{one.gain_e_per_dn:.3g} e⁻/DN", f"full well {one.full_well_e:g} e⁻"]
+    parts = [f"{one.bits} bit", f"{one.gain_e_per_dn:.3g} e⁻/DN", f"full well {_grouped(one.full_well_e)} e⁻"]
     noise = NOISE.get(one.noise, f"read noise {one.read_noise_e:.3g} e⁻, uneven response {100 * one.prnu:.3g} %")
     rolling = any(camera.shutter.kind == "rolling" for camera in contents.dataset.cameras.values())
     return ", ".join([*parts, noise, *(["rolling shutter"] if rolling else [])]) + _preset(contents, "sensor")

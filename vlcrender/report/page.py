@@ -75,7 +75,7 @@ def _measures(contents: Contents) -> list[tuple[str, NDArray[np.float64]]]:
     whole = [sum(led.visible_fraction >= 1 - 1e-6 for led in row.leds) for row in contents.truth]
     bounds_m = contents.bounds_m()
     fine = len(bounds_m) > 0 and bool(np.median(bounds_m) < 1e-3)
-    return [
+    named = [
         ("tilt of the optical axis, °", np.degrees(np.arccos(np.clip(contents.axes()[:, 2], -1, 1)))),
         ("height of the camera, m", contents.positions_m()[:, 2]),
         ("LEDs whole in view", np.array(whole, dtype=np.float64)),
@@ -84,6 +84,8 @@ def _measures(contents: Contents) -> list[tuple[str, NDArray[np.float64]]]:
         ("accelerometer off by, °", contents.gravity_errors_deg()),
         ("Cramér-Rao bound, µm", 1e6 * bounds_m) if fine else ("Cramér-Rao bound, mm", 1e3 * bounds_m),
     ]
+    # A unit stays with the word before it.
+    return [(name.replace(", ", ",\N{NO-BREAK SPACE}"), values) for name, values in named]
 
 
 def _previews(contents: Contents) -> list[Preview]:

@@ -11,6 +11,8 @@ WIDTH = 460.0
 LEFT, BOTTOM, TOP = 26.0, 32.0, 6.0
 MAX_LEDS = 4000
 BINS = 12
+HALF_LABEL = 22.0
+"""Half the width of a number of three digits, in units of the plots."""
 
 
 def floor_plan(room_m: Sequence[float], leds_m: Floats, positions_m: Floats, axes: Floats) -> Markup:
@@ -50,41 +52,43 @@ def directions(axes: Floats) -> Markup:
     largest = 20.0 * max(2, np.ceil(polar.max() / 20))
     turn = np.arctan2(axes[:, 1], axes[:, 0])
     u, v = (size / 2 + polar / largest * radius * np.cos(turn)), (size / 2 - polar / largest * radius * np.sin(turn))
+    values = np.arange(20.0, largest + 1, 20)
     rings = "".join(
-        f'<circle class="rule" cx="{size / 2}" cy="{size / 2}" r="{ring / largest * radius:.1f}"/>'
-        f'<text x="{size / 2 + 3}" y="{size / 2 - ring / largest * radius - 2:.1f}">{ring:g}°</text>'
-        for ring in np.arange(20.0, largest + 1, 20)
+        f'<circle class="rule" cx="{size / 2}" cy="{size / 2}" r="{ring / largest * radius:.1f}"/>' for ring in values
+    )
+    labels = "".join(
+        f'<text x="{size / 2 + 3}" y="{size / 2 - ring / largest * radius - 2:.1f}">{ring:g}°</text>' for ring in values
     )
     dots = "".join(f"M{a - 2.5:.1f} {b:.1f}a2.5 2.5 0 1 0 5 0a2.5 2.5 0 1 0 -5 0" for a, b in zip(u, v, strict=True))
     middle, first = size / 2, size / 2 - radius
     cross = f'<path class="rule" d="M{first} {middle}h{2 * radius}M{middle} {first}v{2 * radius}"/>'
-    label = f'<text x="{size / 2 + radius + 4}" y="{size / 2 + 4}">x</text>'
-    return _svg(size, size, "Directions of the optical axis", rings + cross + f'<path class="dot" d="{dots}"/>' + label)
+    labels += f'<text x="{size / 2 + radius + 4}" y="{size / 2 + 4}">x</text>'
+    return _svg(
+        size, size, "Directions of the optical axis", rings + cross + f'<path class="dot" d="{dots}"/>' + labels
+    )
 
 
 def histogram(name: str, values: Floats) -> Markup:
     """Frames by a value, with the median as a line; empty where all values agree."""
     if len(values) < 2 or np.ptp(values) <= 1e-9 * np.abs(values).max():
         return Markup("")
-    width, height, base = 230.0, 122.0, 100.0
+    width, height, base, tallest = 230.0, 134.0, 112.0, 94.0
     counts, edges = np.histogram(values, min(BINS, max(2, len(values) // 2)))
     wide = width / len(counts)
+    heights = tallest * counts / counts.max()
     bars = "".join(
-        f'<rect class="bar" x="{k * wide + 0.5:.1f}" y="{base - 96 * count / counts.max():.1f}" width="{wide - 1:.1f}" '
-        f'height="{96 * count / counts.max():.1f}"><title>{edge:.3g} to {after:.3g}: {count} frames</title></rect>'
-        for k, (count, edge, after) in enumerate(zip(counts, edges, edges[1:], strict=False))
+        f'<rect class="bar" x="{k * wide + 0.5:.1f}" y="{base - high:.1f}" width="{wide - 1:.1f}" height="{high:.1f}">'
+        f"<title>{edge:.3g} to {after:.3g}: {count} frames</title></rect>"
+        for k, (high, count, edge, after) in enumerate(zip(heights, counts, edges, edges[1:], strict=False))
     )
     median = float(np.median(values))
     middle = width * (median - edges[0]) / (edges[-1] - edges[0])
-    # The median's label takes the place of one at an end that it would cover.
-    near_low, near_high = middle < 80, middle > width - 80
-    anchor, at = ("start", 0.0) if near_low else ("end", width) if near_high else ("middle", middle)
-    texts = f'<text class="lab" x="{at:.1f}" y="{base + 15}" text-anchor="{anchor}">{median:.3g}</text>'
-    if not near_low:
-        texts += f'<text x="0" y="{base + 15}">{edges[0]:.3g}</text>'
-    if not near_high:
-        texts += f'<text x="{width}" y="{base + 15}" text-anchor="end">{edges[-1]:.3g}</text>'
-    line = f'<line class="axis" x1="{middle:.1f}" x2="{middle:.1f}" y1="4" y2="{base}"/>'
+    # The median's label stands above its line, those of the ends below theirs: none covers another.
+    at = min(max(middle, HALF_LABEL), width - HALF_LABEL)
+    texts = f'<text class="lab" x="{at:.1f}" y="{TOP + 5}" text-anchor="middle">{median:.3g}</text>'
+    texts += f'<text x="0" y="{base + 15}">{edges[0]:.3g}</text>'
+    texts += f'<text x="{width}" y="{base + 15}" text-anchor="end">{edges[-1]:.3g}</text>'
+    line = f'<line class="axis" x1="{middle:.1f}" x2="{middle:.1f}" y1="{TOP + 9}" y2="{base}"/>'
     return _svg(width, height, f"Frames by {name}; median {median:.3g}", bars + line + texts)
 
 
