@@ -162,7 +162,7 @@ def test_show_draws_a_frame_of_a_recipe_with_its_camera_in_any_scene(tmp_path: P
     result = run("vlcrender", "show", TABLE1, RECIPE, "--frame", "2", *changes, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert "table1: poses" in result.stdout
-    assert "(18.92 x 14.25 deg view)" in result.stdout
+    assert "by a view of 18.92 x 14.25 deg\n" in result.stdout
     assert re.search(r"frame 2 of 8: \d+ LEDs light 1 region\n", result.stdout)
     assert (tmp_path / "quickstart.png").read_bytes().startswith(b"\x89PNG")
 

@@ -5,7 +5,7 @@ import pytest
 from vlcrender.report.terminal import print_table
 
 ROWS = (
-    ("tilted 0 to 60 deg on both axes, not aimed", "0.75", "122500", "83.46 %"),
+    ("tilted 0 to 60 deg on both axes", "0.75", "122500", "83.46 %"),
     (),
     ("[all]", "", "122506", "1.2e-07"),
 )

@@ -42,7 +42,7 @@ def unit_in_last_place(number: str) -> float:
 
 def test_the_page_shows_what_its_commands_print(tutorial: Tutorial) -> None:
     shown = PAGE.read_text(encoding="utf-8")
-    assert shown.count("```text\n") == 3
+    assert shown.count("```text\n") == 4
     words, here = (NUMBER.sub("#", text).split() for text in (shown, tutorial.text))
     assert here == words, "run make docs"
     # Frames are the same bits on every machine. Positions are the result of iterations in floating point, whose sums

@@ -93,10 +93,11 @@ def show(
             tilted_visibility(camera, loaded, height),
         ):
             share = f"{100 * visibility.share:.2f} %"
-            rows.append((visibility.attitude, f"{height:g}", str(visibility.poses), share))
+            rows.append((visibility.attitude, f"{height:g}", str(visibility.poses), str(visibility.seen), share))
     print_table(
-        f"{loaded.name}: poses that see {ENOUGH_LEDS} LEDs or more, by a view of {across:.4g} x {down:.4g} deg",
-        ("attitude", "height, m", "poses", "share"),
+        f"{loaded.name}: poses, not aimed, that see {ENOUGH_LEDS} LEDs or more "
+        f"by a view of {across:.4g} x {down:.4g} deg",
+        ("attitude", "height, m", "poses", "seeing", "share"),
         rows,
     )
     print_flicker(loaded)

@@ -110,7 +110,7 @@ def tilted_visibility(camera: Camera, scene: Scene, height_m: float) -> Visibili
         posed = PosedCamera(camera, Pose(tuple(position), *triple))
         near = scene.leds.spheres.candidates(posed)
         counts[i] = _on_sensor(camera, posed.camera_coordinates(scene.leds.centers_m[near])).sum()
-    attitude = f"tilted 0 to {TILT_LIMIT_DEG:.0f} deg on both axes, not aimed"
+    attitude = f"tilted 0 to {TILT_LIMIT_DEG:.0f} deg on both axes"
     return Visibility(height_m, attitude, TILTED_POSES, int((counts >= ENOUGH_LEDS).sum()))
 
 
