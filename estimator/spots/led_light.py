@@ -6,6 +6,7 @@ of 60 cm by a wide lens it changes by a third, which moved the centroid by 0.4 p
 tells the fall-off by its own light, and the background is subtracted with it.
 """
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -82,8 +83,10 @@ class Ellipse:
         du, dv = u_px - self.centre_px[0], v_px - self.centre_px[1]
         (uu, uv), (_, vv) = ((self.axes / (self.semi_axes_px + padding_px) ** 2) @ self.axes.T).tolist()
         # uu du^2 + vv dv^2 + 2 uv du dv as one product of matrices, which takes a third of the time of its sums.
-        by_row = np.concatenate([vv * dv**2, np.ones_like(dv), 2 * uv * dv], axis=1)
-        return np.asarray(by_row @ np.concatenate([np.ones_like(du), uu * du**2, du]))
+        by_row, by_column = np.ones((len(dv), 3)), np.ones((3, du.shape[1]))
+        by_row[:, :1], by_row[:, 2:] = vv * dv**2, 2 * uv * dv
+        by_column[1], by_column[2] = uu * du[0] ** 2, du[0]
+        return np.asarray(by_row @ by_column)
 
     def half_extent(self, padding_px: float) -> NDArray[np.float64]:
         """Half width and half height, (2,), of the upright box around the padded ellipse."""
@@ -196,8 +199,9 @@ def light_of(readout: Readout, ellipse: Ellipse, others: list[Ellipse], denoise_
     roi = np.s_[top:bottom, left:right]
     u_px, v_px = _centres_px(left, right)[None, :], _centres_px(top, bottom)[:, None]
     electrons = readout.image_e[roi].astype(np.float64)
-    fall_off: Pixels | float = 1.0
-    distance2 = ellipse.distance2(u_px, v_px, margin_px)
+    fall_off: Pixels | None = None
+    if ellipse.core is None or others:
+        distance2 = ellipse.distance2(u_px, v_px, margin_px)
     if ellipse.core is None:
         support = distance2 <= 1
         ring = ellipse.distance2(u_px, v_px, margin_px + RING_PX) <= 1
@@ -220,21 +224,24 @@ def light_of(readout: Readout, ellipse: Ellipse, others: list[Ellipse], denoise_
     if readout.prnu > 0:
         variance_e2 += (readout.prnu * raw_e) ** 2
     above_e = electrons
-    if ring.any():
-        of_ring = np.flatnonzero(ring)
+    of_ring = np.flatnonzero(ring)
+    if len(of_ring):
+        ring_variance_e2 = variance_e2.take(of_ring)
         # One electron more: the noise of a pixel with fewer is not normal.
-        gate_e = BACKGROUND_SIGMA * float(np.sqrt(_median(variance_e2.ravel()[of_ring]) + 1.0))
-        ring_fall_off = np.ones(len(of_ring)) if isinstance(fall_off, float) else fall_off.ravel()[of_ring]
-        even_e = electrons.ravel()[of_ring] / ring_fall_off
+        gate_e = BACKGROUND_SIGMA * math.sqrt(_median(ring_variance_e2) + 1.0)
+        ring_fall_off = 1.0 if fall_off is None else fall_off.take(of_ring)
+        even_e = electrons.take(of_ring) / ring_fall_off
         # The ring without pixels of another surface or light; all of it where its median is between two surfaces.
         even = np.abs(even_e - _median(even_e)) <= gate_e
         if not even.any():
             even[:] = True
-        of_ring, ring_fall_off = of_ring[even], ring_fall_off[even]
-        above_e = electrons - float(even_e[even].mean()) * fall_off
+        background_e = float(even_e[even].mean())
+        above_e = electrons - (background_e if fall_off is None else background_e * fall_off)
+        of_ring = of_ring[even]
         if len(of_ring) >= MIN_RING_PIXELS:
-            ring_e = readout.raw_e[roi].ravel()[of_ring] / ring_fall_off
-            excess_e2 = _excess_variance(readout, ring_e, float(variance_e2.ravel()[of_ring].mean()))
+            ring_e = readout.raw_e[roi].take(of_ring).astype(np.float64)
+            ring_e /= 1.0 if fall_off is None else fall_off.take(of_ring)
+            excess_e2 = _excess_variance(readout, ring_e, float(ring_variance_e2[even].mean()))
             if excess_e2 != 0:
                 unlit = support & (above_e <= gate_e)
                 variance_e2[unlit] = np.maximum(variance_e2[unlit] + excess_e2, 0.0)
@@ -269,9 +276,10 @@ def _surroundings(ellipse: Ellipse, padding_px: float, shape: tuple[int, ...]) -
     if ellipse.core is None:
         half_extent = ellipse.half_extent(padding_px)
         low_px, high_px = ellipse.centre_px - half_extent, ellipse.centre_px + half_extent
-    left, top = np.maximum(np.floor(low_px), 0).astype(int).tolist()
-    right, bottom = np.minimum(np.ceil(high_px), shape[::-1]).astype(int).tolist()
-    return left, top, right, bottom
+    (left, top), (right, bottom) = low_px.tolist(), high_px.tolist()
+    height_px, width_px = shape
+    last = min(math.ceil(right), width_px), min(math.ceil(bottom), height_px)
+    return max(math.floor(left), 0), max(math.floor(top), 0), *last
 
 
 def _relative_fall_off(electrons: Pixels, inside: NDArray[np.bool_]) -> Pixels:
