@@ -8,7 +8,7 @@ tells the fall-off by its own light, and the background is subtracted with it.
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import cv2
 import numpy as np
@@ -93,26 +93,16 @@ class Ellipse:
         return np.asarray(np.sqrt((self.axes**2) @ (self.semi_axes_px + padding_px) ** 2))
 
 
-@dataclass(frozen=True, eq=False)
 class Moments:
-    """Sums of weights (rows, columns): all of them, by column and by row."""
+    """Sums of weights (rows, columns): all of them, `total`; `by_column` (columns,) and `by_row` (rows,)."""
 
-    weights: NDArray[np.float64]
-
-    @cached_property
-    def total(self) -> float:
-        """Sum of the weights."""
-        return float(self.by_row.sum())
-
-    @cached_property
-    def by_column(self) -> NDArray[np.float64]:
-        """Sums (columns,) over the rows."""
-        return np.asarray(np.ones(self.weights.shape[0]) @ self.weights)
-
-    @cached_property
-    def by_row(self) -> NDArray[np.float64]:
-        """Sums (rows,) over the columns."""
-        return np.asarray(self.weights @ np.ones(self.weights.shape[1]))
+    def __init__(self, weights: NDArray[np.float64]) -> None:
+        """Sum the weights."""
+        rows, columns = weights.shape
+        self.weights = weights
+        self.by_column = np.asarray(_ones(rows) @ weights)
+        self.by_row = np.asarray(weights @ _ones(columns))
+        self.total = float(self.by_row.sum())
 
     def first(self, u_px: Pixels, v_px: Pixels) -> NDArray[np.float64]:
         """Sums (2,) of the weights times u (columns,) and v (rows,)."""
@@ -209,9 +199,10 @@ def light_of(readout: Readout, ellipse: Ellipse, others: list[Ellipse], denoise_
         face = np.zeros(electrons.shape, dtype=bool)
         column, row = ellipse.low_px.astype(int) - (left, top)
         face[row : row + ellipse.core.shape[0], column : column + ellipse.core.shape[1]] = ellipse.core
-        inside = ~_within(~face, SMOOTHING_PX // 2 + ellipse.fringe_px)
+        (outside,) = _within(~face, SMOOTHING_PX // 2 + ellipse.fringe_px)
+        inside = ~outside
         fall_off = _relative_fall_off(electrons, inside)
-        support, ring = _within(face, margin_px), _within(face, margin_px + RING_PX)
+        support, ring = _within(face, margin_px, margin_px + RING_PX)
     ring &= ~support
     for other in others:
         # A pixel in two supports belongs to the nearer spot.
@@ -255,19 +246,31 @@ def _median(values: NDArray[np.float64]) -> float:
     return float(around[middle - 1 + len(values) % 2] + around[middle]) / 2
 
 
+@lru_cache(maxsize=1024)
+def _ones(count: int) -> Pixels:
+    """Ones (count,), the same array each time."""
+    ones = np.ones(count)
+    ones.setflags(write=False)
+    return ones
+
+
 def _centres_px(first: int, last: int) -> Pixels:
     return np.arange(first, last, dtype=np.float64) + 0.5
 
 
-def _within(mask: NDArray[np.bool_], radius_px: float) -> NDArray[np.bool_]:
-    """Pixels of a mask, and those at most this far from one."""
-    if radius_px > MAX_KERNEL_PX:
-        return np.asarray(
-            cv2.distanceTransform((~mask).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE) <= radius_px
-        )
+def _within(mask: NDArray[np.bool_], *radii_px: float) -> list[NDArray[np.bool_]]:
+    """Pixels of a mask, and those at most this far from one, for each radius."""
+    if max(radii_px) > MAX_KERNEL_PX:
+        distance_px = cv2.distanceTransform((~mask).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        return [np.asarray(distance_px <= radius_px) for radius_px in radii_px]
+    return [np.asarray(cv2.dilate(mask.view(np.uint8), _disc(radius_px)).view(bool)) for radius_px in radii_px]
+
+
+@lru_cache(maxsize=256)
+def _disc(radius_px: float) -> NDArray[np.uint8]:
+    """Pixels at most this far from the middle one."""
     along = np.arange(-int(radius_px), int(radius_px) + 1)
-    disc = (along[:, None] ** 2 + along**2 <= radius_px**2).view(np.uint8)
-    return np.asarray(cv2.dilate(mask.view(np.uint8), disc).view(bool))
+    return (along[:, None] ** 2 + along**2 <= radius_px**2).view(np.uint8)
 
 
 def _surroundings(ellipse: Ellipse, padding_px: float, shape: tuple[int, ...]) -> tuple[int, int, int, int]:
