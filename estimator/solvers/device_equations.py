@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.camera.intrinsics import intrinsic_slopes_px, with_errors
 from estimator.camera.pose import POSE_PARAMETERS, Pose
-from estimator.camera.projection import project
+from estimator.camera.projection import images_px, project
 from estimator.io.camera import INTRINSICS, Camera
 from estimator.io.led_map import Led, Luminaire, MapDatum
 
@@ -221,7 +221,8 @@ class DeviceEquations:
         by_camera = intrinsic_slopes_px(seen.p_cam, camera.normalized(seen.pixels), camera)
         own = np.concatenate([seen.slopes, by_camera[:, :, self.shot_places]], axis=2)
         own = np.einsum("nij,njk->nik", self.whitening, own).reshape(2 * n, -1)
-        by_common = np.einsum("nij,njk->nik", self.whitening, self._by_common(seen.slopes, by_camera, common))
+        by_common = self._by_common(positions_m, seen.slopes, by_camera, common)
+        by_common = np.einsum("nij,njk->nik", self.whitening, by_common)
         shared = by_common.reshape(2 * n, -1)[:, self.present]
         gravity = 2 if self.with_gravity else 0
         below = np.zeros((gravity + len(self.shot_places), own.shape[1]))
@@ -251,9 +252,8 @@ class DeviceEquations:
             projector=spots @ spots.T,
         )
 
-    def _by_common(self, slopes: Floats, by_camera: Floats, common: Floats) -> Floats:
+    def _by_common(self, positions_m: Floats, slopes: Floats, by_camera: Floats, common: Floats) -> Floats:
         """Derivatives (n, 2, all) of the pixels by the common unknowns of the frame, in the order of the columns."""
-        positions_m = self.positions_m(common)
         n = len(positions_m)
         by_position = -slopes[:, :, :3]
         by_scale = np.einsum("nij,nj->ni", by_position, positions_m)[:, :, None]
@@ -275,8 +275,8 @@ def _centroids_px(positions_m: Floats, extent_m: Floats, pose: Pose, camera: Cam
     Their images are weighted by the irradiance of the lens, z / |X|^4 (`estimator.solvers.observations`).
     """
     points_m = positions_m[:, None] + extent_m[:, None, None] * FACE
-    seen = project(points_m.reshape(-1, 3), pose, camera)
-    p_cam = seen.p_cam.reshape(-1, 4, 3)
+    pixels, p_cam = images_px(points_m.reshape(-1, 3), pose, camera)
+    p_cam = p_cam.reshape(-1, 4, 3)
     weights = p_cam[..., 2] / (p_cam**2).sum(axis=2) ** 2
     weights /= weights.sum(axis=1, keepdims=True)
-    return np.asarray((weights[..., None] * seen.pixels.reshape(-1, 4, 2)).sum(axis=1))
+    return np.asarray((weights[..., None] * pixels.reshape(-1, 4, 2)).sum(axis=1))
