@@ -5,6 +5,8 @@ point at depth z spreads over a disc of diameter D f_i |1/s - 1/z|. Airy pattern
 7th ed., 8.5.2, Eq. 14.
 """
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import convolve
@@ -122,6 +124,7 @@ def _disc(diameter: float) -> Floats:
     return rois.roi(covered, 0) / (np.pi * diameter**2 / 4)
 
 
+@lru_cache(maxsize=16)
 def _airy(scale: float) -> Floats:
     """Airy pattern in each pixel, centred on the middle pixel: means over AIRY_SAMPLES^2 points."""
     half_width = int(np.ceil(AIRY_RADIUS * scale))

@@ -67,10 +67,10 @@ class Spot:
     """An LED image: its centroid (u, v), continuous pixels with pixel centres at +0.5, and properties.
 
     `covariance_px2` (2, 2) is the centroid's covariance by the pixels' noise; NaN where it was not asked for. The
-    brightest pixel is given by its centre; in a flat or clipped LED image noise decides which it is, and of equal ones the first, row by row, is taken.
-    `area_px` are the pixels above half level. `touches_border` marks an LED image that may be cut by the border of its
-    region, which biases the centroid; `saturated` one with a pixel that is or may be saturated. `flux_e` is the sum of
-    its light, electrons; NaN where it was not measured.
+    brightest pixel is given by its centre; in a flat or clipped LED image noise decides which it is, and of equal ones
+    the first, row by row, is taken. `area_px` are the pixels above half level. `touches_border` marks an LED image that
+    may be cut by the border of its region, which biases the centroid; `saturated` one with a pixel that is or may be
+    saturated. `flux_e` is the sum of its light, electrons; NaN where it was not measured.
     """
 
     u_px: float
