@@ -221,8 +221,7 @@ class DeviceEquations:
         by_camera = intrinsic_slopes_px(seen.p_cam, camera.normalized(seen.pixels), camera)
         own = np.concatenate([seen.slopes, by_camera[:, :, self.shot_places]], axis=2)
         own = np.einsum("nij,njk->nik", self.whitening, own).reshape(2 * n, -1)
-        by_common = self._by_common(positions_m, seen.slopes, by_camera, common)
-        by_common = np.einsum("nij,njk->nik", self.whitening, by_common)
+        by_common = np.einsum("nij,njk->nik", self.whitening, self._by_common(seen.slopes, by_camera, common))
         shared = by_common.reshape(2 * n, -1)[:, self.present]
         gravity = 2 if self.with_gravity else 0
         below = np.zeros((gravity + len(self.shot_places), own.shape[1]))
@@ -252,8 +251,9 @@ class DeviceEquations:
             projector=spots @ spots.T,
         )
 
-    def _by_common(self, positions_m: Floats, slopes: Floats, by_camera: Floats, common: Floats) -> Floats:
+    def _by_common(self, slopes: Floats, by_camera: Floats, common: Floats) -> Floats:
         """Derivatives (n, 2, all) of the pixels by the common unknowns of the frame, in the order of the columns."""
+        positions_m = self.positions_m(common)
         n = len(positions_m)
         by_position = -slopes[:, :, :3]
         by_scale = np.einsum("nij,nj->ni", by_position, positions_m)[:, :, None]
