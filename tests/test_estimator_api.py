@@ -2,7 +2,7 @@
 
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -41,9 +41,9 @@ def record() -> dict[str, Any]:
     }
 
 
-def loaded(code: str) -> set[str]:
-    """Heavy packages that a fresh interpreter has loaded after `code`."""
-    report = f"import sys\n{code}\nprint([name for name in {HEAVY} if name in sys.modules])"
+def loaded(code: str, packages: Sequence[str] = HEAVY) -> set[str]:
+    """Which of some packages a fresh interpreter has loaded after `code`, by default of the heavy ones."""
+    report = f"import sys\n{code}\nprint([name for name in {packages!r} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", report], capture_output=True, text=True, check=True)
     return set(eval(done.stdout.strip().splitlines()[-1]))
 
@@ -52,6 +52,11 @@ def test_the_import_and_the_help_load_no_heavy_package() -> None:
     assert loaded("import estimator; dir(estimator); estimator.__version__; estimator.InputError") == set()
     assert loaded("from estimator.cli import main\nmain(['--help'])") == set()
     assert loaded("from estimator.cli import main\nmain(['run', '--help'])") == set()
+
+
+def test_a_run_does_without_scipy_stats() -> None:
+    """It takes as long to import as all else; `scipy.signal` imports it."""
+    assert loaded("import estimator.evaluate.run", ("scipy.stats", "scipy.signal")) == set()
 
 
 def test_every_public_name_exists_has_a_docstring_and_is_listed() -> None:

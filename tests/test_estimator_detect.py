@@ -268,6 +268,17 @@ def test_an_led_between_two_surfaces_of_equal_share_has_a_centroid() -> None:
     assert np.hypot(spot.u_px - 60, spot.v_px - 50) < 0.1
 
 
+def test_without_covariances_all_else_is_the_same() -> None:
+    v, u = np.mgrid[:100, :120] + 0.5
+    image = (40 + 3960.0 * (np.hypot(u - 60.3, v - 50.2) < 9)).astype(np.float32)
+    readout = Readout(0, 0, neighbourhood_mean(image), image, np.zeros(image.shape, bool))
+    (whole,) = detect([readout], image.size, NEIGHBOURHOOD_RADIUS_PX)
+    (spot,) = detect([readout], image.size, NEIGHBOURHOOD_RADIUS_PX, with_covariances=False)
+    assert np.isfinite(whole.covariance_px2).all()
+    assert np.isnan(spot.covariance_px2).all()
+    assert {**vars(spot), "covariance_px2": None} == {**vars(whole), "covariance_px2": None}
+
+
 @pytest.mark.parametrize("denoised", [False, True])
 def test_masks_padded_by_distances_are_those_padded_by_dilation(
     denoised: bool, monkeypatch: pytest.MonkeyPatch

@@ -192,6 +192,12 @@ def project(points_m: Floats, pose: Pose, camera: Camera) -> ProjectedPoints:
     return ProjectedPoints(camera.to_pixels(image), slopes, p_cam)
 
 
+def images_px(points_m: Floats, pose: Pose, camera: Camera) -> tuple[Floats, Floats]:
+    """Images (n, 2) of world points (n, 3), and these in camera axes (n, 3): `project` without derivatives."""
+    p_cam = pose.in_camera(points_m)
+    return camera.to_pixels(projection_of(camera).project(p_cam)[0]), p_cam
+
+
 def relative_illumination(pixels: Floats, camera: Camera) -> Floats:
     """Irradiance (n,) of the sensor at pixels (n, 2) by a surface of uniform luminance, up to a common factor.
 

@@ -68,7 +68,7 @@ class Huynh2016:
 
     def __call__(self, frame: DeviceFrame) -> Estimate:
         """Denoise, detect, undistort, level, ranges, position. Raises EstimationFailure."""
-        correspondences = find_correspondences(frame, DENOISERS[self.denoise])
+        correspondences = find_correspondences(frame, DENOISERS[self.denoise], with_covariances=False)
         K, leds_m = frame.camera.matrix(), led_positions_m(correspondences)
         tilt = LEVELS[self.level](*tilt_from_gravity(frame.accelerometer_m_s2))
         level_px = level(pinhole_pixels(SPOTS[self.spot](correspondences), frame.camera), K, tilt)

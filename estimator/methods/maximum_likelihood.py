@@ -31,7 +31,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from estimator.camera.pose import POSE_PARAMETERS, Pose
 from estimator.errors import EstimationFailure
@@ -65,6 +64,7 @@ from estimator.pixels.search import (
 from estimator.receiver.known import with_known_gains
 from estimator.solvers import second_order
 from estimator.solvers.camera_check import CameraErrors
+from estimator.solvers.chi_square import chi2_limit
 from estimator.solvers.observations import Observations, observe_once
 from estimator.solvers.reprojection import fit
 from estimator.solvers.uncertainty import assumed_uncertainty
@@ -289,7 +289,7 @@ def _differ(information: Floats, gradient: Floats, tolerance: Floats, more: floa
     D, g, trace, tolerance = information[informed], gradient[informed], trace[informed], tolerance[informed]
     spread = D + D @ D * tolerance[:, None, None] ** 2 + 1e-12 * trace[:, None, None] * np.eye(D.shape[1])
     total = np.einsum("ni,ni->", g, np.linalg.solve(spread, g[:, :, None])[:, :, 0]) + more
-    return bool(total > chi2.isf(REVEALED_PROBABILITY, g.size + freedom))
+    return bool(total > chi2_limit(REVEALED_PROBABILITY, g.size + freedom))
 
 
 def _of_places(z: Nuisances, used: Mask) -> float:

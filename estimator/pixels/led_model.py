@@ -15,7 +15,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,6 +27,7 @@ from estimator.io.camera import Camera
 from estimator.io.led_map import Led
 from estimator.pixels.polygon_raster import MAX_EDGE_PX, EdgePieces, Outlines, RoiStack, cover
 from estimator.pixels.psf import LensBlur
+from estimator.pixels.region_blur import RegionBlur
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -37,6 +37,9 @@ COARSE_POINTS = 32
 MIN_POINTS = 128
 # Margin on the number of points: edges must stay within MAX_EDGE_PX while the pose is searched.
 EDGE_MARGIN = 1.25
+# Before the blur an LED image stays within this of its footprint, pixels, until its pixels are gathered anew: it may
+# have moved by a pixel, and a step is as long at most.
+SHARP_MARGIN_PX = 4
 # Chebyshev nodes across and down a region at which the lens's fall-off is computed; it is interpolated between them by
 # a polynomial. Over a region of 0.5 rad, cos^4 is then exact to 1e-6 of the light (tested).
 FALL_OFF_NODES = 10
@@ -229,6 +232,7 @@ class RenderedLeds:
     _rois: RoiStack
     _pieces: EdgePieces
     _lens: LensBlur
+    _slope_blur: RegionBlur | None
 
     def by_shift_and_size(self) -> "RenderedLeds":
         """The same images, with derivatives by the principal point, which shifts them, and by the size alone."""
@@ -243,8 +247,8 @@ class RenderedLeds:
 
     def slopes(self, cells: Ints) -> Floats:
         """Derivatives of the light in n cells by the p parameters of the model, (n, p)."""
-        pieces, lens = self._pieces, self._lens
-        if not lens.kernels:
+        pieces, lens, blur = self._pieces, self._lens, self._slope_blur
+        if blur is None:
             index = np.full(self._rois.cells(), len(cells))
             index[cells] = np.arange(len(cells))
             at = index[self._rois.cell(pieces.roi, pieces.row, pieces.column)]
@@ -252,13 +256,12 @@ class RenderedLeds:
             for parameter, slope in enumerate(pieces.slopes):
                 sums[parameter] = np.bincount(at, slope, len(cells) + 1)[:-1]
             return sums.T
-        fine = self._rois.padded(lens.radius_px).subdivided(lens.slope_factors)
         coarsening = (lens.factors // lens.slope_factors)[pieces.roi]
-        at = fine.cell(pieces.roi, pieces.row // coarsening, pieces.column // coarsening)
+        at = blur.fine.cell(pieces.roi, pieces.row // coarsening, pieces.column // coarsening)
         slopes = np.empty((len(cells), len(pieces.slopes)))
         for parameter, slope in enumerate(pieces.slopes):
-            sharp: Floats = np.asarray(np.bincount(at, slope / coarsening**2, fine.cells()), dtype=np.float64)
-            slopes[:, parameter] = _blurred(sharp, fine, self._rois, lens, lens.slope_kernels)[cells]
+            sharp = np.bincount(at, slope / coarsening**2, blur.fine.cells())
+            slopes[:, parameter] = blur(np.asarray(sharp, dtype=np.float64))[cells]
         return slopes
 
 
@@ -277,11 +280,16 @@ class LedImageModel:
         self.fall_off = fall_off(rois, footprints.centre, camera)
         self._camera = camera
         self._lens = lens
-        self._fine = rois.padded(lens.radius_px).subdivided(lens.factors)
-        blurred = len(lens.kernels) > 0
-        self._fine_fall_off = (
-            fall_off(self._fine, footprints.centre, camera, lens.factors) if blurred else self.fall_off
-        )
+        self._blur = self._slope_blur = None
+        self._fine, self._fine_fall_off = rois, self.fall_off
+        if lens.kernels:
+            first = np.floor(footprints.low).astype(np.int64) - SHARP_MARGIN_PX
+            size = np.ceil(footprints.high).astype(np.int64) + SHARP_MARGIN_PX - first
+            sharp = RoiStack(first[:, 1], first[:, 0], size[:, 1], size[:, 0])
+            self._blur = RegionBlur(sharp, rois, lens.kernels, lens.factors)
+            self._slope_blur = RegionBlur(sharp, rois, lens.slope_kernels, lens.slope_factors)
+            self._fine = self._blur.fine
+            self._fine_fall_off = fall_off(self._fine, footprints.centre, camera, lens.factors)
         needed = np.maximum(MIN_POINTS, EDGE_MARGIN * footprints.max_edge_px * COARSE_POINTS / MAX_EDGE_PX)
         counts = 4 * np.ceil(needed * lens.factors / 4).astype(np.int64)
         last = np.cumsum(counts)
@@ -304,9 +312,9 @@ class LedImageModel:
         covered, pieces = cover(self._fine, outlines)
         light = covered * self._fine_fall_off
         pieces = pieces.times(self._fine_fall_off[self._fine.cell(pieces.roi, pieces.row, pieces.column)])
-        if lens.kernels:
-            light = _blurred(light, self._fine, self.rois, lens, lens.kernels)
-        return RenderedLeds(light, parameters, self.rois, pieces, lens)
+        if self._blur is not None:
+            light = self._blur(light)
+        return RenderedLeds(light, parameters, self.rois, pieces, lens, self._slope_blur)
 
 
 def _slopes(rims: ProjectedPoints, offsets_m: Floats, camera: Camera, parameters: Ints) -> Floats:
@@ -326,23 +334,3 @@ def _slopes(rims: ProjectedPoints, offsets_m: Floats, camera: Camera, parameters
             if first <= parameter < first + block.shape[2]:
                 slopes[:, column] = block[:, :, parameter - first].T
     return slopes
-
-
-def _blurred(image: Floats, fine: RoiStack, rois: RoiStack, lens: LensBlur, kernels: Sequence[Floats]) -> Floats:
-    """Image of padded, subdivided regions, convolved with the kernels and averaged to the pixels of `rois`."""
-    blurred = np.zeros(rois.cells())
-    for k, kernel in enumerate(kernels):
-        convolved = _convolved(fine.roi(image, k), kernel)
-        rows, columns = (int(size[k]) + 2 * lens.radius_px for size in (rois.heights, rois.widths))
-        blocks = convolved.reshape(rows, convolved.shape[0] // rows, columns, convolved.shape[1] // columns)
-        inner = slice(lens.radius_px, -lens.radius_px)
-        rois.roi(blurred, k)[:] = blocks.mean(axis=(1, 3))[inner, inner]
-    return blurred
-
-
-def _convolved(image: Floats, kernel: Floats) -> Floats:
-    """Convolution with zeros beyond the image."""
-    # OpenCV correlates: flip the kernel.
-    flipped = np.ascontiguousarray(kernel[::-1, ::-1], dtype=np.float32)
-    single = np.ascontiguousarray(image, dtype=np.float32)  # accurate to a millionth of the light, in half the time
-    return np.asarray(cv2.filter2D(single, -1, flipped, borderType=cv2.BORDER_CONSTANT), dtype=np.float64)

@@ -5,9 +5,11 @@ point at depth z spreads over a disc of diameter D f_i |1/s - 1/z|. Airy pattern
 7th ed., 8.5.2, Eq. 14.
 """
 
+from functools import lru_cache, reduce
+
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import convolve
+from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.special import j1
 
 from estimator.io.camera import Camera
@@ -92,18 +94,26 @@ def airy_scale_px(camera: Camera) -> float:
 
 def _kernel(camera: Camera, disc_px: float, airy_px: float, factor: int) -> Floats:
     """Convolution of all blurs, on pixels subdivided by `factor`, (n, n) with n odd, normalized to 1."""
-    kernel = np.ones((1, 1))
+    parts = []
     if disc_px >= MIN_DISC_PX:
-        kernel = _disc(disc_px * factor)
+        parts.append(_disc(disc_px * factor))
     if airy_px > 0:
-        kernel = convolve(kernel, _airy(airy_px * factor))
+        parts.append(_airy(airy_px * factor))
     if camera.psf_kernel is not None:
         # Measured on whole pixels: it applies at whole-pixel shifts alone.
         measured = np.array(camera.psf_kernel)
         comb = np.zeros((np.array(measured.shape) - 1) * factor + 1)
         comb[::factor, ::factor] = measured
-        kernel = convolve(kernel, comb)
+        parts.append(comb)
+    kernel = reduce(_convolved, parts) if parts else np.ones((1, 1))
     return np.asarray(kernel / kernel.sum())
+
+
+def _convolved(one: Floats, other: Floats) -> Floats:
+    """Full convolution. SciPy's own is not imported: it brings all of `scipy.stats`, two seconds."""
+    rows, columns = np.array(one.shape) + other.shape - 1
+    shape = next_fast_len(int(rows), real=True), next_fast_len(int(columns), real=True)
+    return np.asarray(irfft2(rfft2(one, shape) * rfft2(other, shape), shape)[:rows, :columns], dtype=np.float64)
 
 
 def _disc(diameter: float) -> Floats:
@@ -122,6 +132,7 @@ def _disc(diameter: float) -> Floats:
     return rois.roi(covered, 0) / (np.pi * diameter**2 / 4)
 
 
+@lru_cache(maxsize=16)
 def _airy(scale: float) -> Floats:
     """Airy pattern in each pixel, centred on the middle pixel: means over AIRY_SAMPLES^2 points."""
     half_width = int(np.ceil(AIRY_RADIUS * scale))

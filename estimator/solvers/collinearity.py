@@ -4,7 +4,7 @@ An LED, the projection centre and the LED's image lie on one line: `p_cam = R (a
 the projection of `p_cam`. Each LED gives two equations in the six unknowns, p and R.
 """
 
-from functools import cache
+from functools import cache, lru_cache
 
 import cv2
 import numpy as np
@@ -98,17 +98,21 @@ def fit_pose(leds_m: Floats, image: Floats, projection: Projection, start: Pose)
     None if an LED has no image at the start, or the fit does not converge.
     """
 
-    def pose_of(parameters: Floats) -> Pose:
-        return Pose(parameters[:3], cv2.Rodrigues(parameters[3:])[0])
+    @lru_cache(maxsize=1)
+    def seen(packed: bytes) -> tuple[Pose, Floats, Floats, Floats]:
+        # Residuals and derivatives are asked for at the same parameters, one after the other.
+        parameters = np.frombuffer(packed).copy()
+        R_cam_world, by_vector = cv2.Rodrigues(parameters[3:])
+        pose = Pose(parameters[:3], np.asarray(R_cam_world, dtype=np.float64))
+        found, by_point = projection.project(pose.in_camera(leds_m))
+        # Derivative of the rotation by its vector, (3, 9), row by row.
+        return pose, found, by_point, np.asarray(by_vector.reshape(3, 3, 3), dtype=np.float64)
 
     def residuals(parameters: Floats) -> Floats:
-        return np.asarray(projection.project(pose_of(parameters).in_camera(leds_m))[0] - image).ravel()
+        return np.asarray(seen(parameters.tobytes())[1] - image).ravel()
 
     def jacobian(parameters: Floats) -> Floats:
-        pose = pose_of(parameters)
-        by_point = projection.project(pose.in_camera(leds_m))[1]
-        # Derivative of the rotation by its vector, (3, 9), row by row.
-        by_vector = cv2.Rodrigues(parameters[3:])[1].reshape(3, 3, 3)
+        pose, _, by_point, by_vector = seen(parameters.tobytes())
         rotated = np.einsum("kij,nj->nik", by_vector, leds_m - pose.position_m)
         return np.concatenate([by_point @ -pose.R_cam_world, by_point @ rotated], axis=2).reshape(-1, 6)
 
@@ -128,4 +132,4 @@ def fit_pose(leds_m: Floats, image: Floats, projection: Projection, start: Pose)
         gtol=COST_TOLERANCE,
         max_nfev=MAX_EVALUATIONS,
     )
-    return (pose_of(found.x), 2 * float(found.cost)) if found.success else None
+    return (seen(found.x.tobytes())[0], 2 * float(found.cost)) if found.success else None

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.camera.intrinsics import intrinsic_slopes_px, with_errors
 from estimator.camera.pose import POSE_PARAMETERS, Pose
-from estimator.camera.projection import project
+from estimator.camera.projection import images_px, project
 from estimator.io.camera import INTRINSICS, Camera
 from estimator.io.led_map import Led, Luminaire, MapDatum
 
@@ -275,8 +275,8 @@ def _centroids_px(positions_m: Floats, extent_m: Floats, pose: Pose, camera: Cam
     Their images are weighted by the irradiance of the lens, z / |X|^4 (`estimator.solvers.observations`).
     """
     points_m = positions_m[:, None] + extent_m[:, None, None] * FACE
-    seen = project(points_m.reshape(-1, 3), pose, camera)
-    p_cam = seen.p_cam.reshape(-1, 4, 3)
+    pixels, p_cam = images_px(points_m.reshape(-1, 3), pose, camera)
+    p_cam = p_cam.reshape(-1, 4, 3)
     weights = p_cam[..., 2] / (p_cam**2).sum(axis=2) ** 2
     weights /= weights.sum(axis=1, keepdims=True)
-    return np.asarray((weights[..., None] * seen.pixels.reshape(-1, 4, 2)).sum(axis=1))
+    return np.asarray((weights[..., None] * pixels.reshape(-1, 4, 2)).sum(axis=1))

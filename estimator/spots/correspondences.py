@@ -23,8 +23,12 @@ RAW = DENOISERS["none"]
 MAX_STEADY_OFF = 0.2
 
 
-def find_correspondences(frame: DeviceFrame, denoiser: Denoiser = RAW, cut_too: bool = False) -> list[Correspondence]:
+def find_correspondences(
+    frame: DeviceFrame, denoiser: Denoiser = RAW, cut_too: bool = False, with_covariances: bool = True
+) -> list[Correspondence]:
     """Spots in a frame that are identified as LEDs, with `cut_too` also those that a region's border may cut.
+
+    A method that uses no covariances leaves them out by `with_covariances`; those of raw images are always there.
 
     Under a rolling shutter, spots of LED images with stripes are the centres of their outlines
     (`estimator.spots.striped`), without denoising, which would mix lines. Raises EstimationFailure if no LED is
@@ -33,13 +37,14 @@ def find_correspondences(frame: DeviceFrame, denoiser: Denoiser = RAW, cut_too: 
     striped = has_stripes(frame)
     if striped:
         denoiser = RAW
+    with_covariances |= denoiser is RAW
 
     def identified() -> tuple[Correspondence, ...]:
-        spots = _striped(frame) if striped else _detected(frame, denoiser)
+        spots = _striped(frame) if striped else _detected(frame, denoiser, with_covariances)
         return identify(spots, frame.spots, frame.leds, _gate_px(frame, denoiser), cut_too)
 
     # The reference does not keep the frame, which holds the results, and no other frame equals it.
-    return list(frame.once(("correspondences", denoiser, cut_too, weakref.ref(frame)), identified))
+    return list(frame.once(("correspondences", denoiser, cut_too, with_covariances, weakref.ref(frame)), identified))
 
 
 def _gate_px(frame: DeviceFrame, denoiser: Denoiser) -> float:
@@ -47,7 +52,7 @@ def _gate_px(frame: DeviceFrame, denoiser: Denoiser) -> float:
     return gate_px(frame.camera.width_px) + denoiser.radius_px
 
 
-def _detected(frame: DeviceFrame, denoiser: Denoiser) -> tuple[Spot, ...]:
+def _detected(frame: DeviceFrame, denoiser: Denoiser, with_covariances: bool = True) -> tuple[Spot, ...]:
     """Spots of LED images without stripes; raises EstimationFailure if there is none."""
     any_square = any(frame.leds[spot.led].shape == "square" for spot in frame.spots)
 
@@ -61,10 +66,10 @@ def _detected(frame: DeviceFrame, denoiser: Denoiser) -> tuple[Spot, ...]:
             readouts.append(Readout(part.row, part.column, image, raw, frame.clipped(part), *noise))
         decoded_px = np.array([(spot.u_px, spot.v_px) for spot in frame.spots]).reshape(-1, 2)
         sensor_px = frame.camera.width_px * frame.camera.height_px
-        gate, lens = _gate_px(frame, denoiser), lens_blur(frame.camera)
-        return detect(readouts, sensor_px, denoiser.radius_px, decoded_px, any_square, gate, lens, sensor.crosstalk)
+        rest = _gate_px(frame, denoiser), lens_blur(frame.camera), sensor.crosstalk, with_covariances
+        return detect(readouts, sensor_px, denoiser.radius_px, decoded_px, any_square, *rest)
 
-    return frame.once(("spots", denoiser, frame.spots, any_square), detected)
+    return frame.once(("spots", denoiser, frame.spots, any_square, with_covariances), detected)
 
 
 def _striped(frame: DeviceFrame) -> list[Spot]:

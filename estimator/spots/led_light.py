@@ -6,8 +6,9 @@ of 60 cm by a wide lens it changes by a third, which moved the centroid by 0.4 p
 tells the fall-off by its own light, and the background is subtracted with it.
 """
 
+import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import cv2
 import numpy as np
@@ -82,34 +83,26 @@ class Ellipse:
         du, dv = u_px - self.centre_px[0], v_px - self.centre_px[1]
         (uu, uv), (_, vv) = ((self.axes / (self.semi_axes_px + padding_px) ** 2) @ self.axes.T).tolist()
         # uu du^2 + vv dv^2 + 2 uv du dv as one product of matrices, which takes a third of the time of its sums.
-        by_row = np.concatenate([vv * dv**2, np.ones_like(dv), 2 * uv * dv], axis=1)
-        return np.asarray(by_row @ np.concatenate([np.ones_like(du), uu * du**2, du]))
+        by_row, by_column = np.ones((len(dv), 3)), np.ones((3, du.shape[1]))
+        by_row[:, :1], by_row[:, 2:] = vv * dv**2, 2 * uv * dv
+        by_column[1], by_column[2] = uu * du[0] ** 2, du[0]
+        return np.asarray(by_row @ by_column)
 
     def half_extent(self, padding_px: float) -> NDArray[np.float64]:
         """Half width and half height, (2,), of the upright box around the padded ellipse."""
         return np.asarray(np.sqrt((self.axes**2) @ (self.semi_axes_px + padding_px) ** 2))
 
 
-@dataclass(frozen=True, eq=False)
 class Moments:
-    """Sums of weights (rows, columns): all of them, by column and by row."""
+    """Sums of weights (rows, columns): all of them, `total`; `by_column` (columns,) and `by_row` (rows,)."""
 
-    weights: NDArray[np.float64]
-
-    @cached_property
-    def total(self) -> float:
-        """Sum of the weights."""
-        return float(self.by_row.sum())
-
-    @cached_property
-    def by_column(self) -> NDArray[np.float64]:
-        """Sums (columns,) over the rows."""
-        return np.asarray(np.ones(self.weights.shape[0]) @ self.weights)
-
-    @cached_property
-    def by_row(self) -> NDArray[np.float64]:
-        """Sums (rows,) over the columns."""
-        return np.asarray(self.weights @ np.ones(self.weights.shape[1]))
+    def __init__(self, weights: NDArray[np.float64]) -> None:
+        """Sum the weights."""
+        rows, columns = weights.shape
+        self.weights = weights
+        self.by_column = np.asarray(_ones(rows) @ weights)
+        self.by_row = np.asarray(weights @ _ones(columns))
+        self.total = float(self.by_row.sum())
 
     def first(self, u_px: Pixels, v_px: Pixels) -> NDArray[np.float64]:
         """Sums (2,) of the weights times u (columns,) and v (rows,)."""
@@ -196,8 +189,9 @@ def light_of(readout: Readout, ellipse: Ellipse, others: list[Ellipse], denoise_
     roi = np.s_[top:bottom, left:right]
     u_px, v_px = _centres_px(left, right)[None, :], _centres_px(top, bottom)[:, None]
     electrons = readout.image_e[roi].astype(np.float64)
-    fall_off: Pixels | float = 1.0
-    distance2 = ellipse.distance2(u_px, v_px, margin_px)
+    fall_off: Pixels | None = None
+    if ellipse.core is None or others:
+        distance2 = ellipse.distance2(u_px, v_px, margin_px)
     if ellipse.core is None:
         support = distance2 <= 1
         ring = ellipse.distance2(u_px, v_px, margin_px + RING_PX) <= 1
@@ -205,9 +199,10 @@ def light_of(readout: Readout, ellipse: Ellipse, others: list[Ellipse], denoise_
         face = np.zeros(electrons.shape, dtype=bool)
         column, row = ellipse.low_px.astype(int) - (left, top)
         face[row : row + ellipse.core.shape[0], column : column + ellipse.core.shape[1]] = ellipse.core
-        inside = ~_within(~face, SMOOTHING_PX // 2 + ellipse.fringe_px)
+        (outside,) = _within(~face, SMOOTHING_PX // 2 + ellipse.fringe_px)
+        inside = ~outside
         fall_off = _relative_fall_off(electrons, inside)
-        support, ring = _within(face, margin_px), _within(face, margin_px + RING_PX)
+        support, ring = _within(face, margin_px, margin_px + RING_PX)
     ring &= ~support
     for other in others:
         # A pixel in two supports belongs to the nearer spot.
@@ -220,21 +215,24 @@ def light_of(readout: Readout, ellipse: Ellipse, others: list[Ellipse], denoise_
     if readout.prnu > 0:
         variance_e2 += (readout.prnu * raw_e) ** 2
     above_e = electrons
-    if ring.any():
-        of_ring = np.flatnonzero(ring)
+    of_ring = np.flatnonzero(ring)
+    if len(of_ring):
+        ring_variance_e2 = variance_e2.take(of_ring)
         # One electron more: the noise of a pixel with fewer is not normal.
-        gate_e = BACKGROUND_SIGMA * float(np.sqrt(_median(variance_e2.ravel()[of_ring]) + 1.0))
-        ring_fall_off = np.ones(len(of_ring)) if isinstance(fall_off, float) else fall_off.ravel()[of_ring]
-        even_e = electrons.ravel()[of_ring] / ring_fall_off
+        gate_e = BACKGROUND_SIGMA * math.sqrt(_median(ring_variance_e2) + 1.0)
+        ring_fall_off = 1.0 if fall_off is None else fall_off.take(of_ring)
+        even_e = electrons.take(of_ring) / ring_fall_off
         # The ring without pixels of another surface or light; all of it where its median is between two surfaces.
         even = np.abs(even_e - _median(even_e)) <= gate_e
         if not even.any():
             even[:] = True
-        of_ring, ring_fall_off = of_ring[even], ring_fall_off[even]
-        above_e = electrons - float(even_e[even].mean()) * fall_off
+        background_e = float(even_e[even].mean())
+        above_e = electrons - (background_e if fall_off is None else background_e * fall_off)
+        of_ring = of_ring[even]
         if len(of_ring) >= MIN_RING_PIXELS:
-            ring_e = readout.raw_e[roi].ravel()[of_ring] / ring_fall_off
-            excess_e2 = _excess_variance(readout, ring_e, float(variance_e2.ravel()[of_ring].mean()))
+            ring_e = readout.raw_e[roi].take(of_ring).astype(np.float64)
+            ring_e /= 1.0 if fall_off is None else fall_off.take(of_ring)
+            excess_e2 = _excess_variance(readout, ring_e, float(ring_variance_e2[even].mean()))
             if excess_e2 != 0:
                 unlit = support & (above_e <= gate_e)
                 variance_e2[unlit] = np.maximum(variance_e2[unlit] + excess_e2, 0.0)
@@ -248,19 +246,31 @@ def _median(values: NDArray[np.float64]) -> float:
     return float(around[middle - 1 + len(values) % 2] + around[middle]) / 2
 
 
+@lru_cache(maxsize=1024)
+def _ones(count: int) -> Pixels:
+    """Ones (count,), the same array each time."""
+    ones = np.ones(count)
+    ones.setflags(write=False)
+    return ones
+
+
 def _centres_px(first: int, last: int) -> Pixels:
     return np.arange(first, last, dtype=np.float64) + 0.5
 
 
-def _within(mask: NDArray[np.bool_], radius_px: float) -> NDArray[np.bool_]:
-    """Pixels of a mask, and those at most this far from one."""
-    if radius_px > MAX_KERNEL_PX:
-        return np.asarray(
-            cv2.distanceTransform((~mask).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE) <= radius_px
-        )
+def _within(mask: NDArray[np.bool_], *radii_px: float) -> list[NDArray[np.bool_]]:
+    """Pixels of a mask, and those at most this far from one, for each radius."""
+    if max(radii_px) > MAX_KERNEL_PX:
+        distance_px = cv2.distanceTransform((~mask).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        return [np.asarray(distance_px <= radius_px) for radius_px in radii_px]
+    return [np.asarray(cv2.dilate(mask.view(np.uint8), _disc(radius_px)).view(bool)) for radius_px in radii_px]
+
+
+@lru_cache(maxsize=256)
+def _disc(radius_px: float) -> NDArray[np.uint8]:
+    """Pixels at most this far from the middle one."""
     along = np.arange(-int(radius_px), int(radius_px) + 1)
-    disc = (along[:, None] ** 2 + along**2 <= radius_px**2).view(np.uint8)
-    return np.asarray(cv2.dilate(mask.view(np.uint8), disc).view(bool))
+    return (along[:, None] ** 2 + along**2 <= radius_px**2).view(np.uint8)
 
 
 def _surroundings(ellipse: Ellipse, padding_px: float, shape: tuple[int, ...]) -> tuple[int, int, int, int]:
@@ -269,9 +279,10 @@ def _surroundings(ellipse: Ellipse, padding_px: float, shape: tuple[int, ...]) -
     if ellipse.core is None:
         half_extent = ellipse.half_extent(padding_px)
         low_px, high_px = ellipse.centre_px - half_extent, ellipse.centre_px + half_extent
-    left, top = np.maximum(np.floor(low_px), 0).astype(int).tolist()
-    right, bottom = np.minimum(np.ceil(high_px), shape[::-1]).astype(int).tolist()
-    return left, top, right, bottom
+    (left, top), (right, bottom) = low_px.tolist(), high_px.tolist()
+    height_px, width_px = shape
+    last = min(math.ceil(right), width_px), min(math.ceil(bottom), height_px)
+    return max(math.floor(left), 0), max(math.floor(top), 0), *last
 
 
 def _relative_fall_off(electrons: Pixels, inside: NDArray[np.bool_]) -> Pixels:
