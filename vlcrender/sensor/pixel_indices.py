@@ -28,8 +28,8 @@ def pixel_places(rois: Sequence[Roi]) -> Callable[[Any], tuple[Any, Any]]:
     rows_a_pixel = dr.opaque(mi.Float64, 1 / roi.columns)
 
     def places(number: Any) -> tuple[Any, Any]:
-        # Exact: half a pixel is 1 / (2 columns) of a row, and float64 rounds rows by 2^-52 of their number; vectors have
-        # no division of integers.
+        # Exact: a pixel's centre is 1 / (2 columns) of a row or more from the next row, and float64 rounds by 2^-52 of
+        # the row's number. Vectors have no division of integers.
         down = mi.UInt32((mi.Float64(number) + 0.5) * rows_a_pixel)
         return first_column + (number - down * width), first_row + down
 
