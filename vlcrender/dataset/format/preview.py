@@ -43,8 +43,7 @@ def write_preview(path: Path, images: Sequence[RegionImage], sensor: Roi, white_
         sums[row // block : row // block + rows, column // block : column // block + columns] += of_blocks
     share = sums[: max(1, whole.rows // block), : max(1, whole.columns // block)] / block**2
     share /= white_dn - black_dn
-    np.clip(share, 0, 1, out=share)
-    share **= 1 / 2.2
+    share = np.clip(share, 0, 1, out=share) ** (1 / 2.2)
     share *= 256
     path.write_bytes(_png(np.minimum(share, 255, out=share).astype(np.uint8)))
 
