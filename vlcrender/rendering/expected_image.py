@@ -6,6 +6,7 @@ with a rolling shutter.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -45,7 +46,7 @@ class LedPatch:
     imaged_fraction: float
     """Share of the LED's image that is in the regions and not occluded: more where regions extend beyond the sensor."""
 
-    @property
+    @cached_property
     def roi(self) -> Roi:
         """The pixels of the patch."""
         return Roi(self.row, self.column, *self.electrons_per_s.shape)
