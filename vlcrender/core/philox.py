@@ -29,8 +29,8 @@ def uniforms(seed: Any, column: Any, row: Any, number: Any) -> list[Any]:
     seed: of `kernel_seed`; column, row, number: UInt32. The bits are those of Dr.Jit's `Philox4x32` with 10 rounds,
     which takes both halves of a product from one of 64 bits: two products of 32 bits take 0.6 of its time.
     """
-    key = [mi.UInt32(seed >> 32), mi.UInt32(seed)]
-    counter = [column, row, number, mi.UInt32(0)]
+    key: list[Any] = [mi.UInt32(seed >> 32), mi.UInt32(seed)]
+    counter: list[Any] = [column, row, number, mi.UInt32(0)]
     for _ in range(ROUNDS):
         (high_0, low_0), (high_1, low_1) = (
             (dr.mul_hi(half, multiplier), half * multiplier)
@@ -38,8 +38,8 @@ def uniforms(seed: Any, column: Any, row: Any, number: Any) -> list[Any]:
         )
         counter = [high_1 ^ counter[1] ^ key[0], low_1, high_0 ^ counter[3] ^ key[1], low_0]
         key = [half + step for half, step in zip(key, KEY_STEPS, strict=True)]
-    # 23 bits as the mantissa of a number in [1, 2)
-    return [dr.reinterpret_array(mi.Float, (bits >> 9) | 0x3F800000) - 1.0 for bits in counter]
+    mantissas: list[Any] = [dr.reinterpret_array(mi.Float, (bits >> 9) | 0x3F800000) for bits in counter]  # in [1, 2)
+    return [number - 1.0 for number in mantissas]
 
 
 def normals(seed: Any, column: Any, row: Any) -> tuple[Any, Any]:

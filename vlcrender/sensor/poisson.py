@@ -65,7 +65,7 @@ def draw(means: Any, seed: Any, rois: Sequence[Roi], most: int = 2**32 - 1) -> A
     places = pixel_places(rois)
     size = len(means)
     counts: Any = dr.empty(mi.UInt32, size)
-    pixels_a_lane, pixels, most = (dr.opaque(mi.UInt32, number) for number in (PIXELS_A_LANE, size, most))
+    pixels_a_lane, pixels, largest = (dr.opaque(mi.UInt32, number) for number in (PIXELS_A_LANE, size, most))
     pixel: Any = dr.arange(mi.UInt32, -(-size // PIXELS_A_LANE)) * pixels_a_lane
     end = dr.minimum(pixel + pixels_a_lane, pixels)
     product: Any = mi.Float(1.0)
@@ -94,7 +94,7 @@ def draw(means: Any, seed: Any, rois: Sequence[Roi], most: int = 2**32 - 1) -> A
             low |= product <= limit
             count += dr.select(low, 0.0, 1.0)
         done = dr.select(large, accepted, low) | (turn >= MAX_TURNS)
-        dr.scatter(counts, dr.minimum(mi.UInt32(dr.select(large, tried, count)), most), pixel, done)
+        dr.scatter(counts, dr.minimum(mi.UInt32(dr.select(large, tried, count)), largest), pixel, done)
         pixel = dr.select(done, pixel + 1, pixel)
         product = dr.select(done, 1.0, product)
         count = dr.select(done, 0.0, count)
