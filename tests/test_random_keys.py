@@ -6,7 +6,7 @@ import numpy as np
 
 from vlcrender.camera.roi import Roi
 from vlcrender.core.backend import dr, exact_math, mi
-from vlcrender.core.philox import PHILOX, kernel_seed, normals
+from vlcrender.core.philox import kernel_seed, normals, uniforms
 from vlcrender.core.random_keys import random_key, stream
 from vlcrender.sensor.pixel_indices import pixel_indices
 
@@ -30,13 +30,22 @@ def test_a_key_may_be_part_of_a_longer_one() -> None:
     assert int(kernel_seed(key, "read")[0]) == int(kernel_seed(2016, 7, "shot-noise", "read")[0])
 
 
+def test_uniform_numbers_are_those_of_dr_jits_philox() -> None:
+    with exact_math():
+        column, row = pixel_indices([Roi(-20, 5, 300, 400)])
+        seed, number = kernel_seed("uniforms"), mi.UInt32(7)
+        peer = mi.Philox4x32(seed, column, row, number, iterations=10).next_float32x4()
+        for ours, theirs in zip(uniforms(seed, column, row, number), peer, strict=True):
+            assert np.array_equal(ours.numpy(), theirs.numpy())
+
+
 def test_normal_numbers_are_box_and_mullers_of_two_uniforms() -> None:
     """In float64 by NumPy: float32 has 2^-24 = 6e-8 an operation, on numbers up to 5.8, through a dozen operations."""
     with exact_math():
         column, row = pixel_indices([Roi(-20, 5, 300, 400)])
         seed = kernel_seed("normals")
         drawn = [number.numpy() for number in normals(seed, column, row)]
-        u = PHILOX(seed, column, row, mi.UInt32(0), iterations=10).next_float32x4()
+        u = uniforms(seed, column, row, mi.UInt32(0))
         dr.eval(u)
     first, second = (u[i].numpy().astype(float) for i in range(2))
     radius = np.sqrt(-2 * np.log(1 - first))

@@ -244,14 +244,11 @@ class Camera(Settings):
     @property
     def matrix(self) -> NDArray[np.float64]:
         """K, shape (3, 3): [u, v, 1] ~ K p_cam."""
-        u, v = self.center_px
-        fx, fy = self.focal_xy_px
-        return np.array([[fx, self.skew_px, u], [0.0, fy, v], [0.0, 0.0, 1.0]])
+        return _matrix(*self.center_px, *self.focal_xy_px, self.skew_px)
 
     def inverse_matrix(self) -> list[list[Any]]:
         """K^-1, rows of Python floats: a NumPy scalar times a Dr.Jit array would become a NumPy array."""
-        inverse: list[list[Any]] = np.linalg.inv(self.matrix).tolist()
-        return inverse
+        return _inverse(*self.center_px, *self.focal_xy_px, self.skew_px)
 
     def line_starts_s(self) -> NDArray[np.float64]:
         """Start of each line's exposure after the frame's, s: (height, 1) or (1, width); (1, 1) of a global shutter."""
@@ -317,7 +314,8 @@ class Camera(Settings):
         with np.errstate(all="ignore"):
             imaged = self.lens_projection.images(x, y, z)
             pixels = np.stack(self.project(x, y, z), axis=-1)
-        return np.where(imaged[..., None], pixels, np.nan)
+        pixels[~imaged] = np.nan
+        return pixels
 
     def field_of_view(self, margin_px: float = 0.0) -> FieldOfView:
         """Directions from which light reaches the sensor or up to `margin_px` beside it."""
@@ -326,6 +324,16 @@ class Camera(Settings):
     def field_of_view_of(self, left_px: float, top_px: float, right_px: float, bottom_px: float) -> FieldOfView:
         """Directions from which light reaches a rectangle of pixel positions, on the sensor or close to it."""
         return _field_of_view(self, left_px, top_px, right_px, bottom_px)
+
+
+@lru_cache(maxsize=64)
+def _inverse(u: float, v: float, fx: float, fy: float, skew_px: float) -> list[list[Any]]:
+    inverse: list[list[Any]] = np.linalg.inv(_matrix(u, v, fx, fy, skew_px)).tolist()
+    return inverse
+
+
+def _matrix(u: float, v: float, fx: float, fy: float, skew_px: float) -> NDArray[np.float64]:
+    return np.array([[fx, skew_px, u], [0.0, fy, v], [0.0, 0.0, 1.0]])
 
 
 @lru_cache(maxsize=64)
@@ -374,7 +382,8 @@ def transform(matrix: NDArray[np.float64], vectors: NDArray[np.float64]) -> NDAr
 
     Written out, not `@`: the last bits of a matrix product may depend on threads and processor, and frames may not.
     """
-    result: NDArray[np.float64] = (
-        vectors[..., 0:1] * matrix[:, 0] + vectors[..., 1:2] * matrix[:, 1] + vectors[..., 2:3] * matrix[:, 2]
-    )
+    x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
+    result = np.empty((*vectors.shape[:-1], len(matrix)))
+    for row, (of_x, of_y, of_z) in enumerate(matrix.tolist()):
+        result[..., row] = x * of_x + y * of_y + z * of_z
     return result

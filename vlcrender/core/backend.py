@@ -26,6 +26,9 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from vlcrender.errors import InputError
 
 MITSUBA_VARIANTS = ("llvm_ad_mono", "cuda_ad_mono")
@@ -232,4 +235,15 @@ def exact_math() -> AbstractContextManager[None]:
     return scope
 
 
-__all__ = ["dr", "exact_math", "find_llvm", "llvm_version", "mi"]
+def empty_image(shape: tuple[int, int]) -> NDArray[np.float32]:
+    """An image (rows, columns) of any numbers, in memory that Dr.Jit keeps and lends again.
+
+    New pages of the system, which it clears, would cost several times what arithmetic on the image does.
+    """
+    if not MITSUBA_VARIANT.startswith("llvm"):  # memory of a GPU
+        return np.empty(shape, dtype=np.float32)
+    image: NDArray[np.float32] = dr.empty(mi.Float, shape[0] * shape[1]).numpy().reshape(shape)
+    return image
+
+
+__all__ = ["dr", "empty_image", "exact_math", "find_llvm", "llvm_version", "mi"]

@@ -1,6 +1,7 @@
 """Shapes of LED faces in their own plane, and the exact area and moments that each shares with a polygon."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -8,8 +9,16 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+MAX_CIRCLES = 16
+"""Circles that are kept for further LEDs, by their number of points."""
 BEYOND_HORIZON_M = 1e8
 """Distance beyond every LED, m: of a ray that does not meet the LEDs' plane."""
+
+
+@lru_cache(maxsize=MAX_CIRCLES)
+def _unit_circle(points: int) -> Array:
+    angles = np.linspace(0.0, 2 * np.pi, points, endpoint=False)
+    return np.stack([np.cos(angles), np.sin(angles)], axis=1)
 
 
 @dataclass(frozen=True)
@@ -20,8 +29,7 @@ class Disc:
 
     def rim(self, points: int) -> Array:
         """Points of the rim (points, 2), relative to the centre, evenly spaced."""
-        angles = np.linspace(0.0, 2 * np.pi, points, endpoint=False)
-        return self.radius_m * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        return self.radius_m * _unit_circle(points)
 
     def image_area_px(self, outline: Array) -> float:
         """Area of the image with this rim, `outline` (points, 2): the polygon and the segments beyond its sides."""

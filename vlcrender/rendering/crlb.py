@@ -171,12 +171,10 @@ class FrameSlopes:
         information = np.zeros((6, 6))
         for box in self._boxes():
             for common, inside, weight in self._parts(box):
-                slopes = np.stack(
-                    [
-                        self._of(common, change, inside) * self.exposure_s / (2 * step)
-                        for change, step in zip(self.changes, self.steps, strict=True)
-                    ]
-                )
+                slopes = np.empty((6, common.rows, common.columns))
+                for slope, change, step in zip(slopes, self.changes, self.steps, strict=True):
+                    np.multiply(self._of(common, change, inside), self.exposure_s, out=slope)
+                    slope /= 2 * step
                 nuisances = [self._light(common, patch) for patch in inside]
                 nuisances.append(np.ones((common.rows, common.columns)))
                 information += _marginal(slopes, np.stack(nuisances), weight)

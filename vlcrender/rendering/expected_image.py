@@ -6,12 +6,14 @@ with a rolling shutter.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vlcrender.camera.roi import Roi
+from vlcrender.core.backend import empty_image
 
 Image = NDArray[np.float32]
 Gain = float | NDArray[np.float64]
@@ -44,7 +46,7 @@ class LedPatch:
     imaged_fraction: float
     """Share of the LED's image that is in the regions and not occluded: more where regions extend beyond the sensor."""
 
-    @property
+    @cached_property
     def roi(self) -> Roi:
         """The pixels of the patch."""
         return Roi(self.row, self.column, *self.electrons_per_s.shape)
@@ -95,7 +97,7 @@ class ExpectedRegion:
         room_gain: of the light of LEDs that the room reflects. Raises ValueError for one other than 1 where that part
         of the background is not known.
         """
-        image = self.background_e_per_s * np.float32(exposure_s)
+        image = np.multiply(self.background_e_per_s, np.float32(exposure_s), out=empty_image(self.roi.shape))
         lights: list[LedPatch | SpecularReflection] = [*self.patches, *self.reflections]
         for light in lights:
             gain = 1.0 if gains is None else gain_in(gains.get(light.led_id, 1.0), light.roi)

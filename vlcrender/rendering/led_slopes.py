@@ -138,7 +138,7 @@ def _swept(rim_px: Array, moved_px: Array, split: int) -> tuple[Array, Array, Ar
     crossings = []
     for at, step in ((u, du), (v, dv)):
         cell = np.floor(at * split)
-        next_cell = np.roll(cell, -1)
+        next_cell = np.append(cell[1:], cell[0])
         with np.errstate(divide="ignore", invalid="ignore"):
             crossing = (np.maximum(cell, next_cell) / split - at) / step
         crossings.append(np.where(cell == next_cell, 0.0, np.clip(crossing, 0.0, 1.0)))
@@ -146,7 +146,9 @@ def _swept(rim_px: Array, moved_px: Array, split: int) -> tuple[Array, Array, Ar
     lengths = np.diff(cuts, axis=0)
     part, piece = np.nonzero(lengths > 0)
     length, middle = lengths[part, piece], (cuts[part, piece] + cuts[part + 1, piece]) / 2
-    along_u, along_v = (moved[:, piece] + _steps(moved)[:, piece] * middle for moved in (moved_u, moved_v))
+    along_u, along_v = (
+        moved.take(piece, axis=1) + _steps(moved).take(piece, axis=1) * middle for moved in (moved_u, moved_v)
+    )
     outward = np.copysign(length, np.nansum(u * dv - v * du))
     swept = along_u * (dv[piece] * outward) - along_v * (du[piece] * outward)
     return u[piece] + du[piece] * middle, v[piece] + dv[piece] * middle, swept
@@ -154,12 +156,17 @@ def _swept(rim_px: Array, moved_px: Array, split: int) -> tuple[Array, Array, Ar
 
 def _steps(line: Array) -> Array:
     """Steps from each number along a closed line (..., n) to the next."""
-    return np.roll(line, -1, axis=-1) - line
+    steps = np.empty_like(line)
+    np.subtract(line[..., 1:], line[..., :-1], out=steps[..., :-1])
+    np.subtract(line[..., 0], line[..., -1], out=steps[..., -1])
+    return steps
 
 
 def _subdivided(line: Array, parts: int) -> Array:
     """Numbers along a closed line (..., n) with `parts` - 1 more between each two, (..., n * parts)."""
-    between = line[..., None] + _steps(line)[..., None] * (np.arange(parts) / parts)
+    steps, between = _steps(line), np.empty((*line.shape, parts))
+    for part in range(parts):
+        np.add(line, steps * (part / parts), out=between[..., part])
     return between.reshape(*line.shape[:-1], -1)
 
 

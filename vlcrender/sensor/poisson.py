@@ -14,9 +14,11 @@ from numpy.typing import NDArray
 
 from vlcrender.camera.roi import Roi
 from vlcrender.core.backend import dr, exact_math, mi
-from vlcrender.core.philox import PHILOX, kernel_seed
-from vlcrender.sensor.pixel_indices import pixel_indices
+from vlcrender.core.philox import kernel_seed, uniforms
+from vlcrender.sensor.pixel_indices import pixel_places
 
+PIXELS_A_LANE = 16
+"""Pixels for which a lane of a vector draws one after another: a cache line of float32."""
 MAX_TURNS = 1000
 """Bound of the loop. A turn accepts with a probability of 0.7 or more, so no draw reaches it."""
 INFINITY_BITS = np.float32(np.inf).view(np.uint32)
@@ -48,28 +50,36 @@ def poisson_of_regions(
     if flat.view(np.uint32).max() > INFINITY_BITS and not flat.min() >= 0:
         raise ValueError(f"means from {flat.min()} electrons; 0 and more are allowed")
     with exact_math():
-        drawn = draw(dr.minimum(mi.Float(flat), MAX_MEAN), kernel_seed(key), *pixel_indices(rois))
-        count: Any = dr.minimum(mi.UInt32(drawn), dr.opaque(mi.UInt32, most))
-        dr.eval(count)
-    counts: NDArray[np.uint32] = count.numpy()
+        counts: NDArray[np.uint32] = draw(mi.Float(flat), kernel_seed(key), rois, most).numpy()
     return counts
 
 
 @dr.syntax
-def draw(mean: Any, seed: Any, column: Any, row: Any) -> Any:
-    """Poisson counts as Float32, for a kernel: means 0 to MAX_MEAN, seed and places as `philox` has them."""
-    large = mean >= 10.0
-    mu = dr.maximum(mean, 10.0)
-    b = 0.931 + 2.53 * dr.sqrt(mu)
-    a = -0.059 + 0.02483 * b
-    inverse_alpha = 1.1239 + 1.1328 / (b - 3.4)
-    limit = dr.exp(-mean)
+def draw(means: Any, seed: Any, rois: Sequence[Roi], most: int = 2**32 - 1) -> Any:
+    """Poisson counts of all pixels of all regions, evaluated, UInt32; counts beyond `most` count as that.
+
+    means: Float32, of pixels as `pixel_indices` has them, 0 and more; beyond MAX_MEAN they count as that. A lane of a
+    vector draws for PIXELS_A_LANE pixels, and goes on to the next as soon as it has a count: lanes that need another
+    try do not hold up the others.
+    """
+    places = pixel_places(rois)
+    size = len(means)
+    counts: Any = dr.empty(mi.UInt32, size)
+    pixels_a_lane, pixels, largest = (dr.opaque(mi.UInt32, number) for number in (PIXELS_A_LANE, size, most))
+    pixel: Any = dr.arange(mi.UInt32, -(-size // PIXELS_A_LANE)) * pixels_a_lane
+    end = dr.minimum(pixel + pixels_a_lane, pixels)
     product: Any = mi.Float(1.0)
     count: Any = mi.Float(0.0)
     turn: Any = mi.UInt32(0)
-    active = mi.Bool(True)
-    while active:
-        u = PHILOX(seed, column, row, turn, iterations=10).next_float32x4(active)
+    while pixel < end:
+        mean = dr.minimum(dr.gather(mi.Float, means, pixel), MAX_MEAN)
+        column, row = places(pixel)
+        u = uniforms(seed, column, row, turn)
+        large = mean >= 10.0
+        mu = dr.maximum(mean, 10.0)
+        b = 0.931 + 2.53 * dr.sqrt(mu)
+        a = -0.059 + 0.02483 * b
+        inverse_alpha = 1.1239 + 1.1328 / (b - 3.4)
         # PTRS uses one pair of uniforms a try; two tries a turn take longer.
         centred = u[0] - 0.5
         edge = 0.5 - dr.abs(centred)
@@ -77,16 +87,20 @@ def draw(mean: Any, seed: Any, column: Any, row: Any) -> Any:
         density = dr.log(u[1] * inverse_alpha / (a / (edge * edge) + b))
         accepted = (tried >= 0.0) & (density <= _log_probability(tried, mu))
         # Knuth: multiply uniforms until the product is below exp(-mean); four factors a turn.
+        limit = dr.exp(-mean)
         low: Any = mi.Bool(False)
-        steps: Any = mi.Float(0.0)
         for i in range(4):
             product = product * u[i]
             low |= product <= limit
-            steps += dr.select(low, 0.0, 1.0)
-        count = dr.select(active, dr.select(large, dr.select(accepted, tried, count), count + steps), count)
-        active &= ~dr.select(large, accepted, low) & (turn < MAX_TURNS)
-        turn += 1
-    return count
+            count += dr.select(low, 0.0, 1.0)
+        done = dr.select(large, accepted, low) | (turn >= MAX_TURNS)
+        dr.scatter(counts, dr.minimum(mi.UInt32(dr.select(large, tried, count)), largest), pixel, done)
+        pixel = dr.select(done, pixel + 1, pixel)
+        product = dr.select(done, 1.0, product)
+        count = dr.select(done, 0.0, count)
+        turn = dr.select(done, 0, turn + 1)
+    dr.eval(counts)
+    return counts
 
 
 def _log_probability(k: Any, mu: Any) -> Any:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from vlcrender.camera.roi import RegionImage, Roi
 from vlcrender.core.backend import dr, exact_math, mi
-from vlcrender.core.philox import PHILOX, kernel_seed, normals
+from vlcrender.core.philox import kernel_seed, normals, uniforms
 from vlcrender.core.random_keys import random_key
 from vlcrender.sensor.pixel_indices import pixel_indices
 from vlcrender.sensor.poisson import MAX_MEAN, draw, poisson_of_regions
@@ -144,8 +144,8 @@ def _full_chain(
         mean = mean + number(sensor.dark_electrons(exposure_s))  # 3
         if sensor.hot_pixel_share > 0:
             mean = mean + number(sensor.hot_electrons(exposure_s)) * _of_hot_pixels(sensor, individual, column, row)
-        mean = dr.minimum(mean, MAX_MEAN)
-        electrons = draw(mean, kernel_seed(key), column, row)  # 4
+        dr.eval(mean, offset)
+        electrons = mi.Float(draw(mean, kernel_seed(key), rois))  # 4
         electrons = electrons + number(sensor.dsnu_e) * offset  # 5
         electrons = dr.minimum(electrons, number(sensor.full_well_e))  # 6
         # 7 and 8: read and ADC noise are normal and both follow the clip, so one draw has the sum of their variances.
@@ -182,7 +182,5 @@ def _of_lines(seed: Any, line: Any, extents: Sequence[tuple[int, int]], axis: in
 
 def _of_hot_pixels(sensor: Sensor, individual: str, column: Any, row: Any) -> Any:
     """Exponential numbers of mean 1 in hot pixels, 0 in all others; the same in every frame of a sensor."""
-    chance, size, _, _ = PHILOX(
-        kernel_seed(individual, "hot pixels"), column, row, mi.UInt32(0), iterations=10
-    ).next_float32x4(mi.Bool(True))
+    chance, size, _, _ = uniforms(kernel_seed(individual, "hot pixels"), column, row, mi.UInt32(0))
     return dr.select(chance < dr.opaque(mi.Float, sensor.hot_pixel_share), -dr.log(1.0 - size), 0.0)
