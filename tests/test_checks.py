@@ -271,6 +271,19 @@ def test_both_refuse(good: Path, tmp_path: Path, check: int, name: str, damage: 
         assert "\n" not in verdict
 
 
+@pytest.mark.parametrize(("rows", "valid"), [(255, True), (256, False), (257, False)])
+def test_a_kernel_has_255_rows_at_most(good: Path, tmp_path: Path, rows: int, valid: bool) -> None:
+    folder = copied(good, tmp_path)
+    at(*MAIN, "psf", value="measured")(folder)
+    kernel = np.zeros((rows, rows))
+    kernel[rows // 2, rows // 2] = 1.0
+    at(*MAIN, "psf_kernel", value=kernel.tolist())(folder)
+    refused = "has to be square, with an odd number of rows of at most 255"
+    # The seal alone differs where the kernel is valid; the reader does not check it.
+    assert (refused in (verdict_of_verify(folder) or "")) != valid
+    assert (refused in (verdict_of_reader(folder) or "")) != valid
+
+
 def test_every_check_has_a_damage() -> None:
     text = (Path(__file__).parent.parent / "datasets/FORMAT.md").read_text()
     section = text.partition("\n## Checks\n")[2].partition("\n## ")[0]

@@ -23,3 +23,16 @@ def test_no_figure_is_cut_off_and_no_box_is_drawn(
             assert cell in printed
     assert "poses [see] LEDs" in " ".join(printed.split())
     assert not set(printed) & set("│┃┏┓└┘…")
+
+
+def test_figures_stand_under_each_other(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    print_table("lengths", ("what", "of", "m", "error"), [("room", "x", "7", "1.5"), (), ("all", "", "12", "0.25")], left=2)
+    assert [line.rstrip() for line in capsys.readouterr().out.splitlines()] == [
+        "lengths",
+        "what   of    m   error",
+        "──────────────────────",
+        "room   x     7     1.5",
+        "",
+        "all         12    0.25",
+    ]
