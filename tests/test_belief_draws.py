@@ -296,3 +296,13 @@ def test_a_focused_lens_keeps_its_focus_and_aperture() -> None:
     assert true.focus_distance_m == told.focus_distance_m
     # f, f_i and K are functions of one another, each rounded once or twice
     assert true.focal_px / told.focal_px - 1 == pytest.approx(float(errors_of_camera(far, 2)[0]), rel=1e-9)
+
+
+def test_a_rigs_mounting_errors_are_those_of_the_recipe_in_metres() -> None:
+    """1.5 mm are 0.0015 m; the main camera carries the rig's frame and has none."""
+    recipe = plan(*CALIBRATED, 'rig=[{name="left", offset_m=[0.1, 0.0, 0.0]}]').recipe
+    belief = Belief.preset("calibrated")
+    belief = belief.model_copy(update={"rig": belief.rig.model_copy(update={"offset_mm": 1.5, "rotation_deg": 0.25})})
+    cameras = belief.true_sigmas(recipe.cameras, recipe.accelerometer).cameras
+    found = {name: (one.offset_m, one.rotation_deg) for name, one in cameras.items()}
+    assert found == {"main": (0.0, 0.0), "left": (pytest.approx(0.0015, rel=1e-12), 0.25)}

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 import vlcrender as vr
 from vlcrender.dataset.world.budget_plot import draw_budget
-from vlcrender.dataset.world.error_budget import _parts
+from vlcrender.dataset.world.error_budget import _both, _parts
 
 RECIPE = str(ROOT / "datasets/quickstart.toml")
 OVERRIDES = [*SMALL, "poses.count=3", "belief.preset=calibrated"]
@@ -199,3 +199,7 @@ def test_command_refuses_in_one_line(arguments: list[str], message: str) -> None
     assert found.returncode == 2
     assert message in found.stderr
     assert len(found.stderr.strip().splitlines()) == 1
+
+
+def test_two_lengths_are_written_once_where_they_agree() -> None:
+    assert (_both("3", "3"), _both("3", "5")) == ("3 mm", "3, 5 mm")

@@ -157,6 +157,14 @@ def test_a_reflection_has_a_halo() -> None:
     assert 0.3 * total < light.sum() < total
 
 
+def test_gains_of_the_room_by_lines_need_the_part_of_its_halo_that_left_an_led() -> None:
+    renderer = Renderer(scene_of(led=[LED], **DARK))
+    halo = renderer.expected_image(PosedCamera(camera_of(GLARE), Pose((1.0, 1.5, 1.0)))).parts[0].halo
+    assert halo is not None
+    with pytest.raises(ValueError, match="room_gain: the part of the halo that left an LED is not known"):
+        halo.electrons_per_s(Roi(10, 20, 40, 50), room_gain=np.ones((150, 1)))
+
+
 def test_the_halo_follows_the_brightness_of_each_led() -> None:
     renderer, camera = Renderer(scene_of(led=LEDS, **DARK)), camera_of(GLARE)
     both, first, second, twice = (image_of(renderer, camera, g) for g in (None, {2: 0.0}, {1: 0.0}, {1: 2.0, 2: 2.0}))

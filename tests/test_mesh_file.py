@@ -107,6 +107,7 @@ REFUSED: dict[str, tuple[str, str | bytes, str]] = {
     "unknown format": ("a.ply", TEXT_PLY.replace("ascii", "text"), "line 2: .* is no line of a PLY header"),
     "list of floats": ("a.ply", TEXT_PLY.replace("uchar int", "uchar float"), "vertex_indices are no integers"),
     "element twice": ("a.ply", TEXT_PLY.replace("element face 1", "element vertex 1"), "line 7: .* is no line"),
+    "index of 64 bits": ("a.ply", HEAD + FACE + f"3 0 1 {2**63}\n", "face 0: '3 0 1 9223372036854775808' does not fit"),
     "binary cut short": ("a.ply", ply("<")[:-9], "is cut short"),
     "binary too long": ("a.ply", ply("<") + b"\0", "has 1 bytes more than the header states"),
     "binary huge count": ("a.ply", ply("<").replace(b"face 2", b"face 999999999999"), "element face: is cut short"),

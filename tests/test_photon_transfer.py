@@ -213,3 +213,18 @@ def test_a_pattern_under_noise_that_does_not_dither_errs_within_its_stated_error
     found = stack(rng, offsets, sigma, frames=64).pixel
     assert abs(found.value - 0.25) < 2 * found.error
     assert found.error < 0.25 / 4
+
+
+def test_the_linearity_error_counts_from_the_dark_level() -> None:
+    """Signals 100, 220, 300, 380 (30, 70, 100, 130 photons) above a dark level of 50; the last, 1000, is beyond 95 %.
+
+    The line that minimises relative deviations, by numpy's least squares on rows divided by their signal.
+    """
+    dark = Point(0.0, 1e-3, 50.0, 1.0, 10_000)
+    photons, signals = np.array([30.0, 70.0, 100.0, 130.0]), np.array([100.0, 220.0, 300.0, 380.0])
+    points = [Point(p, 1e-3, 50.0 + s, 1.0, 10_000) for p, s in zip([*photons, 400.0], [*signals, 1000.0], strict=True)]
+    rows = np.stack([np.ones(4), photons], axis=1) / signals[:, None]
+    line = np.linalg.lstsq(rows, np.ones(4), rcond=None)[0]
+    found, _ = linearity(dark, points)
+    assert found.value == pytest.approx(np.abs(1 / (rows @ line) - 1).mean(), rel=1e-9)
+    assert found.value > 1e-3

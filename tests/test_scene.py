@@ -145,6 +145,7 @@ BAD_OFFICE = [
     ("radius_m = 0.01", 'shape = "square"\nradius_m = 0.01', r"panels\[0\]\.leds\.radius_m: .*a square has side_m"),
     ("[4000.0, 16000.0]", "[16000.0, 4000.0]", r"put the lower value first"),
     ("columns = 7", "columns = 0", r"panels\[0\]\.columns = 0"),
+    ("first_id = 0", "first_id = 2147483648", r"panels\[0\]\.leds\.first_id = 2147483648"),
     ("first_id = 0", "frist_id = 0", r"did you mean first_id"),
 ]
 

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import OpenEXR
@@ -18,6 +19,7 @@ from vlcrender.dataset.format.summary import disk_use, size_text
 from vlcrender.dataset.recipe.recipe import RecipeFile
 from vlcrender.dataset.recipe.recipe_warnings import recipe_warnings
 from vlcrender.dataset.run.dry_run import dry_run, file_counts
+from vlcrender.dataset.run.frame_job import Job
 from vlcrender.dataset.run.possible import MAX_POSES, check_possible, poses_to_check
 
 
@@ -216,3 +218,22 @@ def test_dark_current_counts_towards_saturation() -> None:
         assert FrameNumbers.of(image, [RegionImage(roi, electrons)], sensor, 1.0) == FrameNumbers(
             pixels=3, saturated=saturated, brightest_e=100.0, background_e=95.0
         )
+
+
+def test_the_share_of_checked_poses_is_reported_from_time_to_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vlcrender.dataset.run.possible.POSES_A_REPORT", 2)
+    shares: list[float] = []
+    check_possible(small_plan("poses.count=5"), shares.append)
+    assert shares == [2 / 5, 4 / 5]
+
+
+def test_the_start_of_a_process_takes_no_negative_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the first frame takes beyond the others counts as the start; a first frame that is quicker has none."""
+    made = iter([1.5, 4.0, 4.0, 9.0, 4.0, 4.0])
+
+    def timed(job: Job, frame: int) -> tuple[SimpleNamespace, float, float]:
+        return SimpleNamespace(model_dump_json=lambda: ""), next(made), 1.0
+
+    monkeypatch.setattr("vlcrender.dataset.run.dry_run._timed", timed)
+    found = [dry_run(small_plan("poses.count=3")) for _ in range(2)]
+    assert [(one.start_s, one.wall_s) for one in found] == [(0.0, 4.0), (5.0, 4.0)]

@@ -27,7 +27,9 @@ def test_no_figure_is_cut_off_and_no_box_is_drawn(
 
 def test_figures_stand_under_each_other(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setenv("COLUMNS", "80")
-    print_table("lengths", ("what", "of", "m", "error"), [("room", "x", "7", "1.5"), (), ("all", "", "12", "0.25")], left=2)
+    print_table(
+        "lengths", ("what", "of", "m", "error"), [("room", "x", "7", "1.5"), (), ("all", "", "12", "0.25")], left=2
+    )
     assert [line.rstrip() for line in capsys.readouterr().out.splitlines()] == [
         "lengths",
         "what   of    m   error",

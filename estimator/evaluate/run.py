@@ -117,9 +117,7 @@ def _run(
     rows: dict[str, list[EstimateRow]] = {name: [] for name in chosen}
     for of_cell, digest, found in zip(homes, digests, of_cells, strict=True):
         for name, of_variant in found.items():
-            path = write_estimates(of_cell, name, of_variant, digest)
-            failed = sum(row.status == "failed" for row in of_variant)
-            logger.info("%s: %d of %d frames failed, estimates in %s", name, failed, len(of_variant), path)
+            write_estimates(of_cell, name, of_variant, digest)
             rows[name] += of_variant
     return {name: tuple(of_variant) for name, of_variant in rows.items()}
 

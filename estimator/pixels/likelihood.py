@@ -46,7 +46,7 @@ PHASE_SIGMA_LINES = 0.5
 # Largest change of the phase in one fit, and in all, lines.
 MAX_PHASE_STEP = 0.5
 MAX_PHASE = 2.0
-# Relative determinant below which readings do not determine amplitude and background; they are then not used.
+# Relative determinant below which readings do not determine amplitude and background, which are not used then.
 MIN_DETERMINANT = 1e-9
 # Standard deviations a priori of the background's slopes by a and b, its curvature: relative to
 # the background's level plus HALO_SHARE of the amplitude.
@@ -134,9 +134,7 @@ def fit_photometry(
             gain, by_phase = pixels.gains.at(phase)
             columns[AMPLITUDE], columns[AMPLITUDE + 1] = light * gain, light * by_phase
         normal, right = _normal_equations(pixels.starts, columns, weight)
-        of_background, of_light = normal[:, 0, 0], normal[:, AMPLITUDE, AMPLITUDE]
-        determinant = of_background * of_light - normal[:, 0, AMPLITUDE] ** 2
-        determined = determinant > MIN_DETERMINANT * of_background * of_light
+        determined = (normal[:, 0, 0] > 0) & (normal[:, AMPLITUDE, AMPLITUDE] > 0)
         prior = np.maximum(np.outer(level, BACKGROUND_SIGMAS), MIN_VARIANCE_E2) ** -2.0
         slopes = range(1, AMPLITUDE)
         normal[:, slopes, slopes] += prior
@@ -147,7 +145,7 @@ def fit_photometry(
             normal[:, -1, -1] += of_phase
             right[:, -1] -= of_phase * bright * phase
         normal[~determined] = np.eye(count)
-        # Few unsaturated pixels may determine background and amplitude, and not the background's slopes beside them.
+        # Of a matrix with a diagonal of ones, which is no larger than the determinant of background and amplitude alone.
         determined &= np.linalg.det(_of_equal_size(normal)[0]) > MIN_DETERMINANT
         normal[~determined] = np.eye(count)
         covariance = _inverse(normal) * determined[:, None, None]

@@ -31,6 +31,11 @@ class Disc:
         """Points of the rim (points, 2), relative to the centre, evenly spaced."""
         return self.radius_m * _unit_circle(points)
 
+    def nearest_on_rim(self, x: Array, y: Array) -> tuple[Array, Array]:
+        """The point of the rim next to each point, from the centre; (0, 0) for the centre itself."""
+        scale = self.radius_m / np.maximum(np.hypot(x, y), np.finfo(float).tiny)
+        return x * scale, y * scale
+
     def image_area_px(self, outline: Array) -> float:
         """Area of the image with this rim, `outline` (points, 2): the polygon and the segments beyond its sides."""
         step = 2 * np.pi / len(outline)
@@ -77,6 +82,17 @@ class Rectangle:
         for _ in range(3):
             sides.append(sides[-1] @ quarter_turn)
         return self._rotated(np.concatenate(sides) * np.array(self.size_m) / 2, 1)
+
+    def nearest_on_rim(self, x: Array, y: Array) -> tuple[Array, Array]:
+        """The point of the rim next to each point, from the centre."""
+        own = self._rotated(np.stack([x, y], axis=-1), -1)
+        half = np.array(self.size_m) / 2
+        inside = np.clip(own, -half, half)
+        to_side = half - np.abs(inside)
+        to_x = to_side[..., 0] < to_side[..., 1]
+        moved = np.stack([to_x, ~to_x], axis=-1)
+        nearest = self._rotated(np.where(moved, np.copysign(half, own), inside), 1)
+        return nearest[..., 0], nearest[..., 1]
 
     def image_area_px(self, outline: Array) -> float:
         """Area of the image, of which `outline` (points, 2) is the rim."""

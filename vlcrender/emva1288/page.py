@@ -9,6 +9,7 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from vlcrender.emva1288.datasheet import Datasheet, cells
+from vlcrender.sensor.sensor import Sensor
 
 Array = NDArray[np.float64]
 WIDTH, HEIGHT = 960.0, 380.0
@@ -57,7 +58,6 @@ def _photon_transfer(sheet: Datasheet) -> str:
 
 def _signal_to_noise(sheet: Datasheet) -> str:
     measured, sensor = sheet.measurement, sheet.sensor
-    acting, gain = sensor.acting(), sensor.gain_at_iso_e_per_dn
     dark_dn = measured.dark.mean_dn
     points = [
         p
@@ -68,8 +68,6 @@ def _signal_to_noise(sheet: Datasheet) -> str:
     ratios = np.array([(p.mean_dn - dark_dn) / p.variance_dn2**0.5 for p in points])
     top = float(np.ceil(np.log10(photons[-1])))
     curve = np.logspace(0, np.log10(photons[-1]), 200)
-    electrons = curve * sheet.efficiency
-    dark_e2 = acting["read_noise_e"] ** 2 + (acting["adc_noise_dn"] ** 2 + 1 / 12) * gain**2
     high = float(np.ceil(np.log10(np.sqrt(photons[-1]))))
 
     def place(x: Array, y: Array) -> tuple[Array, Array]:
@@ -77,7 +75,7 @@ def _signal_to_noise(sheet: Datasheet) -> str:
         return LEFT + u * (WIDTH - LEFT - RIGHT), HEIGHT - BOTTOM - v * (HEIGHT - TOP - BOTTOM)
 
     decades_x, decades_y = np.logspace(0, top, int(top) + 1), np.logspace(-1, high, int(high) + 2)
-    set_ratios = electrons / np.sqrt(electrons + dark_e2)
+    set_ratios = _signal_to_noise_of(sensor, curve * sheet.efficiency)
     shown = set_ratios >= 0.1
     parts = [
         *_axes(decades_x, decades_y, place, "photons per pixel", "signal to noise"),
@@ -86,6 +84,13 @@ def _signal_to_noise(sheet: Datasheet) -> str:
         *_dots(*place(photons, ratios)),
     ]
     return _svg("signal to noise ratio", parts)
+
+
+def _signal_to_noise_of(sensor: Sensor, electrons: Array) -> Array:
+    """Signal to noise of mean electrons by the sensor's settings, by temporal noise alone, as EMVA 1288 counts it."""
+    acting, gain = sensor.acting(), sensor.gain_at_iso_e_per_dn
+    dark_e2 = acting["read_noise_e"] ** 2 + (acting["adc_noise_dn"] ** 2 + 1 / 12) * gain**2
+    return np.asarray(electrons / np.sqrt(electrons + dark_e2))
 
 
 def _steps(end: float) -> Array:

@@ -39,7 +39,6 @@ from vlcrender.camera.intrinsics import Pose
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.rig import Mounted
 from vlcrender.camera.roi import LedRegions, RegionImage, Roi, led_regions
-from vlcrender.core.planar_shapes import Disc
 from vlcrender.rendering.expected_image import Gains, LedPatch, gain_in
 from vlcrender.rendering.face_motions import FACE_NUMBERS, OWN, face_motions, moved
 from vlcrender.rendering.led_coverage import intersections_with_plane
@@ -373,18 +372,7 @@ class FrameSlopes:
         """
         face = face_of_led(leds, i)
         x, y = intersections_with_plane(self.mounted.posed(self.main), face.center_m, *roi.centers_px())
-        if isinstance(face.shape, Disc):
-            scale = face.shape.radius_m / np.maximum(np.hypot(x, y), np.finfo(float).tiny)
-            return x, y, x * scale, y * scale
-        half_x, half_y = (side / 2 for side in face.shape.size_m)
-        inside_x, inside_y = np.clip(x, -half_x, half_x), np.clip(y, -half_y, half_y)
-        to_x = half_x - np.abs(inside_x) < half_y - np.abs(inside_y)
-        return (
-            x,
-            y,
-            np.where(to_x, np.copysign(half_x, x), inside_x),
-            np.where(to_x, inside_y, np.copysign(half_y, y)),
-        )
+        return x, y, *face.shape.nearest_on_rim(x, y)
 
     def shift_slopes(self, roi: Roi, leds: Leds, i: int, by_position: Array) -> Array:
         """Slopes of one LED's light by a shift of its image along u and v, (2, rows, columns), electrons per pixel.
