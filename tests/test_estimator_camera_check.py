@@ -125,7 +125,7 @@ def test_gravity_keeps_a_tilt_from_making_up_for_the_focal_length() -> None:
     """Information of 2e4 each about a tilt and the focal length, 1.5e4 in common, and 1 / (0.01 rad)^2 = 1e4 of gravity
     about the tilt: 2e4 - 1.5e4^2 / 3e4 = 12500 is left of the focal length's, and a gradient of 25 says 0.002.
     """
-    frame = frame_of(VIEW, LEDS_M, np.zeros((700, 900)))
+    frame = frame_of(VIEW, LEDS_M, np.zeros((700, 900), dtype=np.uint32))
     priors = Priors.of(frame, tuple(frame.leds.values()))
     gravity = Gravity(POSE.rig_angles(frame.camera)[:2], np.full(2, 0.01))
     used = np.ones(len(LEDS_M), dtype=bool)

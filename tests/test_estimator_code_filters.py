@@ -21,7 +21,7 @@ def test_filters_give_each_wave_s_correlation(length: int, exposure_chips: float
     rng = np.random.default_rng(8)
     codes = ["".join(map(str, rng.permutation(np.arange(length) % 2))) for _ in range(2)]
     book = CodeBook(CHIP_S, [Codes.model_construct(leds=(4, 7), codes=tuple(codes), depth=1.0, chip_us=25.0)])
-    start_s = 3.0 + 10e-6 * np.arange(60)
+    start_s = 3.0 + np.linspace(0.0, 590e-6, 60)
     signal = Signal(start_s, exposure_chips * CHIP_S, rng.uniform(0, 1, 60), rng.uniform(1, 2, 60))
     found = book.correlations(signal)
     for row in range(2):
