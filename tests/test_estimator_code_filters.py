@@ -16,7 +16,7 @@ def test_filters_give_each_wave_s_correlation(length: int, exposure_chips: float
     """Exposures of two chips, and of more than half a period, in which a chip meets another both before and after it.
 
     Filters are in single precision, 6e-8: a variance of the gains is the difference of two numbers of some 0.25, and is
-    0.003 at least, so that the correlation is right to some 1e-5.
+    9e-4 at least, so that a rounding is 2e-5 of it; a few of them add.
     """
     rng = np.random.default_rng(8)
     codes = ["".join(map(str, rng.permutation(np.arange(length) % 2))) for _ in range(2)]

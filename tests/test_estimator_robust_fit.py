@@ -13,6 +13,7 @@ from estimator.errors import EstimationFailure
 from estimator.methods.gravity_fit import _from_triples as from_triples
 from estimator.methods.gravity_fit import agreement, ambiguous
 from estimator.solvers import robust_fit
+from estimator.solvers.chi_square import chi2_limit
 from estimator.solvers.local_minima import minima
 from estimator.solvers.observations import Observations, observe
 from estimator.solvers.reprojection import Fit
@@ -285,6 +286,6 @@ def test_a_size_of_errors_that_no_fit_settles_leaves_the_other_explanations(monk
 def test_a_fit_explains_gravity_up_to_the_limit_itself() -> None:
     """As with spots, whose limit belongs to what is explained."""
     seen = observed(np.zeros((9, 2)), np.ones(9))
-    limit = robust_fit.chi2_limit(robust_fit.OUTLIER_PROBABILITY, 2)
+    limit = chi2_limit(robust_fit.OUTLIER_PROBABILITY, 2)
     assert explains_all(fitted(limit, np.zeros(9), limit), seen)
     assert not explains_all(fitted(limit, np.zeros(9), float(np.nextafter(limit, np.inf))), seen)
