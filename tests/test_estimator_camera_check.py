@@ -1,6 +1,7 @@
 """Check of a camera that states no errors: by pixels, and what its errors then say."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from estimator_synthetic import grid, poisson, render, view_of
 from scipy.stats import chi2
 from test_estimator_maximum_likelihood import SAMPLES, TARGET, frame_of, most_likely
 
-from estimator.camera.pose import Pose
+from estimator.camera.pose import POSE_PARAMETERS, Pose
 from estimator.io.camera import CameraUncertainty
 from estimator.io.device import DeviceFrame
 from estimator.methods.camera_statement import Judged
@@ -18,7 +19,7 @@ from estimator.pixels.camera_check import camera_errors_by_pixels
 from estimator.pixels.initial import gravity_of
 from estimator.pixels.led_model import SIZE_PARAMETER
 from estimator.pixels.likelihood import Noise, fit_photometry, score
-from estimator.pixels.nuisances import Priors
+from estimator.pixels.nuisances import Gravity, Nuisances, Priors
 from estimator.solvers.camera_check import CameraErrors
 
 VIEW = view_of(TARGET, 3.0, 15.0, -10.0, 30.0, size=(900, 700, 1500.0))
@@ -118,3 +119,19 @@ def test_an_unchecked_camera_costs_its_mean_square_error() -> None:
     expected += (third * 0.09 + (third * 0.1) ** 2) * np.outer(moved[:, 2], moved[:, 2])
     np.testing.assert_allclose(errors.unchecked_m2(), expected, rtol=1e-12)
     assert not CameraErrors(found, np.array([1.2e-4, 0.2, 0.3]), assumed, moved).unchecked_m2().any()
+
+
+def test_gravity_keeps_a_tilt_from_making_up_for_the_focal_length() -> None:
+    """Information of 2e4 each about a tilt and the focal length, 1.5e4 in common, and 1 / (0.01 rad)^2 = 1e4 of gravity
+    about the tilt: 2e4 - 1.5e4^2 / 3e4 = 12500 is left of the focal length's, and a gradient of 25 says 0.002.
+    """
+    frame = frame_of(VIEW, LEDS_M, np.zeros((700, 900), dtype=np.uint32))
+    priors = Priors.of(frame, tuple(frame.leds.values()))
+    gravity = Gravity(POSE.rig_angles(frame.camera)[:2], np.full(2, 0.01))
+    used = np.ones(len(LEDS_M), dtype=bool)
+    result = SimpleNamespace(pose=POSE, nuisances=Nuisances.zero(priors), used=used)
+    information, gradient = 2e4 * np.eye(SIZE_PARAMETER), np.zeros(SIZE_PARAMETER)
+    information[3, POSE_PARAMETERS] = information[POSE_PARAMETERS, 3] = 1.5e4
+    gradient[POSE_PARAMETERS] = 25.0
+    errors = camera_errors_by_pixels(frame, gravity, priors, result, information, gradient)  # type: ignore[arg-type]
+    assert errors.found[0] == pytest.approx(0.002, rel=1e-9)

@@ -18,3 +18,18 @@ def test_a_row_whose_light_does_not_fall_has_no_edge() -> None:
     with np.errstate(all="raise"):
         found = right_edges(electrons, own, np.ones_like(own))
     np.testing.assert_allclose(found, [[last + 1 + 0.4, 0.5]], atol=1e-12)
+
+
+def test_an_edge_needs_pixels_of_one_image_before_it_and_none_of_another_behind() -> None:
+    """Three rows of light that falls by 80 electrons behind a pixel: below a whole side of the image, behind too few
+    pixels of it, and before another piece of it that is nearer than a side is long.
+    """
+    own = np.zeros((3, 4 * SIDE_PX), dtype=bool)
+    last = 2 * SIDE_PX - 1
+    own[:, : last + 1] = True
+    own[1, : last - SIDE_PX + 2] = False
+    own[2, last + SIDE_PX] = True
+    electrons = np.where(np.arange(own.shape[1]) <= last, 100.0, 20.0) * np.ones((3, 1))
+    used = np.zeros_like(own)
+    used[:, last] = True
+    np.testing.assert_allclose(right_edges(electrons, own, used), [[last + 1, 0.5]], atol=1e-12)

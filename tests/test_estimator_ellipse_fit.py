@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from estimator.spots.ellipse_fit import fit_ellipse
+from estimator.spots.ellipse_fit import _start_ellipse, fit_ellipse
 from estimator.spots.line_edges import LineEdges
 from estimator.spots.outlines import OUTLIER_SIGMA, EdgeEllipse
 
@@ -41,3 +41,19 @@ def test_edges_of_a_band_are_no_ellipse() -> None:
     """
     left, right = [16.0, 17.0, 15.0, 11.0, 12.0, 9.0, 12.0], [36.0, 30.0, 30.0, 25.0, 27.0, 25.0, 22.0]
     assert fit_ellipse(edges_of(left, right)) is None
+
+
+def test_the_start_weighs_squared_chords_by_their_errors() -> None:
+    """A squared chord c^2 errs by 2 c times its chord's error: in c^2 = c0 + c1 y + c2 y^2 its weight is 1 / (c sigma),
+    here with errors that differ tenfold from line to line. Both solve the same equations: rounding alone differs.
+    """
+    rng = np.random.default_rng(6)
+    lines, sigma_px = np.arange(26.0), np.where(np.arange(26) % 3 == 0, 0.5, 0.05)
+    left, right = EdgeEllipse(30.0, 12.0, 0.0, 15.0, 16.0).edges(lines)
+    left, right = left + sigma_px * rng.uniform(-1, 1, 26), right + sigma_px * rng.uniform(-1, 1, 26)
+    found = _start_ellipse(LineEdges(lines, left, right, sigma_px**2, np.ones(26), 0.0))
+    c2, c1, c0 = np.polyfit(lines + 0.5, (right - left) ** 2, 2, w=1 / (sigma_px * (right - left)))
+    assert found is not None
+    y0, chord2 = -c1 / (2 * c2), c0 - c1**2 / (4 * c2)
+    expected = y0, np.sqrt(chord2) / 2, np.sqrt(-chord2 / c2)
+    assert (found.y0, found.half_chord, found.half_extent) == pytest.approx(expected, rel=1e-9)

@@ -13,6 +13,8 @@ from estimator.io.camera import Camera
 from estimator.io.led_map import DiscLed, Led, SquareLed
 from estimator.pixels.led_model import (
     IMAGE_PARAMETERS,
+    LOCAL_PARAMETERS,
+    MOTION_COLUMNS,
     PRINCIPAL_POINT,
     SIZE_PARAMETER,
     TILT_PARAMETERS,
@@ -279,3 +281,8 @@ def test_leds_that_are_not_imaged_have_no_footprint() -> None:
         True,
         False,
     ]
+
+
+def test_the_motion_s_columns_are_those_behind_the_local_ones() -> None:
+    """Six of a velocity: three of the place, three of the rotation."""
+    assert (np.asarray(MOTION_COLUMNS) - LOCAL_PARAMETERS).tolist() == [0, 1, 2, 3, 4, 5]

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
 from estimator.spots.line_edges import LineEdges, edges_of
 from estimator.spots.striped_blobs import BlobLight, StripedBlob
@@ -58,3 +59,20 @@ def test_lines_below_a_twentieth_of_the_bright_ones_are_background() -> None:
     found = bar(level)
     assert found is not None
     assert sorted(set(range(ROWS)) - set(found.lines.astype(int).tolist())) == [3]
+
+
+def test_the_edges_of_a_blurred_bar_are_where_it_begins_and_ends() -> None:
+    """Each edge is the light within EDGE_PX = 2.5 px of a rough one, where light and shadow that the blur of 1.2 px
+    carries beyond are equal: a share of Q(2.5 / 1.2) = 0.02 at each end. A rough edge that is right to half a pixel
+    makes them differ by 2 x 0.02 x 0.5 = 0.02 px.
+    """
+    edges_px, blur_px = np.array([20.3, 40.4]), 1.2
+    columns = np.linspace(0, COLUMNS, 100 * COLUMNS + 1)
+    shares = ndtr((columns - edges_px[0]) / blur_px) - ndtr((columns - edges_px[1]) / blur_px)
+    signal = np.tile(1e5 * shares[:-1].reshape(COLUMNS, 100).mean(axis=1), (ROWS, 1))
+    own = signal > 5e3
+    blob = StripedBlob(0, 0, COLUMNS, ROWS, own, np.zeros_like(own), int(own.sum()))
+    found = edges_of(BlobLight(signal, signal + 1, np.ones_like(own), np.zeros(ROWS)), blob, np.zeros_like(own))
+    assert found is not None
+    assert found.left == pytest.approx(np.full(ROWS, edges_px[0]), abs=0.02)
+    assert found.right == pytest.approx(np.full(ROWS, edges_px[1]), abs=0.02)

@@ -5,7 +5,7 @@ import pytest
 from downlink_signals import PACKETS, packet_chips
 from numpy.typing import NDArray
 
-from estimator.receiver.packets import PacketFormat, _checked, _Fit
+from estimator.receiver.packets import PacketFormat, _added, _checked, _Fit
 
 Array = NDArray[np.float64]
 FORM = PacketFormat(PACKETS)
@@ -46,3 +46,14 @@ def test_bits_of_which_no_line_shows_a_chip_are_erasures_and_those_with_one_are_
     assert data_with(np.concatenate([ones, ones + 1])) == [(3, 0)]
     assert data_with(ones) == [(0, 0)]
     assert data_with(np.array([], dtype=np.int64)) == [(0, 0)]
+
+
+def test_fits_are_added_chip_by_chip() -> None:
+    """Two LED images that show all chips but one each: every chip is shown by two of them but for those two chips."""
+    first, second = np.ones(FORM.length), np.full(FORM.length, 2.0)
+    first[3], second[8] = 0.0, 0.0
+    both = _added([fit_of(first, 1), fit_of(second, 1)], FORM.length)
+    assert both.shown.tolist() == [1 if place in (3, 8) else 2 for place in range(FORM.length)]
+    assert (np.diag(both.normal) == first + second).all()
+    assert (both.right == (first + second) * (CHIPS - 0.5)).all()
+    assert both.square == pytest.approx((first + second).sum() / 4)

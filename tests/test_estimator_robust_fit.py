@@ -13,10 +13,12 @@ from estimator.errors import EstimationFailure
 from estimator.methods.gravity_fit import _from_triples as from_triples
 from estimator.methods.gravity_fit import agreement, ambiguous
 from estimator.solvers import robust_fit
+from estimator.solvers.chi_square import chi2_limit
 from estimator.solvers.local_minima import minima
 from estimator.solvers.observations import Observations, observe
 from estimator.solvers.reprojection import Fit
 from estimator.solvers.robust_fit import Consensus, consensus
+from estimator.solvers.robust_fit import _explains_all as explains_all
 from estimator.solvers.robust_fit import _plausible as plausible
 from estimator.solvers.robust_fit import _score as score
 from estimator.solvers.robust_fit import _snooped as data_snooping
@@ -279,3 +281,11 @@ def test_a_size_of_errors_that_no_fit_settles_leaves_the_other_explanations(monk
     monkeypatch.setattr(robust_fit, "MIN_SURE_SHARE", 99.0)
     found = agreed(observed(np.vstack([np.zeros((8, 2)), [[30.0, 0.0]]]), np.full(9, 0.02)))
     assert found.inliers.tolist() == [True] * 8 + [False]
+
+
+def test_a_fit_explains_gravity_up_to_the_limit_itself() -> None:
+    """As with spots, whose limit belongs to what is explained."""
+    seen = observed(np.zeros((9, 2)), np.ones(9))
+    limit = chi2_limit(robust_fit.OUTLIER_PROBABILITY, 2)
+    assert explains_all(fitted(limit, np.zeros(9), limit), seen)
+    assert not explains_all(fitted(limit, np.zeros(9), float(np.nextafter(limit, np.inf))), seen)

@@ -145,7 +145,7 @@ def fit_photometry(
             normal[:, -1, -1] += of_phase
             right[:, -1] -= of_phase * bright * phase
         normal[~determined] = np.eye(count)
-        # Of a matrix with a diagonal of ones, which is no larger than the determinant of background and amplitude alone.
+        # Of matrices with a diagonal of ones: no larger than the determinant of background and amplitude alone.
         determined &= np.linalg.det(_of_equal_size(normal)[0]) > MIN_DETERMINANT
         normal[~determined] = np.eye(count)
         covariance = _inverse(normal) * determined[:, None, None]
