@@ -209,7 +209,9 @@ def _moved_into_rectangle(polygons: Array, half_x: float, half_y: float) -> Arra
     b, c, first, last = np.maximum(a, c), np.minimum(b, d), np.minimum(a, c), np.maximum(b, d)
     t = np.stack([np.zeros_like(a), first, np.minimum(b, c), np.maximum(b, c), last], axis=1)
     moved = p[:, :, None] + t * edge[:, :, None]
-    return np.clip(moved, -limits[..., None], limits[..., None], out=moved).reshape(2, 5 * p.shape[1], len(polygons))
+    np.clip(moved, -limits[..., None], limits[..., None], out=moved)
+    corners: Array = moved.reshape(2, 5 * p.shape[1], len(polygons))
+    return corners
 
 
 def _triangle_moments(a: Array, b: Array) -> Array:
