@@ -1,6 +1,6 @@
 """Regions of interest: the rectangles of a sensor that are read out."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, NamedTuple, Self
 
@@ -10,6 +10,9 @@ from pydantic import Field
 
 from vlcrender.camera.intrinsics import Camera
 from vlcrender.config.toml_model import Settings
+
+PIXELS_AT_ONCE = 50_000
+"""Pixels of a band of rows: so few that arrays of them stay in the processor's cache."""
 
 
 class LedRegions(Settings):
@@ -62,6 +65,12 @@ class Roi:
         u = np.arange(self.column, self.end_column, dtype=np.float64) + 0.5
         v = np.arange(self.row, self.end_row, dtype=np.float64) + 0.5
         return u[None, :], v[:, None]
+
+    def bands(self) -> Iterator[slice]:
+        """Slices of the region's rows, from the first on, of some PIXELS_AT_ONCE pixels each."""
+        rows = max(1, PIXELS_AT_ONCE // self.columns)
+        for start in range(0, self.rows, rows):
+            yield slice(start, start + rows)
 
     def padded(self, by_px: int) -> "Roi":
         """The region with `by_px` more pixels on each side."""

@@ -113,7 +113,8 @@ class Rectangle:
                 mixed &= ~_corner_extreme(beyond, np.logical_and)
         mixed &= ~whole
         for own in (x, y):  # only a cell with a corner beyond the horizon is as large as that
-            mixed[mixed] = np.ptp(corners_of_cells(own, mixed), axis=-1) < BEYOND_HORIZON_M / 2
+            if np.ptp(own) >= BEYOND_HORIZON_M / 2:
+                mixed[mixed] = np.ptp(corners_of_cells(own, mixed), axis=-1) < BEYOND_HORIZON_M / 2
         return whole, mixed
 
     def shared_area(self, quads: Array) -> Array:
@@ -196,8 +197,9 @@ def rectangle_polygon_area(polygons: Array, half_x: float, half_y: float) -> Arr
     point: points inside stay, points outside collapse onto the rectangle's sides and enclose no area. The moved polygon
     has additional vertices where an edge crosses the line of a side. The result is continuous where edges coincide.
     """
-    moved = _moved_into_rectangle(polygons, half_x, half_y)
-    area: Array = np.abs(_cross(moved, np.roll(moved, -1, axis=1)).sum(axis=1)) / 2
+    x, y = _moved_into_rectangle(polygons, half_x, half_y)
+    doubled = x * np.roll(y, -1, axis=0) - y * np.roll(x, -1, axis=0)
+    area: Array = np.abs(np.ascontiguousarray(doubled.T).sum(axis=1)) / 2
     return area
 
 
@@ -206,20 +208,26 @@ def rectangle_polygon_moments(polygons: Array, half_x: float, half_y: float) -> 
 
     Arguments as of `rectangle_polygon_area`.
     """
-    moved = _moved_into_rectangle(polygons, half_x, half_y)
+    moved = np.ascontiguousarray(_moved_into_rectangle(polygons, half_x, half_y).T)
     return _oriented(_triangle_moments(moved, np.roll(moved, -1, axis=1)).sum(axis=-1))
 
 
 def _moved_into_rectangle(polygons: Array, half_x: float, half_y: float) -> Array:
-    limits = np.array([half_x, half_y])
-    p = polygons
-    edge = np.roll(polygons, -1, axis=1) - p
+    """Moved polygons (n, vertices, 2) of `rectangle_polygon_area`, (2, 5 vertices, n): NumPy is slow on short axes."""
+    limits = np.array([half_x, half_y])[:, None, None]
+    p = np.ascontiguousarray(polygons.T)
+    edge = np.roll(p, -1, axis=1) - p
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
-        crossings = np.concatenate([(-limits - p) / edge, (limits - p) / edge], axis=-1)
+        crossings = np.concatenate([(-limits - p) / edge, (limits - p) / edge])
     # an edge parallel to a side does not cross it
-    crossings = np.clip(np.nan_to_num(crossings, nan=0.0, posinf=0.0, neginf=0.0), 0.0, 1.0)
-    t = np.concatenate([np.zeros((*p.shape[:-1], 1)), np.sort(crossings, axis=-1)], axis=-1)
-    return np.clip(p[:, :, None] + t[..., None] * edge[:, :, None], -limits, limits).reshape(len(p), 5 * p.shape[1], 2)
+    a, b, c, d = np.clip(np.nan_to_num(crossings, copy=False, nan=0.0, posinf=0.0, neginf=0.0), 0.0, 1.0)
+    a, b, c, d = np.minimum(a, b), np.maximum(a, b), np.minimum(c, d), np.maximum(c, d)
+    b, c, first, last = np.maximum(a, c), np.minimum(b, d), np.minimum(a, c), np.maximum(b, d)
+    t = np.stack([np.zeros_like(a), first, np.minimum(b, c), np.maximum(b, c), last], axis=1)
+    moved = p[:, :, None] + t * edge[:, :, None]
+    np.clip(moved, -limits[..., None], limits[..., None], out=moved)
+    corners: Array = moved.reshape(2, 5 * p.shape[1], len(polygons))
+    return corners
 
 
 def _triangle_moments(a: Array, b: Array) -> Array:

@@ -49,7 +49,8 @@ def light_of_diffuser(
         about_foot = replace(diffuser, foot_m=(0.0, 0.0), **numbers)
         columns, row, column = (data(value % 2**32, mi.UInt32) for value in (roi.columns, roi.row, roi.column))
         index = dr.arange(mi.UInt32, roi.pixels)
-        down = index // columns
+        # Vectors have no division of integers. The quotient of two of 32 bits is never rounded up to a whole number.
+        down = mi.UInt32(mi.Float64(index) / mi.Float64(columns))
         u, v = (mi.Float64(mi.Int32(place)) + 0.5 for place in (column + index - down * columns, row + down))
         camera, total = CameraData.of(posed.camera, mi.Float64), number(0.0)
         for du, dv in nodes:

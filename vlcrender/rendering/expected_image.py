@@ -101,7 +101,10 @@ class ExpectedRegion:
         lights: list[LedPatch | SpecularReflection] = [*self.patches, *self.reflections]
         for light in lights:
             gain = 1.0 if gains is None else gain_in(gains.get(light.led_id, 1.0), light.roi)
-            image[self.roi.slices(light.roi)] += light.electrons_per_s * _float32(gain * exposure_s)
+            factor = np.broadcast_to(_float32(gain * exposure_s), light.roi.shape)
+            pixels = image[self.roi.slices(light.roi)]
+            for band in light.roi.bands():
+                pixels[band] += light.electrons_per_s[band] * factor[band]
         if isinstance(room_gain, np.ndarray) or room_gain != 1:
             if self.led_background_e_per_s is None:
                 raise ValueError("room_gain: the part of the background that left an LED is not known")

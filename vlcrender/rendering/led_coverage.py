@@ -61,8 +61,9 @@ class CoverageBlocks:
     def reduce(self, light: NDArray[Any]) -> None:
         """Multiply the light of pixels covered whole, (rows, columns), by their coverage."""
         for number, lit in enumerate(self.whole | self.mixed):
-            if not lit.all():
-                light[number * BLOCK_PX : (number + 1) * BLOCK_PX] *= lit.repeat(BLOCK_PX)[: light.shape[1]]
+            row_of_blocks = light[number * BLOCK_PX : (number + 1) * BLOCK_PX]
+            for start, end in _runs(~lit):
+                row_of_blocks[:, start * BLOCK_PX : end * BLOCK_PX] = 0
         first_row, first_column = np.nonzero(self.mixed)
         rows, columns = np.broadcast_arrays(
             (first_row * BLOCK_PX)[:, None, None] + np.arange(BLOCK_PX)[:, None],
@@ -235,6 +236,13 @@ def _coverage_of_cells(face: LedFace, whole: NDArray[np.bool_], mixed: NDArray[n
     coverage = whole.astype(float)
     coverage[mixed] = np.clip(face.shape.shared_area(quads) / quadrilateral_area(quads), 0.0, 1.0)
     return coverage
+
+
+def _runs(chosen: NDArray[np.bool_]) -> list[list[int]]:
+    """First number of each run of chosen ones, and the number after its last."""
+    edges = np.flatnonzero(np.diff(chosen, prepend=False, append=False))
+    runs: list[list[int]] = edges.reshape(-1, 2).tolist()
+    return runs
 
 
 def _quads(x: Array, y: Array, cells: NDArray[np.bool_]) -> Array:

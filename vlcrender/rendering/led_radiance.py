@@ -42,7 +42,6 @@ MAX_UNIFORM_SHARE = 0.02
 an error of 2 (m + 3) * 0.02^2 / 24: 3e-4 for a Lambertian order m of 5."""
 GRID_POINTS = 17
 """Points across and down a region at which the width of a pixel on a diffuser is computed."""
-PIXELS_AT_ONCE = 50_000
 
 Array = NDArray[np.float64]
 
@@ -100,7 +99,7 @@ class LedImage:
         pattern = _pattern(self.leds, self.index, self.posed, self.roi)
         u, v = self.roi.centers_px()
         light = np.empty(self.roi.shape, dtype=precision)
-        for band in _bands(self.roi):
+        for band in self.roi.bands():
             luminance = 1.0 if pattern is None else pattern(u, v[band])
             luminance = luminance * (profile if isinstance(profile, float) else profile[band])
             light[band] = unit * coverage[band] * relative_illumination(camera, u, v[band]) * luminance
@@ -251,19 +250,12 @@ def _weight(posed: PosedCamera, roi: Roi) -> Array:
 
 
 def _in_bands(roi: Roi, function: Callable[[Array, Array], Array]) -> Array:
-    """A function of the pixel centres u (1, columns) and v (rows, 1), (rows, columns), by `_bands`."""
+    """A function of the pixel centres u (1, columns) and v (rows, 1), (rows, columns), by bands."""
     u, v = roi.centers_px()
     image = np.empty((roi.rows, roi.columns))
-    for band in _bands(roi):
+    for band in roi.bands():
         image[band] = function(u, v[band])
     return image
-
-
-def _bands(roi: Roi) -> Iterator[slice]:
-    """Bands of the region's rows, so narrow that arrays of their pixels stay in the processor's cache."""
-    rows = max(1, PIXELS_AT_ONCE // roi.columns)
-    for start in range(0, roi.rows, rows):
-        yield slice(start, start + rows)
 
 
 def _overscan_px(camera: Camera) -> int:
