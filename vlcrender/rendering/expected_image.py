@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlcrender.camera.roi import Roi
-from vlcrender.core.backend import empty_image
 
 Image = NDArray[np.float32]
 Gain = float | NDArray[np.float64]
@@ -97,6 +96,8 @@ class ExpectedRegion:
         room_gain: of the light of LEDs that the room reflects. Raises ValueError for one other than 1 where that part
         of the background is not known.
         """
+        from vlcrender.core.backend import empty_image  # loads Mitsuba, which a scene alone does not need
+
         image = np.multiply(self.background_e_per_s, np.float32(exposure_s), out=empty_image(self.roi.shape))
         lights: list[LedPatch | SpecularReflection] = [*self.patches, *self.reflections]
         for light in lights:
