@@ -8,13 +8,14 @@ from pydantic import Field, model_validator
 
 from estimator.evaluate.statistics import squared_in_sigmas
 from estimator.io.estimates import EstimateRow
-from estimator.io.records import LedId, Number, Row, Size, Triple
+from estimator.io.records import LedId, Number, Row, Size, Triple, small_row
 from estimator.io.truth import TruthRow
 
 Position = tuple[float, float, float]
 
 
-class RangeError(Row):
+@small_row
+class RangeError:
     """Estimated minus true distance to an LED, metres."""
 
     led: LedId

@@ -14,7 +14,7 @@ from pydantic import Field, Strict, model_validator
 from estimator.errors import InputError
 from estimator.io.atomic import write_atomically
 from estimator.io.device import Identity
-from estimator.io.records import Covariance, LedId, Number, Row, Size, Triple, read_metadata, read_rows
+from estimator.io.records import Covariance, LedId, Number, Row, Size, Triple, read_metadata, read_rows, small_row
 
 COLUMNS = {
     "frame": pa.int64(),
@@ -51,14 +51,16 @@ NAME = r"[A-Za-z0-9][A-Za-z0-9._:=,+-]{0,199}"
 NAME_RULE = "at most 200 of A-Z a-z 0-9 . _ : = , + -, a letter or digit first"
 
 
-class LedRange(Row):
+@small_row
+class LedRange:
     """Distance from the camera's projection centre to an LED, metres."""
 
     led: LedId
     range_m: Number
 
 
-class FoundSpot(Row):
+@small_row
+class FoundSpot:
     """Identified spot: centroid, continuous pixels, and signal to noise of its brightest pixel; None where unknown."""
 
     led: LedId

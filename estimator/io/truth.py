@@ -8,7 +8,17 @@ from pydantic import Field, Strict
 
 from estimator.errors import InputError
 from estimator.io.led_map import LedSize
-from estimator.io.records import Covariance, FlatRotation, LedId, Number, Row, Triple, read_rows, read_scalars
+from estimator.io.records import (
+    Covariance,
+    FlatRotation,
+    LedId,
+    Number,
+    Row,
+    Triple,
+    read_rows,
+    read_scalars,
+    small_row,
+)
 
 COLUMNS = {
     "frame": pa.int64(),
@@ -42,7 +52,8 @@ Angle = Annotated[float, Field(ge=-360, le=360)]
 """Degrees."""
 
 
-class TrueLed(Row):
+@small_row
+class TrueLed:
     """An LED that lights pixels of a frame: its centre's pixel, and the share of its image on the sensor.
 
     `bits` are the chips of one period that it sends; None without chips.
@@ -51,8 +62,8 @@ class TrueLed(Row):
     led: LedId
     u_px: Number
     v_px: Number
-    visible_fraction: float = Field(ge=0, le=WHOLE_AND_ROUNDING)
-    bits: str | None
+    visible_fraction: Annotated[float, Field(ge=0, le=WHOLE_AND_ROUNDING), Strict()]
+    bits: Annotated[str, Strict()] | None
 
 
 class TruthRow(Row):
