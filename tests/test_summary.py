@@ -15,7 +15,7 @@ import vlcrender as vr
 from vlcrender.config.presets import with_presets
 from vlcrender.config.toml_model import check, read_toml
 from vlcrender.dataset.format.frame_numbers import FrameNumbers
-from vlcrender.dataset.format.summary import disk_use, size_text
+from vlcrender.dataset.format.summary import Summary, disk_use, size_text, summary_lines
 from vlcrender.dataset.recipe.recipe import RecipeFile
 from vlcrender.dataset.recipe.recipe_warnings import recipe_warnings
 from vlcrender.dataset.run.dry_run import dry_run, file_counts
@@ -198,8 +198,6 @@ def test_an_impossible_pose_among_many_stops_its_frame(tmp_path: Path, monkeypat
 
 
 def test_numbers_that_are_not_known_leave_their_lines_out(rendered_set: Path, tmp_path: Path) -> None:
-    from vlcrender.dataset.format.summary import Summary, summary_lines
-
     found = Summary.model_validate(summary(copy_of(rendered_set, tmp_path / "set")))
     unknown = found.model_copy(update={"saturated_share": None, "brightest_e": None, "background_e": None})
     assert len(summary_lines(found)) == len(summary_lines(unknown)) + 3
@@ -237,3 +235,14 @@ def test_the_start_of_a_process_takes_no_negative_time(monkeypatch: pytest.Monke
     monkeypatch.setattr("vlcrender.dataset.run.dry_run._timed", timed)
     found = [dry_run(small_plan("poses.count=3")) for _ in range(2)]
     assert [(one.start_s, one.wall_s) for one in found] == [(0.0, 4.0), (5.0, 4.0)]
+
+
+@pytest.mark.parametrize(
+    ("share", "text"), [(1.0, "100 %"), (0.125, "12 %"), (0.0123, "1.2 %"), (3e-7, "3e-05 %"), (0.0, "no pixel")]
+)
+def test_the_share_of_saturated_pixels_is_a_number_as_people_write_it(
+    rendered_set: Path, share: float, text: str
+) -> None:
+    found = Summary.model_validate(summary(rendered_set)).model_copy(update={"saturated_share": share})
+    (line,) = [line for line in summary_lines(found) if line.startswith("saturated")]
+    assert line.removeprefix("saturated").strip().removesuffix(" of the pixels") == text

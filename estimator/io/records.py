@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, TypeVar, dataclass_transform
+from typing import Annotated, TypeVar, cast, dataclass_transform
 
 import numpy as np
 import pyarrow as pa
@@ -38,7 +38,7 @@ def small_row(record: type[T]) -> type[T]:
     The types of its fields have to be strict by themselves.
     """
     config = ConfigDict(strict=False, allow_inf_nan=False, extra="ignore")
-    return dataclass(frozen=True, slots=True, kw_only=True, config=config)(record)
+    return cast("type[T]", dataclass(frozen=True, slots=True, kw_only=True, config=config)(record))
 
 
 INT64_MAX = 2**63 - 1

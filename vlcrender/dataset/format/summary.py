@@ -109,8 +109,9 @@ def summary_lines(summary: Summary) -> list[str]:
     ]
     if summary.saturated_share is not None and summary.brightest_e is not None and summary.background_e is not None:
         share = 100 * summary.saturated_share
+        percent = f"{share:.2g}" if share < 10 else f"{share:.0f}"
         lines += [
-            ("saturated", f"{share:.2g} % of the pixels" if summary.saturated_share else "no pixel"),
+            ("saturated", f"{percent} % of the pixels" if summary.saturated_share else "no pixel"),
             ("brightest LED", f"{summary.brightest_e:.4g} electrons; a pixel saturates at {summary.saturation_e:.4g}"),
             ("background", f"{summary.background_e:.3g} electrons (median; mostly the ceiling)"),
         ]
