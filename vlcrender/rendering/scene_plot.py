@@ -107,7 +107,7 @@ def draw_view(
     plan, image = figure.subplots(1, 2, width_ratios=[1, 1.25])
     faces = _draw_plan(plan, scene, posed, positions_m)
     if np.ptp(scene.leds.luminances_cd_m2) > 0:
-        figure.colorbar(faces, ax=plan, label="LED luminance, cd/m$^2$", location="bottom", aspect=40)
+        figure.colorbar(faces, ax=plan, label="LED luminance, cd/m$^2$", shrink=0.8)
     _draw_image(image, posed.camera, regions, places_px)
     image.set_title(title)
     figure.savefig(path, dpi=110)
