@@ -33,7 +33,7 @@ class Entry(Row):
 
 @dataclass_transform(kw_only_default=True, frozen_default=True)
 def small_row(record: type[T]) -> type[T]:
-    """Decorator of a record like Row of which a frame has dozens: it takes a tenth of the memory.
+    """Decorator of a record like Row of which a frame has dozens: it takes a fifth of the memory.
 
     The types of its fields have to be strict by themselves.
     """

@@ -23,5 +23,5 @@ def print_table(title: str, headers: Sequence[str], rows: Sequence[Sequence[str]
             table.add_section()
     console = Console(highlight=False)
     own = Console(width=10_000).measure(table).maximum
-    console.print(escape(title), soft_wrap=False)
+    console.print(escape(title))
     Console(width=max(console.width, own), highlight=False).print(table)
