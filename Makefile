@@ -50,6 +50,7 @@ paper-full: $(READY)
 
 bench: $(READY)
 	$(BIN)/python benchmarks/full_frame.py
+	$(BIN)/python benchmarks/cycles.py
 	$(BIN)/python benchmarks/options.py
 	$(BIN)/python benchmarks/workers.py
 	$(BIN)/python benchmarks/errors.py

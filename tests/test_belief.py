@@ -17,7 +17,7 @@ from vlcrender.camera.intrinsics import Camera, Pose, transform
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.core.backend import dr
 from vlcrender.dataset.format.files import read_dataset_file
-from vlcrender.dataset.format.schema import DeviceTruthRow, FrameRow, MapTruthRow, TruthRow
+from vlcrender.dataset.format.rows import DeviceTruthRow, FrameRow, MapTruthRow, TruthRow
 from vlcrender.dataset.format.tables import read_table, write_table
 from vlcrender.dataset.recipe.plan import Plan, load_plan
 from vlcrender.dataset.run.frame_job import Job, _rendered, make_frame

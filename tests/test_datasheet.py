@@ -1,9 +1,7 @@
 """Photon transfer held against a camera written here in plain NumPy; then the sensor's own data sheet and its page."""
 
 import dataclasses
-import json
 import re
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,9 +12,8 @@ from html_text import texts
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from vlcrender.cli import main
 from vlcrender.core.quantity import Quantity, line
-from vlcrender.emva1288.datasheet import LABELS, SIGMAS, Datasheet, Row, cells, compare, load_sensor, make_datasheet
+from vlcrender.emva1288.datasheet import LABELS, Datasheet, Row, cells, compare, load_sensor, make_datasheet
 from vlcrender.emva1288.page import BOTTOM, HEIGHT, LEFT, RIGHT, TOP, WIDTH, page
 from vlcrender.emva1288.photon_transfer import Measurement, Shoot, measure, take_pair
 from vlcrender.errors import InputError
@@ -413,65 +410,6 @@ def test_a_value_that_is_off_stands_out(full: Datasheet) -> None:
     assert 'class="off"' not in page(full)
     wrong = tuple(dataclasses.replace(row, passed=False) if row.key == "K" else row for row in full.rows)
     assert page(dataclasses.replace(full, rows=wrong)).count('<td class="off">OFF</td>') == 1
-
-
-def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
-    """The command's exit code, in this process: another would first start Mitsuba."""
-    monkeypatch.setattr(sys, "argv", ["vlcrender", *arguments])
-    try:
-        main()
-    except SystemExit as end:
-        return int(end.code or 0)
-    return 0
-
-
-@pytest.mark.filterwarnings("ignore:Cyclopts application invoked")
-def test_the_command_prints_a_table_or_json_and_writes_the_page(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert run(monkeypatch, "datasheet", "ideal", "--side-px", "64", "--json") == 0
-    rows = json.loads(capsys.readouterr().out)["rows"]
-    assert rows["K"]["set_value"] == 1.0
-    assert abs(rows["K"]["measured"] - 1) <= rows["K"]["tolerance"] < SIGMAS * 0.008
-    assert (tmp_path / "ideal-datasheet.html").read_text().startswith("<!doctype html>")
-    (tmp_path / "clipped.toml").write_text('[sensor]\nnoise = "full"\nread_noise_e = 3.0\n')
-    # a deviation is no error
-    assert run(monkeypatch, "datasheet", "clipped.toml", "--side-px", "64", "--out", "page.html") == 0
-    assert "OFF" in capsys.readouterr().out
-    assert "clipped" in (tmp_path / "page.html").read_text()
-
-
-@pytest.mark.filterwarnings("ignore:Cyclopts application invoked")
-@pytest.mark.parametrize(
-    ("arguments", "mention"),
-    [
-        (["blind.toml", "--wavelength-nm", "800"], "--wavelength-nm 800: quantum efficiency is 0 there"),
-        (["ideal", "--wavelength-nm", "nan"], "--wavelength-nm nan"),
-        # Below, air and lenses absorb; beyond, silicon has no efficiency: its band gap of 1.12 eV is at 1107 nm.
-        (["ideal", "--wavelength-nm", "199.9"], "--wavelength-nm 199.9: has to be from 200 to 1200"),
-        (["ideal", "--wavelength-nm", "1200.1"], "--wavelength-nm 1200.1: has to be from 200 to 1200"),
-        (["ideal", "--side-px", "1"], "--side-px 1"),
-        (["unknown"], "unknown"),
-        (["ideal", "--out", "no/such/x.html"], "no/such"),
-        ([], "SENSOR"),
-    ],
-)
-def test_the_command_refuses_in_one_line(
-    arguments: list[str],
-    mention: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "blind.toml").write_text(
-        "[sensor.quantum_efficiency]\nwavelengths_nm = [400, 700]\nvalues = [0.5, 0.5]\n"
-    )
-    assert run(monkeypatch, "datasheet", *arguments) == 2
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert len(lines) == 1
-    assert mention in lines[0]
 
 
 def test_a_variance_that_rounding_hides_has_the_standard_error_of_what_may_be_hidden() -> None:

@@ -11,7 +11,7 @@ from conftest import ROOT, SMALL
 from vlcrender.camera.roi import RegionImage, Roi
 from vlcrender.dataset.format.exr import write_exr
 from vlcrender.dataset.format.files import whole_file, write_json
-from vlcrender.dataset.format.schema import FrameRecord, FrameRow
+from vlcrender.dataset.format.rows import FrameRecord, FrameRow
 from vlcrender.dataset.format.tables import write_table
 from vlcrender.dataset.recipe.plan import load_plan
 from vlcrender.dataset.run.generate import generate

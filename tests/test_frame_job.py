@@ -10,7 +10,7 @@ from conftest import ROOT, SMALL
 import vlcrender as vr
 from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.roi import RegionImage, Roi
-from vlcrender.dataset.format.schema import FrameRow, TruthRow
+from vlcrender.dataset.format.rows import FrameRow, TruthRow
 from vlcrender.dataset.format.tables import read_table
 from vlcrender.dataset.recipe.plan import Plan, load_plan
 from vlcrender.dataset.run import frame_job

@@ -20,7 +20,8 @@ import pytest
 from conftest import HANG_S, ROOT, SMALL, small_plan, started, wait_until
 
 from vlcrender.dataset.format.manifest import read_manifest
-from vlcrender.dataset.format.schema import DATA_VERSION, FrameRecord
+from vlcrender.dataset.format.rows import FrameRecord
+from vlcrender.dataset.format.schema import DATA_VERSION
 from vlcrender.dataset.recipe.plan import load_plan
 from vlcrender.dataset.run.generate import generate
 from vlcrender.dataset.run.progress import Progress, ProgressCallback

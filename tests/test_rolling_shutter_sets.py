@@ -15,7 +15,7 @@ import vlcrender as vr
 from vlcrender.camera.intrinsics import Pose
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.roi import RegionImage, Roi
-from vlcrender.dataset.format.schema import FrameRow, MapTruthRow, TruthRow
+from vlcrender.dataset.format.rows import FrameRow, MapTruthRow, TruthRow
 from vlcrender.dataset.format.tables import read_table, write_table
 from vlcrender.dataset.run import frame_job
 from vlcrender.dataset.world.true_world import gyro_rad_s

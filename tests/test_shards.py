@@ -17,7 +17,7 @@ import vlcrender as vr
 from estimator.io import dataset as reader
 from estimator.io.shard import frame_of_shard
 from vlcrender.camera.roi import RegionImage, Roi
-from vlcrender.dataset.format.schema import FrameRecord
+from vlcrender.dataset.format.rows import FrameRecord
 from vlcrender.dataset.format.shard import Shard, incomplete
 from vlcrender.dataset.run import frame_job
 from vlcrender.dataset.run.generate import _tasks

@@ -13,7 +13,7 @@ from conftest import copy_of
 from estimator.errors import InputError as ReaderError
 from estimator.io.dataset import read_dataset
 from vlcrender.dataset.format import tables
-from vlcrender.dataset.format.schema import (
+from vlcrender.dataset.format.rows import (
     FRAMES_SCHEMA,
     TRUTH_SCHEMA,
     DeviceTruthRow,

@@ -11,7 +11,7 @@ from conftest import ROOT, SMALL, sealed
 from vlcrender.camera.roi import RegionImage, Roi
 from vlcrender.core.digest import sha256_of
 from vlcrender.dataset.format.exr import write_exr
-from vlcrender.dataset.format.schema import FrameRow, TruthRow, flat9
+from vlcrender.dataset.format.rows import FrameRow, TruthRow, flat9
 from vlcrender.dataset.format.tables import read_table, write_table
 from vlcrender.dataset.recipe.plan import load_plan
 from vlcrender.dataset.run.generate import generate

@@ -26,7 +26,7 @@ from vlcrender.sensor.sensor import Sensor
 
 if TYPE_CHECKING:
     from vlcrender.dataset.format.downlink_entry import Demodulation
-    from vlcrender.dataset.format.schema import SpotRow
+    from vlcrender.dataset.format.rows import SpotRow
     from vlcrender.dataset.recipe.plan import Plan
     from vlcrender.dataset.run.progress import ProgressCallback
     from vlcrender.dataset.world.error_budget import ErrorBudget

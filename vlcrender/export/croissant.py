@@ -13,7 +13,7 @@ from typing import Annotated, Any, Union, get_args, get_origin
 from vlcrender.config.toml_model import Settings
 from vlcrender.core.digest import sha256_of
 from vlcrender.dataset.format.files import FRAMES, write_json
-from vlcrender.dataset.format.schema import FrameRow, TruthRow
+from vlcrender.dataset.format.rows import FrameRow, TruthRow
 from vlcrender.export.source import Source
 
 TYPES = {int: "sc:Integer", float: "sc:Float", str: "sc:Text", bool: "sc:Boolean"}

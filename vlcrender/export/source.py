@@ -14,7 +14,8 @@ from vlcrender.core.digest import sha256_of
 from vlcrender.dataset.format.camera_entries import CameraEntry
 from vlcrender.dataset.format.files import read_dataset_file
 from vlcrender.dataset.format.frame_files import read_frame_parts
-from vlcrender.dataset.format.schema import DatasetFile, FrameRow, MapTruthRow, TruthRow, five
+from vlcrender.dataset.format.rows import FrameRow, MapTruthRow, TruthRow, five
+from vlcrender.dataset.format.schema import DatasetFile
 from vlcrender.dataset.format.shard import parts_of_frame
 from vlcrender.dataset.format.tables import read_table
 from vlcrender.dataset.recipe.sweep import SWEEP_FILE, sweep_columns

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlcrender.dataset.format.files import read_dataset_file
-from vlcrender.dataset.format.schema import DatasetFile, DeviceTruthRow, FrameRow, MapTruthRow, TruthRow
+from vlcrender.dataset.format.rows import DeviceTruthRow, FrameRow, MapTruthRow, TruthRow
+from vlcrender.dataset.format.schema import DatasetFile
 from vlcrender.dataset.format.tables import read_table
 from vlcrender.dataset.recipe.sweep import SWEEP_FILE, sweep_columns
 from vlcrender.errors import InputError

@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from vlcrender.config.toml_model import Settings
 from vlcrender.core.digest import sha256_of
 from vlcrender.dataset.format.files import read_json_object, whole_file, write_json
-from vlcrender.dataset.format.schema import FileEntry
+from vlcrender.dataset.format.rows import FileEntry
 from vlcrender.errors import InputError
 
 MANIFEST = "manifest.json"

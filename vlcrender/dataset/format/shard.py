@@ -15,7 +15,7 @@ from vlcrender.camera.roi import RegionImage, Roi
 from vlcrender.dataset.format.exr import ExrPart, exr_bytes
 from vlcrender.dataset.format.files import FRAMES, whole_file
 from vlcrender.dataset.format.manifest import entry_of
-from vlcrender.dataset.format.schema import FileEntry
+from vlcrender.dataset.format.rows import FileEntry
 
 MAGIC, VERSION = 20000630, 2
 SEVERAL_PARTS = 0x1000

@@ -13,7 +13,7 @@ import numpy as np
 
 from vlcrender.dataset.format.files import EXPECTED, FRAMES, PREVIEWS, PROCESSED
 from vlcrender.dataset.format.frame_numbers import LedCounts, Summary
-from vlcrender.dataset.format.schema import FrameRecord
+from vlcrender.dataset.format.rows import FrameRecord
 from vlcrender.dataset.recipe.recipe import Recipe
 
 MANY_SATURATED = 0.5

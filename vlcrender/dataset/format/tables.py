@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from vlcrender.config.toml_model import Settings
 from vlcrender.dataset.format.files import first_line, whole_file
-from vlcrender.dataset.format.schema import arrow_schema
+from vlcrender.dataset.format.rows import arrow_schema
 from vlcrender.errors import InputError
 
 R = TypeVar("R", bound=Settings)

@@ -5,7 +5,8 @@ from itertools import pairwise
 
 from vlcrender.dataset.format.camera_entries import CameraEntry, SensorEntry
 from vlcrender.dataset.format.exr import ExrPart
-from vlcrender.dataset.format.schema import DatasetFile, FrameRow, TruthRow
+from vlcrender.dataset.format.rows import FrameRow, TruthRow
+from vlcrender.dataset.format.schema import DatasetFile
 from vlcrender.dataset.format.values import MAX_ANGLE_DEG, MAX_VISIBLE, is_covariance, is_rotation, repeated
 
 MAX_SENSOR_AREAS = 16

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vlcrender.dataset.format.files import EXPECTED, FRAMES, PREVIEWS, PROCESSED
-from vlcrender.dataset.format.schema import FrameRecord
+from vlcrender.dataset.format.rows import FrameRecord
 from vlcrender.dataset.format.summary import disk_use, size_text
 from vlcrender.dataset.recipe.plan import Plan
 from vlcrender.dataset.recipe.recipe import Recipe

@@ -18,7 +18,7 @@ from vlcrender.dataset.format.frame_files import frame_file, stored, write_frame
 from vlcrender.dataset.format.frame_numbers import FrameNumbers
 from vlcrender.dataset.format.manifest import entry_of
 from vlcrender.dataset.format.preview import write_preview
-from vlcrender.dataset.format.schema import (
+from vlcrender.dataset.format.rows import (
     FileEntry,
     FrameRecord,
     FrameRow,

@@ -22,7 +22,8 @@ from vlcrender.dataset.format.manifest import (
     seal_dataset,
     write_sealed,
 )
-from vlcrender.dataset.format.schema import DATA_VERSION, DatasetFile, FrameRecord
+from vlcrender.dataset.format.rows import FrameRecord
+from vlcrender.dataset.format.schema import DATA_VERSION, DatasetFile
 from vlcrender.dataset.recipe.plan import Plan
 from vlcrender.dataset.recipe.recipe import Recipe
 from vlcrender.dataset.recipe.sweep import SWEEP_FILE

@@ -22,13 +22,11 @@ from vlcrender.dataset.format.files import FRAMES, sync_folder, whole_file, writ
 from vlcrender.dataset.format.layout import extra_folders
 from vlcrender.dataset.format.lock import LOCK
 from vlcrender.dataset.format.manifest import JOURNAL, PLAN, entry_of, write_manifest, write_sealed
+from vlcrender.dataset.format.rows import FileEntry, FrameRecord, FrameRow
 from vlcrender.dataset.format.schema import (
     DATA_VERSION,
     FORMAT_VERSION,
     DatasetFile,
-    FileEntry,
-    FrameRecord,
-    FrameRow,
     NamesEntry,
     accelerometer_entry,
     camera_entry,

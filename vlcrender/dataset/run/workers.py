@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from vlcrender.dataset.format.files import first_line
-from vlcrender.dataset.format.schema import FrameRecord
+from vlcrender.dataset.format.rows import FrameRecord
 from vlcrender.dataset.run.frame_job import Job, made_frames, make_frames
 from vlcrender.errors import InputError
 from vlcrender.rendering.renderer import share_cores

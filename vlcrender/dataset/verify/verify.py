@@ -12,7 +12,8 @@ from vlcrender.dataset.format.files import read_dataset_file, read_json_object, 
 from vlcrender.dataset.format.frame_files import read_frame_parts
 from vlcrender.dataset.format.layout import extra_folders, missing_files
 from vlcrender.dataset.format.manifest import seal_of
-from vlcrender.dataset.format.schema import DatasetFile, DeviceTruthRow, FrameRow, MapTruthRow, TruthRow
+from vlcrender.dataset.format.rows import DeviceTruthRow, FrameRow, MapTruthRow, TruthRow
+from vlcrender.dataset.format.schema import DatasetFile
 from vlcrender.dataset.format.tables import Constants, read_table
 from vlcrender.dataset.format.value_checks import row_problems as value_problems
 from vlcrender.dataset.recipe.file_settings import FileSettings

@@ -11,7 +11,8 @@ from vlcrender.dataset.format.camera_entries import CameraEntry
 from vlcrender.dataset.format.exr import ExrPart
 from vlcrender.dataset.format.files import EXPECTED
 from vlcrender.dataset.format.frame_files import DTYPES
-from vlcrender.dataset.format.schema import DatasetFile, DiscEntry, FrameRow, SquareEntry, TruthRow
+from vlcrender.dataset.format.rows import FrameRow, TruthRow
+from vlcrender.dataset.format.schema import DatasetFile, DiscEntry, SquareEntry
 from vlcrender.dataset.format.shard import parts_of_frame
 from vlcrender.dataset.format.value_checks import image_problem
 from vlcrender.dataset.verify.verify_files import FileCheck

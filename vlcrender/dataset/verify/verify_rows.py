@@ -11,7 +11,8 @@ from pydantic import ValidationError
 from vlcrender.camera.intrinsics import Pose
 from vlcrender.camera.rig import MAIN
 from vlcrender.dataset.format.files import FRAMES
-from vlcrender.dataset.format.schema import DatasetFile, FrameRow, TruthRow
+from vlcrender.dataset.format.rows import FrameRow, TruthRow
+from vlcrender.dataset.format.schema import DatasetFile
 from vlcrender.dataset.recipe.file_settings import FileSettings
 from vlcrender.dataset.recipe.recipe import Recipe
 from vlcrender.dataset.world.downlink import ROUGH_PX

@@ -10,15 +10,8 @@ from vlcrender.camera.distortion import Distortion
 from vlcrender.camera.intrinsics import Camera, rotation_cam_world, transform
 from vlcrender.config.toml_model import check
 from vlcrender.dataset.format.camera_entries import CameraEntry
-from vlcrender.dataset.format.schema import (
-    DatasetFile,
-    DeviceTruthRow,
-    FrameRow,
-    MapTruthRow,
-    TruthRow,
-    five,
-    flat9,
-)
+from vlcrender.dataset.format.rows import DeviceTruthRow, FrameRow, MapTruthRow, TruthRow, five, flat9
+from vlcrender.dataset.format.schema import DatasetFile
 from vlcrender.dataset.format.value_checks import truth_problem
 from vlcrender.errors import InputError
 from vlcrender.modulation.transmission import Transmitter, led_waves

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vlcrender.dataset.format.schema import SpotRow
+from vlcrender.dataset.format.rows import SpotRow
 from vlcrender.rendering.expected_image import ExpectedRegion
 
 ROUGH_PX = 10.0

@@ -18,7 +18,7 @@ from vlcrender.camera.rig import MAIN, Mounted
 from vlcrender.config.toml_model import check
 from vlcrender.core.face_profile import lowest_share
 from vlcrender.core.random_keys import key_number, stream
-from vlcrender.dataset.format.schema import DeviceTruthRow, MapTruthRow, five, flat9
+from vlcrender.dataset.format.rows import DeviceTruthRow, MapTruthRow, five, flat9
 from vlcrender.dataset.recipe.belief import CAMERA_PARAMETERS, Sigmas
 from vlcrender.dataset.recipe.recipe import Recipe
 from vlcrender.errors import InputError

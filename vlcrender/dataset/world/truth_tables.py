@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from pathlib import Path
 
-from vlcrender.dataset.format.schema import DeviceTruthRow, MapTruthRow, TruthRow
+from vlcrender.dataset.format.rows import DeviceTruthRow, MapTruthRow, TruthRow
 from vlcrender.dataset.format.tables import write_table
 from vlcrender.dataset.recipe.plan import Plan
 from vlcrender.dataset.recipe.sweep import sweep_columns

@@ -10,7 +10,7 @@ from vlcrender.camera.intrinsics import Pose
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.rig import Mounted
 from vlcrender.camera.roi import LedRegions, RegionImage
-from vlcrender.dataset.format.schema import Flat9, flat9
+from vlcrender.dataset.format.rows import Flat9, flat9
 from vlcrender.dataset.recipe.recipe import Recipe
 from vlcrender.dataset.world.bound_uncertainty import uncertainty_of
 from vlcrender.dataset.world.true_world import tilt_sigmas_deg

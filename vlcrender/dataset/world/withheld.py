@@ -22,7 +22,8 @@ from vlcrender.dataset.format.files import first_line, read_dataset_file, whole_
 from vlcrender.dataset.format.frame_numbers import Summary
 from vlcrender.dataset.format.lock import LOCK, locked
 from vlcrender.dataset.format.manifest import DATASET_FILE, frames_per_file, manifest_of_files, write_sealed
-from vlcrender.dataset.format.schema import DatasetFile, TruthRow
+from vlcrender.dataset.format.rows import TruthRow
+from vlcrender.dataset.format.schema import DatasetFile
 from vlcrender.dataset.format.summary import disk_use
 from vlcrender.dataset.format.tables import write_table
 from vlcrender.dataset.format.withheld_entry import Withheld
