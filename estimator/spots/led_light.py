@@ -27,6 +27,8 @@ RING_PX = 3.0
 BACKGROUND_SIGMA = 3.0
 # Of fewer pixels the variance is not measured.
 MIN_RING_PIXELS = 20
+# Variance of a sample, by n - 1, over its mean square deviation, at most.
+MAX_SAMPLE_RATIO = MIN_RING_PIXELS / (MIN_RING_PIXELS - 1)
 # Up to this radius a mask is dilated; a larger one by distances takes less time.
 MAX_KERNEL_PX = 12.0
 # Length of a vector of the processor in bytes, of which OpenCV dilates as many pixels at once.
@@ -239,7 +241,6 @@ def light_of(readout: Readout, ellipse: Ellipse, others: list[Ellipse], denoise_
         support &= distance2 <= other_distance2
         ring &= other_distance2 > 1
     above_e, raw_e = electrons, readout.raw_e[roi]
-    gate_e, excess_e2 = 0.0, 0.0
     of_ring = np.flatnonzero(ring)
     if len(of_ring):
         ring_e = raw_e.take(of_ring)
@@ -254,18 +255,20 @@ def light_of(readout: Readout, ellipse: Ellipse, others: list[Ellipse], denoise_
             even[:] = True
         background_e = float(even_e[even].mean())
         above_e = electrons - (background_e if fall_off is None else background_e * fall_off)
-        ring_e = ring_e[even] / ring_fall_off[even]
-        if len(ring_e) >= MIN_RING_PIXELS:
-            excess_e2 = _excess_variance(readout, ring_e, float(ring_variance_e2[even].mean()))
 
     def variances_e2() -> Pixels:
         variance_e2 = readout.variance_e2(np.maximum(raw_e, 0.0, dtype=np.float64))
-        if excess_e2 != 0:
-            unlit = support & (above_e <= gate_e)
-            variance_e2[unlit] = np.maximum(variance_e2[unlit] + excess_e2, 0.0)
+        if len(of_ring) and np.count_nonzero(even) >= MIN_RING_PIXELS:
+            model_e2 = float(ring_variance_e2[even].mean())
+            excess_e2 = _excess_variance(readout, ring_e[even] / ring_fall_off[even], model_e2)
+            if excess_e2 != 0:
+                unlit = support & (above_e <= gate_e)
+                variance_e2[unlit] = np.maximum(variance_e2[unlit] + excess_e2, 0.0)
         return variance_e2
 
-    max_variance_e2 = readout.variance_e2(max(float(raw_e.max()), 0.0)) + max(excess_e2, 0.0)
+    # The excess is at most the variance of the ring's electrons over the fall-off, which their square exceeds.
+    max_e = max(float(raw_e.max()), -float(raw_e.min()))
+    max_variance_e2 = readout.variance_e2(max_e) + MAX_SAMPLE_RATIO * (max_e / FALL_OFF_RANGE[0]) ** 2
     signal_e = np.where(support, above_e, 0.0)
     return Light(roi, u_px, v_px, electrons, support, signal_e, variances_e2, max_variance_e2)
 
