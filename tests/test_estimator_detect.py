@@ -9,7 +9,7 @@ from estimator.errors import EstimationFailure
 from estimator.spots import led_light
 from estimator.spots.denoise import NEIGHBOURHOOD_RADIUS_PX, neighbourhood_mean
 from estimator.spots.detect import Spot, detect
-from estimator.spots.led_light import Readout
+from estimator.spots.led_light import Ellipse, Readout, light_of
 from estimator.spots.sampling import LensBlur
 
 SMALL = (400, 300, 1500.0)
@@ -427,3 +427,18 @@ def test_a_ring_of_two_surfaces_has_a_background() -> None:
     (spot,) = spots_of(image)
     # The support has at most 14 x 14 pixels, each half off its background by 4950 e at a mean lever of 3.5 px.
     assert abs(spot.u_px - 30.0) < 14 * 14 * 4950 * 3.5 / 42e6
+
+
+@pytest.mark.parametrize("background_e", [0.0, 40.0])
+@pytest.mark.parametrize("amplitude_e", [0.5, 3.0, 30.0, 3000.0])
+def test_the_largest_variance_decides_as_all_variances_do(background_e: float, amplitude_e: float) -> None:
+    """Backgrounds with a structure have an excess, which `max_variance_e2` has to cover as well."""
+    rng = np.random.default_rng(int(amplitude_e))
+    ellipse = Ellipse(np.array([30.0, 30.0]), np.eye(2), np.array([4.0, 4.0]), np.zeros(2), np.full(2, 60.0), 50, 1.0)
+    v, u = np.mgrid[:60, :60] + 0.5
+    mean = background_e * (1 + 0.5 * (u % 4 < 2)) + amplitude_e * (np.hypot(u - 30, v - 30) < 4)
+    image = (rng.poisson(mean) + rng.normal(0, 2.0, mean.shape)).astype(np.float32)
+    light = light_of(Readout(0, 0, image, image, np.zeros(image.shape, bool), 4.0, 0.01), ellipse, [], 0)
+    assert light.variance_e2.max() <= light.max_variance_e2
+    for limit in (0.1, 1.0, 0.99 * light.signal_to_noise, 1.01 * light.signal_to_noise, 1000.0):
+        assert light.is_fainter(limit) == (light.signal_to_noise <= limit)

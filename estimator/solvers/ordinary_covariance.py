@@ -28,7 +28,7 @@ def ordinary_covariance(observations: Observations, pose: Pose) -> Floats:
     slopes = of_image.reshape(-1, 6)
     of_pose = np.linalg.pinv(slopes)
     gain = of_position @ of_pose
-    left_open = np.eye(len(slopes)) - slopes @ np.linalg.pinv(slopes)
+    left_open = np.eye(len(slopes)) - slopes @ of_pose
     centres = centroid_images(pose, observations.leds_m, np.zeros_like(observations.lift_m2))[0]
     lifted = centroid_images(pose, observations.leds_m, observations.lift_m2)[0]
     residuals = left_open @ (observations.still_image - centres).ravel()

@@ -58,6 +58,8 @@ SMALL_PX = 6.0
 LARGE_PX = 40.0
 # Second moments replace the ellipse where noise changes them by a few percent at most.
 MIN_SIGNAL_FOR_MOMENTS = 50.0
+# A pixel at a smaller squared distance is in an ellipse, however its distance is rounded.
+CLEARLY_INSIDE = 1 - 1e-9
 # A sampling error with a smaller share of the noise's variance is left alone.
 MIN_SAMPLING_SHARE = 1e-3
 
@@ -357,13 +359,11 @@ def _measure(
     """Centroid and covariance of one spot; None if its signal-to-noise ratio is too small."""
     height_px, width_px = readout.image_e.shape
     light = light_of(readout, ellipse, others, denoise_radius_px)
-    if light.signal_to_noise <= MIN_SIGNAL_TO_NOISE:
+    if light.is_fainter(MIN_SIGNAL_TO_NOISE):
         return None
     centroid, u_px, v_px = light.centroid_px(), light.u_px, light.v_px
 
-    inside = ellipse.distance2(u_px, v_px, 0.0) <= 1
-    brightest = np.unravel_index(np.argmax(np.where(inside, light.electrons, -np.inf)), inside.shape)
-    clipped = readout.clipped[light.roi]
+    brightest, saturated = _brightest(light, ellipse, readout.clipped[light.roi])
     margin_px = MARGIN_PX + max(denoise_radius_px, ellipse.fringe_px)
     (left, top), (right, bottom) = (ellipse.low_px - margin_px).tolist(), (ellipse.high_px + margin_px).tolist()
     covariance = light.covariance_px2(centroid, denoise_radius_px) if with_covariance else np.full((2, 2), np.nan)
@@ -376,7 +376,18 @@ def _measure(
         area_px=ellipse.area_px,
         peak_e=float(light.electrons[brightest]),
         touches_border=left < 0 or top < 0 or right > width_px or bottom > height_px,
-        saturated=bool(clipped.any() and clipped[inside].any()),
+        saturated=saturated,
         flux_e=light.flux_e,
     )
     return _Measured(spot, light, centroid)
+
+
+def _brightest(light: Light, ellipse: Ellipse, clipped: NDArray[np.bool_]) -> tuple[tuple[int, int], bool]:
+    """Row and column of the brightest pixel in an ellipse, and whether one there is among those `clipped`."""
+    row, column = divmod(int(light.electrons.argmax()), light.electrons.shape[1])
+    here = ellipse.distance2(light.u_px[:, column : column + 1], light.v_px[row : row + 1], 0.0)
+    if here < CLEARLY_INSIDE and not clipped.any():
+        return (row, column), False
+    inside = ellipse.distance2(light.u_px, light.v_px, 0.0) <= 1
+    row, column = divmod(int(np.argmax(np.where(inside, light.electrons, -np.inf))), inside.shape[1])
+    return (row, column), bool(clipped[inside].any())

@@ -7,14 +7,17 @@ tells the fall-off by its own light, and the background is subtracted with it.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 Pixels = NDArray[np.float64]
+Numbers = TypeVar("Numbers", float, Pixels)
 
 # Blobs are searched in a 5 x 5 mean, which keeps an LED image of a few electrons a pixel in one piece.
 SMOOTHING_PX = 5
@@ -24,8 +27,12 @@ RING_PX = 3.0
 BACKGROUND_SIGMA = 3.0
 # Of fewer pixels the variance is not measured.
 MIN_RING_PIXELS = 20
+# Variance of a sample, by n - 1, over its mean square deviation, at most.
+MAX_SAMPLE_RATIO = MIN_RING_PIXELS / (MIN_RING_PIXELS - 1)
 # Up to this radius a mask is dilated; a larger one by distances takes less time.
 MAX_KERNEL_PX = 12.0
+# Length of a vector of the processor in bytes, of which OpenCV dilates as many pixels at once.
+VECTOR_BYTES = 32
 # Of fewer pixels within an LED image the gradient of its light is not measured.
 MIN_INSIDE_PIXELS = 20
 # Illumination beside an LED image, relative to its middle: luminaires of 60 cm have 0.8 to 1.2; noise may give any.
@@ -53,6 +60,14 @@ class Readout:
     floor_e2: float = 0.0
     prnu: float = 0.0
     rounding_e2: float = 0.0
+
+    def variance_e2(self, raw_e: Numbers) -> Numbers:
+        """Variance of pixels with raw electrons, none of them negative."""
+        # Shot noise: a raw pixel's variance is its electrons.
+        variance_e2 = raw_e + self.floor_e2
+        if self.prnu > 0:
+            variance_e2 += (self.prnu * raw_e) ** 2
+        return variance_e2
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,8 +133,8 @@ class Moments:
 class Light:
     """Light of an LED image: pixels of a rectangle `roi` at u (1, columns) and v (rows, 1), of its region's own.
 
-    `signal_e` (rows, columns) are electrons above the background, 0 outside the support; `variance_e2` is the variance
-    of every pixel.
+    `signal_e` (rows, columns) are electrons above the background, 0 outside the support; `variances_e2` gives the
+    variance of every pixel, none of which exceeds `max_variance_e2`.
     """
 
     roi: tuple[slice, slice]
@@ -128,7 +143,13 @@ class Light:
     electrons: NDArray[np.float64]
     support: NDArray[np.bool_]
     signal_e: NDArray[np.float64]
-    variance_e2: NDArray[np.float64]
+    variances_e2: Callable[[], Pixels]
+    max_variance_e2: float = math.inf
+
+    @cached_property
+    def variance_e2(self) -> Pixels:
+        """Variance of every pixel, (rows, columns)."""
+        return self.variances_e2()
 
     @cached_property
     def _signal(self) -> Moments:
@@ -148,6 +169,12 @@ class Light:
     def signal_to_noise(self) -> float:
         """Flux over its standard deviation."""
         return self.flux_e / max(float(np.sqrt(self._noise.total)), 1e-300)
+
+    def is_fainter(self, limit: float) -> bool:
+        """Whether `signal_to_noise` is at most a limit."""
+        # Most LED images are much brighter even if all pixels had the largest variance; the factor covers rounding.
+        max_noise_e = math.sqrt(np.count_nonzero(self.support) * self.max_variance_e2)
+        return not self.flux_e > 1.001 * limit * max_noise_e and self.signal_to_noise <= limit
 
     def centroid_px(self) -> NDArray[np.float64]:
         """Centroid (u, v), (2,)."""
@@ -198,9 +225,13 @@ def light_of(readout: Readout, ellipse: Ellipse, others: list[Ellipse], denoise_
     else:
         face = np.zeros(electrons.shape, dtype=bool)
         column, row = ellipse.low_px.astype(int) - (left, top)
-        face[row : row + ellipse.core.shape[0], column : column + ellipse.core.shape[1]] = ellipse.core
-        (outside,) = _within(~face, SMOOTHING_PX // 2 + ellipse.fringe_px)
-        inside = ~outside
+        last_row, last_column = row + ellipse.core.shape[0], column + ellipse.core.shape[1]
+        face[row:last_row, column:last_column] = ellipse.core
+        # The nearest pixel beside the face is at most a pixel away from the box around it.
+        box = np.s_[max(row - 1, 0) : last_row + 1, max(column - 1, 0) : last_column + 1]
+        inside = np.zeros_like(face)
+        (outside,) = _within(~face[box], SMOOTHING_PX // 2 + ellipse.fringe_px)
+        inside[box] = ~outside
         fall_off = _relative_fall_off(electrons, inside)
         support, ring = _within(face, margin_px, margin_px + RING_PX)
     ring &= ~support
@@ -209,18 +240,14 @@ def light_of(readout: Readout, ellipse: Ellipse, others: list[Ellipse], denoise_
         other_distance2 = other.distance2(u_px, v_px, MARGIN_PX + max(denoise_radius_px, other.fringe_px))
         support &= distance2 <= other_distance2
         ring &= other_distance2 > 1
-    # Shot noise: a raw pixel's variance is its electrons.
-    raw_e = np.maximum(readout.raw_e[roi], 0.0, dtype=np.float64)
-    variance_e2 = raw_e + readout.floor_e2
-    if readout.prnu > 0:
-        variance_e2 += (readout.prnu * raw_e) ** 2
-    above_e = electrons
+    above_e, raw_e = electrons, readout.raw_e[roi]
     of_ring = np.flatnonzero(ring)
     if len(of_ring):
-        ring_variance_e2 = variance_e2.take(of_ring)
+        ring_e = raw_e.take(of_ring)
+        ring_variance_e2 = readout.variance_e2(np.maximum(ring_e, 0.0, dtype=np.float64))
         # One electron more: the noise of a pixel with fewer is not normal.
         gate_e = BACKGROUND_SIGMA * math.sqrt(_median(ring_variance_e2) + 1.0)
-        ring_fall_off = 1.0 if fall_off is None else fall_off.take(of_ring)
+        ring_fall_off = np.ones(len(of_ring)) if fall_off is None else fall_off.take(of_ring)
         even_e = electrons.take(of_ring) / ring_fall_off
         # The ring without pixels of another surface or light; all of it where its median is between two surfaces.
         even = np.abs(even_e - _median(even_e)) <= gate_e
@@ -228,15 +255,22 @@ def light_of(readout: Readout, ellipse: Ellipse, others: list[Ellipse], denoise_
             even[:] = True
         background_e = float(even_e[even].mean())
         above_e = electrons - (background_e if fall_off is None else background_e * fall_off)
-        of_ring = of_ring[even]
-        if len(of_ring) >= MIN_RING_PIXELS:
-            ring_e = readout.raw_e[roi].take(of_ring).astype(np.float64)
-            ring_e /= 1.0 if fall_off is None else fall_off.take(of_ring)
-            excess_e2 = _excess_variance(readout, ring_e, float(ring_variance_e2[even].mean()))
+
+    def variances_e2() -> Pixels:
+        variance_e2 = readout.variance_e2(np.maximum(raw_e, 0.0, dtype=np.float64))
+        if len(of_ring) and np.count_nonzero(even) >= MIN_RING_PIXELS:
+            model_e2 = float(ring_variance_e2[even].mean())
+            excess_e2 = _excess_variance(readout, ring_e[even] / ring_fall_off[even], model_e2)
             if excess_e2 != 0:
                 unlit = support & (above_e <= gate_e)
                 variance_e2[unlit] = np.maximum(variance_e2[unlit] + excess_e2, 0.0)
-    return Light(roi, u_px, v_px, electrons, support, np.where(support, above_e, 0.0), variance_e2)
+        return variance_e2
+
+    # The excess is at most the variance of the ring's electrons over the fall-off, which their square exceeds.
+    max_e = max(float(raw_e.max()), -float(raw_e.min()))
+    max_variance_e2 = readout.variance_e2(max_e) + MAX_SAMPLE_RATIO * (max_e / FALL_OFF_RANGE[0]) ** 2
+    signal_e = np.where(support, above_e, 0.0)
+    return Light(roi, u_px, v_px, electrons, support, signal_e, variances_e2, max_variance_e2)
 
 
 def _median(values: NDArray[np.float64]) -> float:
@@ -263,7 +297,12 @@ def _within(mask: NDArray[np.bool_], *radii_px: float) -> list[NDArray[np.bool_]
     if max(radii_px) > MAX_KERNEL_PX:
         distance_px = cv2.distanceTransform((~mask).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
         return [np.asarray(distance_px <= radius_px) for radius_px in radii_px]
-    return [np.asarray(cv2.dilate(mask.view(np.uint8), _disc(radius_px)).view(bool)) for radius_px in radii_px]
+    rows, columns = mask.shape
+    # OpenCV takes up to twice as long for rows that are not of whole vectors.
+    whole = np.zeros((rows, columns + -columns % VECTOR_BYTES), dtype=np.uint8)
+    whole[:, :columns] = mask
+    dilated = [cv2.dilate(whole, _disc(radius_px))[:, :columns] for radius_px in radii_px]
+    return [np.ascontiguousarray(one).view(np.bool_) for one in dilated]
 
 
 @lru_cache(maxsize=256)
