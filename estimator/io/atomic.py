@@ -4,15 +4,15 @@ import os
 from pathlib import Path
 
 
-def write_atomically(path: Path, data: bytes) -> None:
-    """Write `data` to `path` through a temporary file in the same folder.
+def write_atomically(path: Path, *data: bytes) -> None:
+    """Write `data`, one after another, to `path` through a temporary file in the same folder.
 
     The temporary file is removed in any case. Raises OSError, which names `path`.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         with temporary.open("wb") as file:
-            file.write(data)
+            file.writelines(data)
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)

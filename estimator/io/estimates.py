@@ -3,7 +3,7 @@
 import hashlib
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -14,7 +14,17 @@ from pydantic import Field, Strict, model_validator
 from estimator.errors import InputError
 from estimator.io.atomic import write_atomically
 from estimator.io.device import Identity
-from estimator.io.records import Covariance, LedId, Number, Row, Size, Triple, read_metadata, read_rows, small_row
+from estimator.io.records import (
+    Covariance,
+    FrameRow,
+    LedId,
+    Number,
+    Size,
+    Triple,
+    iter_frame_rows,
+    read_metadata,
+    small_row,
+)
 
 COLUMNS = {
     "frame": pa.int64(),
@@ -69,7 +79,7 @@ class FoundSpot:
     snr: Size | None
 
 
-class EstimateRow(Row):
+class EstimateRow(FrameRow):
     """Estimate of one frame: a world position in metres, or `failed` and a reason `stage: what went wrong`.
 
     `covariance_m2` is the covariance of the position, row by row, if the variant reports one. `identities` are the LED
@@ -77,7 +87,6 @@ class EstimateRow(Row):
     and identified, the same for every variant; None where they are not stated.
     """
 
-    frame: int = Field(ge=0)
     status: Literal["ok", "failed"]
     reason: str
     position_m: Triple | None
@@ -138,17 +147,22 @@ def read_estimates(path: Path, frame_count: int, digest: str | None = None) -> t
     digest: `frames_sha256` of the dataset, where estimates of another one are to be refused.
     """
     if digest is not None:
-        stated = read_metadata(path).get(FRAMES_SHA256)
-        if stated is None:
-            raise InputError(
-                f"{path}: does not say which frames it is of (no {FRAMES_SHA256}); run `estimator run` again"
-            )
-        if stated.lower() != digest:
-            raise InputError(
-                f"{path}: estimates of another dataset: {FRAMES_SHA256} is {stated[:12]}..., but frames.parquet has "
-                f"{digest[:12]}...; run `estimator run` again"
-            )
-    rows = read_rows(path, COLUMNS, EstimateRow, SPOT_COLUMNS)
-    if [row.frame for row in rows] != list(range(frame_count)):
-        raise InputError(f"{path}: {len(rows)} rows, needed one for each of the {frame_count} frames, in order")
-    return rows
+        check_digest(path, digest)
+    return tuple(iter_estimates(path, frame_count))
+
+
+def iter_estimates(path: Path, frame_count: int) -> Iterator[EstimateRow]:
+    """Rows of `read_estimates`, of which some are in memory at a time."""
+    return iter_frame_rows(path, COLUMNS, EstimateRow, frame_count, SPOT_COLUMNS)
+
+
+def check_digest(path: Path, digest: str) -> None:
+    """Raise InputError for estimates of another dataset than the one whose `frames_sha256` is `digest`."""
+    stated = read_metadata(path).get(FRAMES_SHA256)
+    if stated is None:
+        raise InputError(f"{path}: does not say which frames it is of (no {FRAMES_SHA256}); run `estimator run` again")
+    if stated.lower() != digest:
+        raise InputError(
+            f"{path}: estimates of another dataset: {FRAMES_SHA256} is {stated[:12]}..., but frames.parquet has "
+            f"{digest[:12]}...; run `estimator run` again"
+        )
