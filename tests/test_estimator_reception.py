@@ -238,7 +238,7 @@ def test_a_frame_alone_is_received_where_it_is_estimated(by_codes: Path) -> None
 def test_frames_of_a_burst_share_the_time_of_their_reception(by_codes: Path) -> None:
     """Both kinds of variants get received frames; a frame that cannot be read takes no other one with it."""
     dataset = est.read_dataset(by_codes)
-    assert [[record.frame for record in burst] for burst in bursts(dataset)] == [[0, 1], [2, 3]]
+    assert [[record.frame for record in burst] for burst in bursts(dataset, dataset.frames)] == [[0, 1], [2, 3]]
 
     def looks(frame: est.DeviceFrame) -> Estimate:
         assert len(frame.spots) == 12

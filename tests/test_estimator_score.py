@@ -158,6 +158,29 @@ def dataset(synthetic_set: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     return folder
 
 
+def test_scores_keep_no_record_of_a_frame(
+    scored_set: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As scores.json is written, records of truth, frames and estimates of one frame are left at most, of three."""
+    folder, alive = copy_of(scored_set, tmp_path), Counter[type]()
+
+    def count(*_: object) -> None:
+        alive.update(type(one) for one in gc.get_objects())
+
+    monkeypatch.setattr("estimator.evaluate.score.write_atomically", count)
+    kinds = (TruthRow, TrueLed, FrameRecord, DecodedSpot, EstimateRow, FoundSpot)
+    gc.collect()
+    before = Counter(type(one) for one in gc.get_objects())
+    scores = est.score(folder)
+    truth = read_truth(folder / "truth.parquet", 3)
+    variants = len(scores.variants)
+    of_frame = {TruthRow: 1, FrameRecord: 1, EstimateRow: variants}
+    leds = len(truth[-1].leds)
+    of_frame |= {TrueLed: leds, DecodedSpot: leds, FoundSpot: variants * leds}
+    assert alive[FrameScore] - before[FrameScore] == 3 * variants  # the count sees small records
+    assert {kind.__name__: alive[kind] - before[kind] for kind in kinds if alive[kind] - before[kind] > of_frame[kind]} == {}
+
+
 def test_scores_json_is_plain_json_and_comes_back(dataset: Path) -> None:
     scores = score(dataset)
     text = (dataset / "scores.json").read_text()

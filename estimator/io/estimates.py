@@ -1,9 +1,11 @@
 """Estimates of a variant on disk: estimates/VARIANT.parquet, one row a frame (datasets/FORMAT.md)."""
 
 import hashlib
-import io
 import re
-from collections.abc import Iterator, Sequence
+import shutil
+import tempfile
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -12,9 +14,10 @@ import pyarrow.parquet as pq
 from pydantic import Field, Strict, model_validator
 
 from estimator.errors import InputError
-from estimator.io.atomic import write_atomically
+from estimator.io.atomic import whole_file
 from estimator.io.device import Identity
 from estimator.io.records import (
+    ROWS_AT_ONCE,
     Covariance,
     FrameRow,
     LedId,
@@ -126,19 +129,46 @@ def frames_sha256(dataset: Path) -> str:
     return sha256_of(dataset / "frames.parquet")
 
 
-def write_estimates(folder: Path, variant: str, rows: Sequence[EstimateRow], digest: str | None = None) -> Path:
+def write_estimates(folder: Path, variant: str, rows: Iterable[EstimateRow], digest: str | None = None) -> Path:
     """Write a variant's rows, replacing an older file atomically; returns the path. Raises InputError, OSError.
 
     digest: `frames_sha256` of the dataset at the time its frames were read; of `folder` now if None.
     """
+    with estimates_file(folder, variant, digest or frames_sha256(folder)) as add:
+        add(rows)
+    return estimates_path(folder, variant)
+
+
+@contextmanager
+def estimates_file(folder: Path, variant: str, digest: str) -> Iterator[Callable[[Iterable[EstimateRow]], None]]:
+    """Function that adds rows to a variant's file, which replaces an older one after the block, if nothing is raised.
+
+    Not more than ROWS_AT_ONCE rows are in memory. digest: as of `write_estimates`. Raises InputError, OSError.
+    """
     path = estimates_path(folder, variant)
     path.parent.mkdir(exist_ok=True)
-    columns = [*COLUMNS.items(), *SPOT_COLUMNS.items()]
-    schema = pa.schema(columns, {FRAMES_SHA256: digest or frames_sha256(folder)})
-    buffer = io.BytesIO()
-    pq.write_table(pa.Table.from_pylist([row.model_dump() for row in rows], schema), buffer)
-    write_atomically(path, buffer.getvalue())
-    return path
+    schema = pa.schema([*COLUMNS.items(), *SPOT_COLUMNS.items()], {FRAMES_SHA256: digest})
+    waiting: list[dict[str, object]] = []
+    # The temporary file has no name: nothing is left where the process dies.
+    with tempfile.TemporaryFile(dir=path.parent) as unnamed:
+        with pq.ParquetWriter(unnamed, schema) as writer:
+
+            def write() -> None:
+                writer.write_table(pa.Table.from_pylist(waiting, schema))
+                waiting.clear()
+
+            def add(rows: Iterable[EstimateRow]) -> None:
+                for row in rows:
+                    waiting.append(row.model_dump())
+                    if len(waiting) == ROWS_AT_ONCE:
+                        write()
+
+            yield add
+            if waiting:
+                write()
+        unnamed.seek(0)
+        with whole_file(path) as file:
+            shutil.copyfileobj(unnamed, file)
 
 
 def read_estimates(path: Path, frame_count: int, digest: str | None = None) -> tuple[EstimateRow, ...]:
