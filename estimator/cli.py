@@ -12,8 +12,9 @@ import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, CycloptsError, Parameter
 
@@ -23,6 +24,9 @@ from estimator.io.process import INTERRUPTED, ending_at_second_interrupt, prepar
 from estimator.report.benchmark_commands import leaderboard, submit
 from estimator.report.score_commands import score
 from estimator.report.table_commands import plot, table
+
+if TYPE_CHECKING:
+    from estimator.io.estimates import EstimateRow
 
 INTERNAL_ERROR = 1
 NO_ANSWER = 1
@@ -87,6 +91,7 @@ def run(
     """
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+    from estimator.evaluate.run import write_run
     from estimator.io.estimates import estimates_path
     from estimator.io.sweep import read_sweep
 
@@ -95,6 +100,11 @@ def run(
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     bar = Progress(*columns, console=progress_console())
     task = bar.add_task("frames", total=None)
+    answers: dict[str, _Answers] = {}
+
+    def count(name: str, some: Sequence[EstimateRow]) -> None:
+        answers.setdefault(name, _Answers()).add(some)
+
     with ExitStack() as stack:
 
         def draw(done: int, total: int) -> None:
@@ -102,24 +112,48 @@ def run(
                 stack.enter_context(bar)  # not before the dataset is read: an error is one line
             bar.update(task, completed=done, total=total)
 
-        rows = estimator.run(dataset, _with_centroid_sigma(variant, centroid_sigma), workers, draw, out)
+        write_run(dataset, count, _with_centroid_sigma(variant, centroid_sigma), workers, draw, out)
     home = dataset if out is None else out
-    for name, of_variant in rows.items():
-        ok = sum(row.status == "ok" for row in of_variant)
+    for name, of_variant in answers.items():
         sweep = read_sweep(dataset)
         where = estimates_path(home, name) if sweep is None else f"the {len(sweep.cells)} cells of {home}"
-        print(f"{name}: {ok} of {len(of_variant)} frames ok -> {where}")
-    for of_variant in rows.values():
-        if unread := [row for row in of_variant if row.reason.startswith("read: ")]:
-            why = f"frame {unread[0].frame}: {unread[0].reason.removeprefix('read: ')}"
-            raise InputError(f"{dataset}: {len(unread)} of {len(of_variant)} frames could not be read; {why}")
-    silent = [name for name, of_variant in rows.items() if not any(row.status == "ok" for row in of_variant)]
+        print(f"{name}: {of_variant.ok} of {of_variant.frames} frames ok -> {where}")
+    for of_variant in answers.values():
+        if of_variant.unread:
+            raise InputError(
+                f"{dataset}: {of_variant.unread} of {of_variant.frames} frames could not be read; "
+                f"{of_variant.first_unread}"
+            )
+    silent = [name for name, of_variant in answers.items() if not of_variant.ok]
     if variant is None or not silent:
         return 0
     for name in silent:
-        reasons = Counter(row.reason for row in rows[name]).most_common(1)
+        reasons = answers[name].reasons.most_common(1)
         print(f"estimator: {name} answered no frame: {reasons[0][0] if reasons else 'there is none'}", file=sys.stderr)
     return NO_ANSWER
+
+
+@dataclass
+class _Answers:
+    """Counts of a variant's frames: all, `ok`, of no readable image, and failed by reason."""
+
+    frames: int = 0
+    ok: int = 0
+    unread: int = 0
+    first_unread: str = ""
+    """The first frame that could not be read, and why."""
+    reasons: Counter[str] = field(default_factory=Counter)
+
+    def add(self, rows: Sequence[EstimateRow]) -> None:
+        """Count some rows."""
+        for row in rows:
+            self.frames += 1
+            self.ok += row.status == "ok"
+            if row.reason.startswith("read: "):
+                self.unread += 1
+                self.first_unread = self.first_unread or f"frame {row.frame}: {row.reason.removeprefix('read: ')}"
+            elif row.reason:
+                self.reasons[row.reason] += 1
 
 
 def _with_centroid_sigma(names: list[str] | None, sigma_px: float | None) -> list[str] | None:

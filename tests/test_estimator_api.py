@@ -1,5 +1,6 @@
 """Public API of the estimator: the functions of `import estimator`, and what the import loads."""
 
+import gc
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -13,6 +14,8 @@ from conftest import copy_of
 from estimator_synthetic import description, grid, poisson, render, view_of
 
 import estimator as est
+from estimator.evaluate.run import write_run
+from estimator.io.estimates import EstimateRow
 
 LEDS = grid(5, 4, 0.14, (3.5, 3.6, 3.5))
 VIEW = view_of((3.5, 3.6, 3.5), 3.0, 10.0, -5.0, 30.0)
@@ -87,6 +90,20 @@ def test_a_dataset_is_read_estimated_run_and_scored(folder: Path, as_path: Calla
     assert rows["pnp"][1].position_m == tuple(est.estimate(frame, "pnp").position_m.tolist())
     scores = est.score(as_path(folder))
     assert [variant.variant for variant in scores.variants] == ["kim", "pnp"]
+
+
+def test_a_run_keeps_no_row_that_is_not_kept_for_it(folder: Path) -> None:
+    """Rows of two frames are alive at most, of three: those of the frame in hand and of the one before."""
+    alive = []
+
+    def count(name: str, rows: Sequence[EstimateRow]) -> None:
+        alive.append(sum(isinstance(one, EstimateRow) for one in gc.get_objects()))
+
+    gc.collect()
+    before = sum(isinstance(one, EstimateRow) for one in gc.get_objects())
+    write_run(folder, count, ["pnp"])
+    assert len(alive) == 1 + 3  # before the first frame, and with each
+    assert 1 <= max(alive) - before <= 2
 
 
 def test_an_estimate_takes_a_name_options_or_a_variant(folder: Path) -> None:

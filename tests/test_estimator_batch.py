@@ -10,7 +10,7 @@ import pytest
 from estimator_synthetic import small_dataset
 
 from estimator.errors import EstimationFailure
-from estimator.evaluate.batch import Observed, estimate_burst, estimate_dataset, estimate_device, estimate_frame, shots
+from estimator.evaluate.batch import Observed, bursts, estimate_burst, estimate_dataset, estimate_device, estimate_frame
 from estimator.io.dataset import Dataset, read_dataset, read_frame
 from estimator.io.device import DeviceFrame
 from estimator.io.estimates import EstimateRow
@@ -116,7 +116,7 @@ def test_a_variant_sees_the_other_frames_of_the_shot_and_cannot_change_the_image
         name: [(0, "ok"), (1, "ok"), (2, "ok")] for name in "ab"
     }
     assert len(done) == 3
-    assert [[record.frame for record in shot] for shot in shots(dataset)] == [[0, 1], [2]]
+    assert [[record.frame for record in shot] for shot in bursts(dataset, dataset.frames)] == [[0, 1], [2]]
 
 
 def test_a_frame_that_cannot_be_read_fails_and_is_no_other_camera(dataset: Dataset) -> None:

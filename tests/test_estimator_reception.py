@@ -238,7 +238,7 @@ def test_a_frame_alone_is_received_where_it_is_estimated(by_codes: Path) -> None
 def test_frames_of_a_burst_share_the_time_of_their_reception(by_codes: Path) -> None:
     """Both kinds of variants get received frames; a frame that cannot be read takes no other one with it."""
     dataset = est.read_dataset(by_codes)
-    assert [[record.frame for record in burst] for burst in bursts(dataset)] == [[0, 1], [2, 3]]
+    assert [[record.frame for record in burst] for burst in bursts(dataset, dataset.frames)] == [[0, 1], [2, 3]]
 
     def looks(frame: est.DeviceFrame) -> Estimate:
         assert len(frame.spots) == 12
@@ -309,12 +309,12 @@ def test_scores_tell_wrong_from_rejected_from_missed(by_codes: Path, by_packets:
     rows = list(estimate_dataset(dataset, [Variant("a", "", lambda _: Estimate(np.zeros(3)))], lambda: None)["a"])
     truth = read_truth(by_codes / "truth.parquet", 4)
     first = list(rows[0].identities or ())
-    first[0] = first[0].model_copy(update={"led": first[1].led})
-    first[2] = first[2].model_copy(update={"led": None})
+    first[0] = replace(first[0], led=first[1].led)
+    first[2] = replace(first[2], led=None)
     bits = first[4].bits or ""
     turned = bits.replace("0", "x").replace("1", "0").replace("x", "1")
-    first[4] = first[4].model_copy(update={"bits": turned})
-    first[3] = first[3].model_copy(update={"u_px": -500.0})
+    first[4] = replace(first[4], bits=turned)
+    first[3] = replace(first[3], u_px=-500.0)
     rows[0] = rows[0].model_copy(update={"identities": tuple(first)})
     found = score_identities(rows, truth, dataset, ())
     assert found is not None

@@ -6,6 +6,7 @@ import json
 import math
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -266,7 +267,7 @@ def many_frames(folder: Path, rng: np.random.Generator, variants: int = 3, count
         # The summaries are those of the first variant: their bootstraps take most of the time, and no picture has them.
         first = scores[0] if scores else score_variant("v0", rows, truth, LEDS_M)
         of_rows = tuple(
-            score_frame(row, true, LEDS_M).model_copy(update={**measured, "spots_found": spots})
+            replace(score_frame(row, true, LEDS_M), **measured, spots_found=spots)
             for row, true, measured, spots in zip(rows, truth, measures, found, strict=True)
         )
         scores.append(first.model_copy(update={"variant": f"v{k}", "rows": of_rows}))

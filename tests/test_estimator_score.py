@@ -1,7 +1,9 @@
 """Scores: errors by hand, failures counted, no frame dropped."""
 
+import gc
 import json
 import os
+from collections import Counter
 from pathlib import Path
 
 import pyarrow as pa
@@ -10,11 +12,14 @@ import pytest
 from conftest import copy_of
 
 from estimator.errors import InputError
+from estimator.evaluate.frame_score import FrameScore
 from estimator.evaluate.score import Scores, score, score_variant
 from estimator.evaluate.scores_file import read_or_score
-from estimator.io.estimates import EstimateRow, LedRange, write_estimates
+from estimator.io.dataset import FrameRecord
+from estimator.io.device import DecodedSpot
+from estimator.io.estimates import EstimateRow, FoundSpot, LedRange, write_estimates
 from estimator.io.led_map import DiscLed
-from estimator.io.truth import TrueLed, TruthRow
+from estimator.io.truth import TrueLed, TruthRow, read_truth
 
 LEDS = {10: DiscLed(id=10, position_m=(1.0, 2.0, 3.5), radius_m=0.01)}
 LEDS_M = {led.id: led.position_m for led in LEDS.values()}
@@ -156,6 +161,26 @@ def dataset(synthetic_set: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     folder = copy_of(synthetic_set, tmp_path_factory.mktemp("scored"))
     write_estimates(folder, "one", [ok(0, TRUTH, 3.0), failed(1, "a: <b>"), ok(2, TRUTH)])
     return folder
+
+
+def test_scores_keep_no_record_of_a_frame(scored_set: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As scores.json is written, records of truth, frames and estimates of one frame are left at most, of three."""
+    folder, alive = copy_of(scored_set, tmp_path), Counter[type]()
+
+    def count(*_: object) -> None:
+        alive.update(type(one) for one in gc.get_objects())
+
+    monkeypatch.setattr("estimator.evaluate.score.write_atomically", count)
+    gc.collect()
+    before = Counter(type(one) for one in gc.get_objects())
+    scores = score(folder)
+    truth = read_truth(folder / "truth.parquet", 3)
+    variants = len(scores.variants)
+    of_frame = {TruthRow: 1, FrameRecord: 1, EstimateRow: variants}
+    leds = len(truth[-1].leds)
+    of_frame |= {TrueLed: leds, DecodedSpot: leds, FoundSpot: variants * leds}
+    assert alive[FrameScore] - before[FrameScore] == 3 * variants  # the count sees small records
+    assert [kind.__name__ for kind, most in of_frame.items() if alive[kind] - before[kind] > most] == []
 
 
 def test_scores_json_is_plain_json_and_comes_back(dataset: Path) -> None:

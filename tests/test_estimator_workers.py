@@ -38,10 +38,19 @@ def test_any_number_of_workers_gives_the_same_answers_in_order(folder: Path, wor
     dataset = read_dataset(folder)
     alone = estimate_dataset(dataset, list(VARIANTS.values()), on_frame=lambda: None)
     done: list[None] = []
-    (shared,) = estimate_with_workers([dataset], list(VARIANTS), workers, on_frame=lambda: done.append(None))
-    assert without_times(shared) == without_times(alone)
-    assert [row.frame for row in shared["pnp"]] == [0, 1, 2]
-    assert len(done) == 2 * 3  # a variant of all frames of a device is among them
+    of = [(dataset, dataset.frames), (dataset, ()), (dataset, dataset.frames)]
+    shared: list[dict[str, tuple[EstimateRow, ...]]] = [dict.fromkeys(VARIANTS, ()) for _ in of]
+    numbers = []
+    for number, rows in estimate_with_workers(of, list(VARIANTS), workers, on_frame=lambda: done.append(None)):
+        numbers.append(number)
+        for name, some in rows.items():
+            shared[number][name] += tuple(some)
+    assert numbers == sorted(numbers)
+    assert set(numbers) == {0, 1, 2}
+    assert without_times(shared[0]) == without_times(shared[2]) == without_times(alone)
+    assert not any(shared[1].values())
+    assert [row.frame for row in shared[0]["pnp"]] == [0, 1, 2]
+    assert len(done) == 2 * 2 * 3  # a variant of all frames of a device is among them
 
 
 def test_frames_of_a_device_are_solved_in_order_and_counted(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -59,15 +68,16 @@ def test_frames_of_a_device_are_solved_in_order_and_counted(folder: Path, monkey
     monkeypatch.setattr(workers, "_work", work)
     monkeypatch.setattr(workers, "_solve", solve)
     done: list[None] = []
-    (rows,) = estimate_with_workers([read_dataset(folder)], [], 2, on_frame=lambda: done.append(None))
-    assert rows == {}
+    dataset = read_dataset(folder)
+    parts = list(estimate_with_workers([(dataset, dataset.frames)], [], 2, on_frame=lambda: done.append(None)))
+    assert not any(rows for _, rows in parts)
     assert solved == [[0, 1, 2]]
     assert len(done) == 2 * 3
 
 
 def test_an_unknown_name_is_refused_before_a_process_starts(folder: Path) -> None:
     with pytest.raises(InputError, match="variant best: unknown"):
-        next(estimate_with_workers([read_dataset(folder)], ["best"], 2, on_frame=lambda: None))
+        next(estimate_with_workers([(read_dataset(folder), ())], ["best"], 2, on_frame=lambda: None))
 
 
 @pytest.mark.parametrize(

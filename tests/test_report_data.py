@@ -86,12 +86,12 @@ def test_quantiles_at_the_bound_are_those_of_chi() -> None:
     200 000 draws: the share below a quantile has a standard error of 0.11 %, which at the median, where the density of
     chi is 0.57, are 0.0020, and at 95 %, of density 0.13, 0.0037; four of them.
     """
-    found = bound_quantiles_m(truths(3, (1e-6, 0.0, 0.0, 0.0, 1e-6, 0.0, 0.0, 0.0, 1e-6)))
+    found = bound_quantiles_m(np.tile(1e-6 * np.eye(3), (3, 1, 1)))
     assert found is not None
     assert len(found) == 101
     assert found[50] == pytest.approx(1.538e-3, abs=0.008e-3)
     assert found[95] == pytest.approx(2.795e-3, abs=0.015e-3)
-    assert bound_quantiles_m(truths(3)) is None
+    assert bound_quantiles_m(np.empty((0, 3, 3))) is None
 
 
 def test_the_plan_names_its_presets() -> None:

@@ -5,7 +5,7 @@ Every frame gets a row. Where identities are not given, the frames of a burst ar
 
 import operator
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import groupby
 
@@ -42,33 +42,40 @@ class Observed:
     """LEDs that packets told, where the dataset has no map."""
 
 
+OfDevice = dict[str, list[Observed]]
+"""Observed frames by the name of the variant."""
+
+
 @dataclass(frozen=True, eq=False)
 class ShotResult:
     """Result of a shot: `rows` of the variants that are done with it, and frames `observed`, by name, of the others."""
 
     rows: Rows
-    observed: dict[str, list[Observed]]
+    observed: OfDevice
 
 
 def estimate_dataset(
     dataset: Dataset, variants: Sequence[Variant], on_frame: Callable[[], None]
 ) -> dict[str, tuple[EstimateRow, ...]]:
-    """Rows of every variant, one a frame; each image is read once, and `on_frame` is called after each step of a frame.
+    """All rows of `estimate_frames` by variant, one a frame, in order."""
+    rows: dict[str, list[EstimateRow]] = {variant.name: [] for variant in variants}
+    for part in estimate_frames(dataset, dataset.frames, variants, on_frame):
+        for name, some in part.items():
+            rows[name] += some
+    return {name: tuple(of_variant) for name, of_variant in rows.items()}
 
-    A frame has one step, and a second one if a variant uses all frames of a device: they are estimated together, after
+
+def estimate_frames(
+    dataset: Dataset, records: Iterable[FrameRecord], variants: Sequence[Variant], on_frame: Callable[[], None]
+) -> Iterator[Rows]:
+    """Rows of every variant in the order of the frames, some at a time; each image is read once.
+
+    `records` are those of all frames; `dataset.frames` is not used. `on_frame` is called after each step of a frame. A
+    frame has one step, and a second one if a variant uses all frames of a device: they are estimated together, after
     all images. A frame whose image cannot be read fails for every variant, with the reason `read: ...`.
     """
-    results = []
-    for records in bursts(dataset):
-        results.append(estimate_burst(dataset, records, variants))
-        for _ in records:
-            on_frame()
-    solved = []
-    for device in devices(results):
-        solved.append(estimate_device(dataset, device, variants))
-        for _ in next(iter(device.values())):
-            on_frame()
-    return in_order(dataset, variants, [*(result.rows for result in results), *solved])
+    results = ((len(some), estimate_burst(dataset, some, variants)) for some in bursts(dataset, records))
+    return in_order(results, lambda found: (estimate_device(dataset, one, variants) for one in found), on_frame)
 
 
 def steps(variants: Iterable[Variant]) -> int:
@@ -76,16 +83,13 @@ def steps(variants: Iterable[Variant]) -> int:
     return 1 if all(variant.of_device is None for variant in variants) else 2
 
 
-def shots(dataset: Dataset) -> list[tuple[FrameRecord, ...]]:
-    """Frames of each shot, in order; they were exposed at once and are estimated together."""
-    return [tuple(records) for _, records in groupby(dataset.frames, lambda record: record.shot)]
+def bursts(dataset: Dataset, records: Iterable[FrameRecord]) -> Iterator[tuple[FrameRecord, ...]]:
+    """Frames that are estimated together, in order: those of a burst if they have to be received, else of a shot.
 
-
-def bursts(dataset: Dataset) -> list[tuple[FrameRecord, ...]]:
-    """Frames that are estimated together, in order: those of a burst if they have to be received, else of a shot."""
-    if not receives(dataset):
-        return shots(dataset)
-    return [tuple(records) for _, records in groupby(dataset.frames, lambda record: record.burst)]
+    The frames of a shot were exposed at once.
+    """
+    key = operator.attrgetter("burst" if receives(dataset) else "shot")
+    return (tuple(together) for _, together in groupby(records, key))
 
 
 def receives(dataset: Dataset) -> bool:
@@ -93,25 +97,40 @@ def receives(dataset: Dataset) -> bool:
     return dataset.downlink is not None and dataset.downlink.demodulation == "pixels"
 
 
-def devices(results: Iterable[ShotResult]) -> list[dict[str, list[Observed]]]:
+def devices(observed: Iterable[OfDevice]) -> list[OfDevice]:
     """Observed frames by variant name of each device, devices and frames in order; none without such a variant."""
-    found: dict[int, dict[str, list[Observed]]] = {}
-    for result in results:
-        for name, of_shot in result.observed.items():
+    found: dict[int, OfDevice] = {}
+    for of_burst in observed:
+        for name, of_shot in of_burst.items():
             for one in of_shot:
                 found.setdefault(one.device, {}).setdefault(name, []).append(one)
     return [found[device] for device in sorted(found)]
 
 
 def in_order(
-    dataset: Dataset, variants: Sequence[Variant], parts: Iterable[Rows]
-) -> dict[str, tuple[EstimateRow, ...]]:
-    """All rows of every variant, in the order of the frames."""
-    rows: dict[str, dict[int, EstimateRow]] = {variant.name: {} for variant in variants}
-    for part in parts:
-        for name, of_part in part.items():
-            rows[name].update((row.frame, row) for row in of_part)
-    return {name: tuple(by_frame[record.frame] for record in dataset.frames) for name, by_frame in rows.items()}
+    results: Iterable[tuple[int, ShotResult]],
+    solve: Callable[[Sequence[OfDevice]], Iterable[Rows]],
+    on_frame: Callable[[], None],
+) -> Iterator[Rows]:
+    """Rows of every variant in the order of the frames, some at a time, once more at the end.
+
+    `results` are those of all bursts, in order, each after its number of frames. Only what variants that use all frames
+    of a device observed stays in memory: `solve` makes the rows of each device of it.
+    """
+    observed = []
+    for frames, result in results:
+        for _ in range(frames):
+            on_frame()
+        observed.append(result.observed)
+        yield result.rows
+    found = devices(observed)
+    rows: Rows = {}
+    for device, solved in zip(found, solve(found), strict=True):
+        for _ in next(iter(device.values())):
+            on_frame()
+        for name, some in solved.items():
+            rows.setdefault(name, []).extend(some)
+    yield {name: sorted(some, key=lambda row: row.frame) for name, some in rows.items()}
 
 
 def estimate_burst(dataset: Dataset, records: Sequence[FrameRecord], variants: Sequence[Variant]) -> ShotResult:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from estimator.errors import InputError
 from estimator.evaluate.frame_score import Position, mean_distance_m, score_frame, tilt_deg
-from estimator.evaluate.score import estimate_paths, read_known
+from estimator.evaluate.known import KnownEstimates, estimate_paths
 from estimator.io.dataset import Dataset, read_dataset
 from estimator.io.estimates import frames_sha256
 from estimator.io.sweep import dataset_folders
@@ -96,12 +96,13 @@ def _of_dataset(folder: Path, label: str, variants: Sequence[str] | None) -> dic
     scalars = read_true_scalars(truth_path, len(dataset.frames))
     columns: dict[str, Values] = {}
     for name in variants or estimates:
-        rows, leds_m = read_known(estimates[name], dataset, digest)
+        known = KnownEstimates.of(estimates[name], dataset, len(dataset.frames), digest)
+        leds_m = known.leds_m
         scores = [
             score_frame(row, true, leds_m, record.device)
-            for row, true, record in zip(rows, truth, dataset.frames, strict=True)
+            for row, true, record in zip(known.rows(), truth, dataset.frames, strict=True)
         ]
-        found: dict[str, Values] = {"set": [label] * len(rows), "variant": [name] * len(rows)}
+        found: dict[str, Values] = {"set": [label] * len(scores), "variant": [name] * len(scores)}
         found |= {key.removeprefix(SWEPT): column for key, column in scalars.items() if key.startswith(SWEPT)}
         # A swept name goes before another column of its name.
         found = scalars | _of_truth(truth, leds_m) | found

@@ -1,17 +1,20 @@
 """Score of one frame of one variant: its errors by the truth, and what the errors may depend on."""
 
 from collections.abc import Mapping, Sequence
-from typing import Literal
+from dataclasses import fields
+from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, Strict, model_validator
 
 from estimator.evaluate.statistics import squared_in_sigmas
 from estimator.io.estimates import EstimateRow
-from estimator.io.records import LedId, Number, Row, Size, Triple, small_row
+from estimator.io.records import LedId, Number, Size, Triple, small_row
 from estimator.io.truth import TruthRow
 
 Position = tuple[float, float, float]
+Whole = Annotated[int, Strict()]
+Count = Annotated[int, Field(ge=0), Strict()]
 
 
 @small_row
@@ -22,7 +25,8 @@ class RangeError:
     error_m: Number
 
 
-class FrameScore(Row):
+@small_row
+class FrameScore:
     """Score of one frame of one variant; positions in world metres. Errors are null for a failed frame.
 
     `vertical_error_m` is signed, positive is too high. `bound_m` is the root of the trace of the frame's Cramer-Rao
@@ -35,17 +39,17 @@ class FrameScore(Row):
     signal to noise of their brightest pixel, both null where the estimates state no spots.
     """
 
-    frame: int
-    device: int
-    map: int
-    good_leds: int
-    tilt_deg: float = Field(ge=0, le=180)
-    leds: int = Field(ge=0)
+    frame: Whole
+    device: Whole
+    map: Whole
+    good_leds: Count
+    tilt_deg: Annotated[float, Field(ge=0, le=180), Strict()]
+    leds: Count
     distance_m: Size | None
-    spots_found: int | None = Field(ge=0)
+    spots_found: Count | None
     snr: Size | None
     status: Literal["ok", "failed"]
-    reason: str
+    reason: Annotated[str, Strict()]
     true_m: Triple
     estimate_m: Triple | None
     error_3d_m: Size | None
@@ -54,7 +58,7 @@ class FrameScore(Row):
     bound_m: Size | None
     bound_exact_m: Size | None
     nees: Size | None
-    ambiguous: bool
+    ambiguous: Annotated[bool, Strict()]
     range_errors: tuple[RangeError, ...]
     time_s: Size
 
@@ -69,7 +73,7 @@ class FrameScore(Row):
 def frame_columns() -> list[str]:
     """Columns of the frames' table beside the variant: the keys of a row without lists, positions by axis."""
     columns: list[str] = []
-    for field in FrameScore.model_fields:
+    for field in (one.name for one in fields(FrameScore)):
         if field in ("true_m", "estimate_m"):
             columns += [f"{field.removesuffix('_m')}_{axis}_m" for axis in "xyz"]
         elif field != "range_errors":
@@ -80,7 +84,7 @@ def frame_columns() -> list[str]:
 def frame_row(variant: str, row: FrameScore) -> dict[str, object]:
     """Values of a frame of a variant by column name, `variant` among them."""
     values: dict[str, object] = {"variant": variant}
-    for field in FrameScore.model_fields:
+    for field in (one.name for one in fields(FrameScore)):
         value = getattr(row, field)
         if field in ("true_m", "estimate_m"):
             point = (None, None, None) if value is None else value

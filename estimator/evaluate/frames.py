@@ -1,40 +1,41 @@
 """What scores.json states of the frames themselves: poses, readings, and what errors at the bound would be."""
 
-from collections.abc import Sequence
+from typing import Annotated
 
 import numpy as np
+from numpy.typing import NDArray
+from pydantic import Strict
 
 from estimator.io.dataset import FrameRecord
-from estimator.io.records import Number, Row, Size
+from estimator.io.records import Number, Size, small_row
 from estimator.io.truth import TruthRow
 
+Floats = NDArray[np.float64]
 DRAWS = 200_000
 """Errors that are drawn for the quantiles: the share below each has a standard error of 0.1 % or less."""
 DRAW_KEY = 20161119
 
 
-class FramePose(Row):
+@small_row
+class FramePose:
     """A frame's camera, exposure and true attitude, row by row.
 
     `gravity_error_deg` is the angle between the accelerometer's reading and the true vertical; null without a reading.
     """
 
-    camera: str
+    camera: Annotated[str, Strict()]
     exposure_s: Size
-    R_cam_world: tuple[Number, ...]
+    R_cam_world: Annotated[tuple[Number, ...], Strict(False)]
     gravity_error_deg: Size | None
 
 
-def frame_poses(records: Sequence[FrameRecord], truth: Sequence[TruthRow]) -> tuple[FramePose, ...]:
-    """Poses of all frames, in order."""
-    return tuple(
-        FramePose(
-            camera=record.camera,
-            exposure_s=record.exposure_s,
-            R_cam_world=true.R_cam_world,
-            gravity_error_deg=_gravity_error_deg(record, true),
-        )
-        for record, true in zip(records, truth, strict=True)
+def frame_pose(record: FrameRecord, true: TruthRow) -> FramePose:
+    """Pose of a frame."""
+    return FramePose(
+        camera=record.camera,
+        exposure_s=record.exposure_s,
+        R_cam_world=true.R_cam_world,
+        gravity_error_deg=_gravity_error_deg(record, true),
     )
 
 
@@ -47,13 +48,12 @@ def _gravity_error_deg(record: FrameRecord, true: TruthRow) -> float | None:
     return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(reading, up)), reading @ up)))
 
 
-def bound_quantiles_m(truth: Sequence[TruthRow]) -> tuple[float, ...] | None:
+def bound_quantiles_m(bounds_m2: Floats) -> tuple[float, ...] | None:
     """Sizes of errors at the quantiles 0, 1, ..., 100 %, metres, if each frame's error were drawn from its bound.
 
-    The errors are normal, and the frames that have a bound count alike; None without such a frame. The first and the
+    The errors are normal, and the frames of `bounds_m2` (n, 3, 3) count alike; None without a frame. The first and the
     last are the quantiles 0.1 and 99.9 %: those of 0 and 100 % are 0 and infinity.
     """
-    bounds_m2 = np.array([row.bound_m2 for row in truth if row.bound_m2 is not None]).reshape(-1, 3, 3)
     if not len(bounds_m2):
         return None
     generator = np.random.Generator(np.random.Philox(key=DRAW_KEY))

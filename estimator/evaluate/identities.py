@@ -1,6 +1,7 @@
 """Scores of a receiver: its identities against the truth, by the lines of an LED image, distance and tilt."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +11,7 @@ from pydantic import Field
 from estimator.camera.pose import Pose
 from estimator.camera.projection import project
 from estimator.io.camera import Camera
-from estimator.io.dataset import Dataset
+from estimator.io.dataset import Dataset, FrameRecord
 from estimator.io.device import Identity
 from estimator.io.estimates import EstimateRow
 from estimator.io.records import Row, Size
@@ -18,6 +19,8 @@ from estimator.io.truth import WHOLE, TrueLed, TrueMapLed, TruthRow
 from estimator.receiver.bits import NOT_SEEN
 
 Floats = NDArray[np.float64]
+Places = Mapping[int, tuple[Floats, float]]
+"""Centre, world metres, and radius or half the side of LEDs, by id."""
 
 ROWS = (0.0, 30.0, 40.0, 50.0, 60.0, 80.0)
 DISTANCES_M = (0.0, 2.0, 2.5, 3.0, 3.5, 4.5)
@@ -62,16 +65,6 @@ class IdentityScore(Row):
     by_tilt: tuple[IdentityClass, ...]
 
 
-@dataclass(frozen=True)
-class _Judged:
-    """An LED image that is whole: its lines, distance, tilt of the camera, and what became of it."""
-
-    lines: float
-    distance_m: float
-    tilt_deg: float
-    verdict: str
-
-
 def score_identities(
     estimates: Sequence[EstimateRow], truth: Sequence[TruthRow], dataset: Dataset, true_map: Sequence[TrueMapLed]
 ) -> IdentityScore | None:
@@ -79,46 +72,76 @@ def score_identities(
 
     `true_map` is needed where the dataset has no map.
     """
-    if dataset.downlink is None or all(row.identities is None for row in estimates):
-        return None
-    judged: list[_Judged] = []
-    elsewhere = errors = bits = 0
-    places = {(led.map, led.led): (np.array(led.position_m), led.size_m) for led in true_map}
+    tally = IdentityTally(dataset, true_map)
     for row, true, record in zip(estimates, truth, dataset.frames, strict=True):
-        known = {led: place for (number, led), place in places.items() if number == true.map}
-        if not known:
-            known = {led.id: (np.array(led.position_m), led.half_width_m) for led in dataset.leds.values()}
-        names = _names(row.identities or (), known, bool(dataset.leds))
-        frame = _Frame(true, dataset.cameras[record.camera], known)
-        of_led, stray = frame.assigned(row.identities or ())
-        elsewhere += sum(names[number] is not None for number in stray)
+        tally.add(row, true, record)
+    return tally.score()
+
+
+class IdentityTally:
+    """Counts of one variant's identities, frame by frame; as `score_identities`."""
+
+    def __init__(self, dataset: Dataset, true_map: Sequence[TrueMapLed]) -> None:
+        """Count nothing yet; `true_map` is needed where the dataset has no map."""
+        self._dataset = dataset
+        received = dataset.downlink is not None and dataset.downlink.demodulation == "pixels"
+        self._downlink = dataset.downlink if received else None
+        self._of_map: dict[int, dict[int, tuple[Floats, float]]] = {}
+        for led in true_map:
+            self._of_map.setdefault(led.map, {})[led.led] = (np.array(led.position_m), led.size_m)
+        self._told: Places = {led.id: (np.array(led.position_m), led.half_width_m) for led in dataset.leds.values()}
+        self._received = False
+        self._elsewhere = self._bit_errors = self._bits = 0
+        self._verdicts = Counter[str]()
+        self._by_rows, self._by_distance, self._by_tilt = _Classes(ROWS), _Classes(DISTANCES_M), _Classes(TILTS_DEG)
+
+    def add(self, row: EstimateRow, true: TruthRow, record: FrameRecord) -> None:
+        """Count the identities of a frame."""
+        if self._downlink is None:
+            return
+        identities = row.identities or ()
+        self._received |= row.identities is not None
+        known: Places = self._of_map.get(true.map, self._told)
+        names = _names(identities, known, bool(self._dataset.leds))
+        frame = _Frame(true, self._dataset.cameras[record.camera], known)
+        of_led, stray = frame.assigned(identities)
+        self._elsewhere += sum(names[number] is not None for number in stray)
         for led in true.leds:
             found = of_led.get(led.led, [])
             said = {names[number] for number in found} - {None}
-            tells = led.led in dataset.downlink.leds or led.bits is not None
+            tells = led.led in self._downlink.leds or led.bits is not None
             if led.visible_fraction < WHOLE or not tells:
-                elsewhere += bool(said - ({led.led} if tells else set()))
+                self._elsewhere += bool(said - ({led.led} if tells else set()))
                 continue
             verdict = "missed" if not found else "rejected" if not said else "right" if said == {led.led} else "wrong"
-            judged.append(_Judged(*frame.geometry(led), verdict))
+            self._verdicts[verdict] += 1
+            for classes, value in zip(
+                (self._by_rows, self._by_distance, self._by_tilt), frame.geometry(led), strict=True
+            ):
+                classes.add(value, verdict)
             if verdict == "right" and led.bits is not None:
                 for number in found:
-                    read = (row.identities or ())[number].bits or ""
+                    read = identities[number].bits or ""
                     pairs = [(a, b) for a, b in zip(read, led.bits, strict=False) if a != NOT_SEEN]
-                    bits += len(pairs)
-                    errors += sum(a != b for a, b in pairs)
-    return IdentityScore(
-        **_counts(judged),
-        wrong_elsewhere=elsewhere,
-        bit_errors=errors,
-        bits=bits,
-        by_rows=_classes(judged, ROWS, lambda one: one.lines),
-        by_distance=_classes(judged, DISTANCES_M, lambda one: one.distance_m),
-        by_tilt=_classes(judged, TILTS_DEG, lambda one: one.tilt_deg),
-    )
+                    self._bits += len(pairs)
+                    self._bit_errors += sum(a != b for a, b in pairs)
+
+    def score(self) -> IdentityScore | None:
+        """Score of the frames so far; None where identities are given, or no frame has any."""
+        if not self._received:
+            return None
+        return IdentityScore(
+            **_counts(self._verdicts),
+            wrong_elsewhere=self._elsewhere,
+            bit_errors=self._bit_errors,
+            bits=self._bits,
+            by_rows=self._by_rows.counted(),
+            by_distance=self._by_distance.counted(),
+            by_tilt=self._by_tilt.counted(),
+        )
 
 
-def _names(identities: Sequence[Identity], known: Mapping[int, tuple[Floats, float]], mapped: bool) -> list[int | None]:
+def _names(identities: Sequence[Identity], known: Places, mapped: bool) -> list[int | None]:
     """LED of the truth that each identity names: by its id, or by its position where the dataset has no map."""
     if mapped:
         return [one.led for one in identities]
@@ -138,7 +161,7 @@ class _Frame:
 
     truth: TruthRow
     camera: Camera
-    known: Mapping[int, tuple[Floats, float]]
+    known: Places
 
     def _rim_px(self, led: int) -> Floats:
         """Pixels (24, 2) around the image of an LED, by the camera as it is told and the pose at mid-readout."""
@@ -169,16 +192,25 @@ class _Frame:
         return of_led, stray
 
 
-def _counts(judged: Iterable[_Judged]) -> dict[str, int]:
-    verdicts = [one.verdict for one in judged]
-    return {"leds": len(verdicts)} | {name: verdicts.count(name) for name in ("right", "wrong", "rejected", "missed")}
+def _counts(verdicts: Counter[str]) -> dict[str, int]:
+    return {"leds": verdicts.total()} | {name: verdicts[name] for name in ("right", "wrong", "rejected", "missed")}
 
 
-def _classes(
-    judged: Sequence[_Judged], lower: Sequence[float], value: Callable[[_Judged], float]
-) -> tuple[IdentityClass, ...]:
-    found = []
-    for low, high in zip(lower, [*lower[1:], None], strict=True):
-        some = [one for one in judged if low <= value(one) and (high is None or value(one) < high)]
-        found.append(IdentityClass(low=low, high=high, **_counts(some)))
-    return tuple(found)
+class _Classes:
+    """Verdicts on LED images by the class of a value; `lower` are the lower ends, the last class has no upper end."""
+
+    def __init__(self, lower: Sequence[float]) -> None:
+        self._ends = tuple(zip(lower, [*lower[1:], None], strict=True))
+        self._verdicts = [Counter[str]() for _ in lower]
+
+    def add(self, value: float, verdict: str) -> None:
+        """Count a verdict on an image of this value."""
+        for (low, high), verdicts in zip(self._ends, self._verdicts, strict=True):
+            verdicts[verdict] += low <= value and (high is None or value < high)
+
+    def counted(self) -> tuple[IdentityClass, ...]:
+        """The classes so far."""
+        return tuple(
+            IdentityClass(low=low, high=high, **_counts(verdicts))
+            for (low, high), verdicts in zip(self._ends, self._verdicts, strict=True)
+        )

@@ -2,14 +2,16 @@
 
 import logging
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, closing
+from itertools import chain, groupby
 from pathlib import Path
 
 from estimator.errors import InputError
-from estimator.evaluate.batch import estimate_dataset, steps
+from estimator.evaluate.batch import estimate_frames, steps
 from estimator.evaluate.workers import estimate_with_workers
-from estimator.io.dataset import Dataset, read_dataset
-from estimator.io.estimates import EstimateRow, estimates_path, frames_sha256, write_estimates
+from estimator.io.dataset import Dataset, iter_frames, read_device
+from estimator.io.estimates import EstimateRow, estimates_file, estimates_path, frames_sha256
 from estimator.io.lock import locked
 from estimator.io.results import dataset_folder, make_results_folder
 from estimator.io.sweep import dataset_folders
@@ -62,6 +64,24 @@ def run(
     OSError
         The estimates cannot be written.
     """
+    rows: dict[str, list[EstimateRow]] = {}
+
+    def keep(name: str, some: Sequence[EstimateRow]) -> None:
+        rows.setdefault(name, []).extend(some)
+
+    write_run(directory, keep, variants, workers, progress, out)
+    return {name: tuple(of_variant) for name, of_variant in rows.items()}
+
+
+def write_run(
+    directory: str | Path,
+    on_rows: Callable[[str, Sequence[EstimateRow]], None],
+    variants: Sequence[str | Variant] | None = None,
+    workers: int = 1,
+    progress: Callable[[int, int], None] | None = None,
+    out: str | Path | None = None,
+) -> None:
+    """`run` that keeps no row: `on_rows` is called with each variant's name and no rows, then with some in order."""
     if workers < 1:
         raise InputError(f"workers {workers}: is not 1 or more")
     folder = Path(directory)
@@ -73,7 +93,7 @@ def run(
         dataset_folders(folder)  # refuses a damaged sweep before the folder is made
         make_results_folder(home, dataset_folder(folder))
     with locked(home, "estimator run"):
-        return _run(folder, home, chosen, workers, progress)
+        _run(folder, home, chosen, workers, progress, on_rows)
 
 
 def _run(
@@ -82,21 +102,22 @@ def _run(
     chosen: dict[str, Variant],
     workers: int,
     progress: Callable[[int, int], None] | None,
-) -> dict[str, tuple[EstimateRow, ...]]:
-    """`run`, with the estimates in the folder `home`, which is locked."""
+    on_rows: Callable[[str, Sequence[EstimateRow]], None],
+) -> None:
+    """`write_run`, with the estimates in the folder `home`, which is locked."""
     cells = dataset_folders(folder)
     homes = [home / os.path.relpath(cell, folder) for cell in cells]
-    # A cell that cannot be read is refused before the first frame is estimated. Not all are in memory at a time.
+    # A cell that cannot be read is refused before the first frame is estimated.
     frames = 0
     digests = []
     for cell, of_cell in zip(cells, homes, strict=True):
-        dataset = read_dataset(cell)
+        dataset, frame_count = read_device(cell)
+        _check_files(dataset, frame_count)
         digests.append(frames_sha256(dataset.folder))
-        _check_files(dataset)
         if of_cell != cell and of_cell != home:
             make_results_folder(of_cell, dataset.folder)
         _check_writable(of_cell)
-        frames += len(dataset.frames)
+        frames += frame_count
     done, total = 0, frames * steps(chosen.values())
 
     def on_frame() -> None:
@@ -107,27 +128,38 @@ def _run(
 
     if progress is not None:
         progress(0, total)
-    datasets = [dataset] if len(cells) == 1 else map(read_dataset, cells)
-    of_cells: Iterator[dict[str, tuple[EstimateRow, ...]]]
-    if workers == 1:
-        of_cells = (estimate_dataset(dataset, list(chosen.values()), on_frame) for dataset in datasets)
-    else:
+    datasets = ((dataset, iter_frames(dataset, count)) for dataset, count in map(read_device, cells))
+    if workers > 1:
         _check_registered(chosen)
-        of_cells = estimate_with_workers(datasets, list(chosen), min(workers, frames), on_frame)
-    rows: dict[str, list[EstimateRow]] = {name: [] for name in chosen}
-    for of_cell, digest, found in zip(homes, digests, of_cells, strict=True):
-        for name, of_variant in found.items():
-            write_estimates(of_cell, name, of_variant, digest)
-            rows[name] += of_variant
-    return {name: tuple(of_variant) for name, of_variant in rows.items()}
+        parts = estimate_with_workers(datasets, list(chosen), min(workers, frames), on_frame)
+    else:
+        parts = (
+            (number, rows)
+            for number, (dataset, records) in enumerate(datasets)
+            for rows in estimate_frames(dataset, records, list(chosen.values()), on_frame)
+        )
+    for name in chosen:
+        on_rows(name, ())
+    with closing(parts):
+        for number, of_dataset in groupby(parts, lambda part: part[0]):
+            files = {name: estimates_file(homes[number], name, digests[number]) for name in chosen}
+            with ExitStack() as stack:
+                add = {name: stack.enter_context(file) for name, file in files.items()}
+                for name, some in chain.from_iterable(rows.items() for _, rows in of_dataset):
+                    add[name](some)
+                    on_rows(name, some)
 
 
-def _check_files(dataset: Dataset) -> None:
-    """Refuse a dataset of which no frame has a file: their loss is no failure of a variant."""
-    if dataset.frames and not any((dataset.folder / record.file).is_file() for record in dataset.frames):
+def _check_files(dataset: Dataset, frame_count: int) -> None:
+    """Refuse a dataset of which no frame has a file: their loss is no failure of a variant. All records are checked."""
+    first, found = None, False
+    for record in iter_frames(dataset, frame_count):
+        first = first or record.file
+        found = found or (dataset.folder / record.file).is_file()
+    if first is not None and not found:
         raise InputError(
-            f"{dataset.folder}: the files of all {len(dataset.frames)} frames are missing, the first "
-            f"{dataset.frames[0].file}; generate or copy the dataset again"
+            f"{dataset.folder}: the files of all {frame_count} frames are missing, the first {first}; generate or copy "
+            "the dataset again"
         )
 
 

@@ -2,19 +2,21 @@
 
 import errno
 import logging
+from array import array
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, TypeAdapter, model_validator
 
 from estimator.errors import InputError
 from estimator.evaluate.entry import MadeBy, VariantEntry, entry_of
 from estimator.evaluate.frame_score import FrameScore, Position, frame_columns, frame_row, score_frame
-from estimator.evaluate.frames import FramePose, bound_quantiles_m, frame_poses
-from estimator.evaluate.identities import IdentityScore, score_identities
+from estimator.evaluate.frames import FramePose, bound_quantiles_m, frame_pose
+from estimator.evaluate.identities import IdentityScore, IdentityTally
+from estimator.evaluate.known import KnownEstimates, estimate_paths
 from estimator.evaluate.sources import sources_of
 from estimator.evaluate.statistics import (
     AgainstBound,
@@ -38,12 +40,12 @@ from estimator.evaluate.statistics import (
     summary,
 )
 from estimator.io.atomic import write_atomically
-from estimator.io.dataset import Dataset, read_dataset
-from estimator.io.estimates import EstimateRow, read_estimates
+from estimator.io.dataset import iter_frames, read_device
+from estimator.io.estimates import EstimateRow
 from estimator.io.led_map import AnyLed
 from estimator.io.lock import locked
 from estimator.io.records import Positive, Row, Size
-from estimator.io.truth import TruthRow, read_true_map, read_truth
+from estimator.io.truth import TruthRow, iter_truth, read_true_map
 from estimator.io.withheld import read_withheld
 
 if TYPE_CHECKING:
@@ -224,9 +226,16 @@ def score_variant(
     `downlink` is the score of its identities, `entry` what is stated about the variant, by its name if None.
     """
     of_frame = [0] * len(estimates) if devices is None else devices
-    rows = tuple(
+    rows = [
         score_frame(row, true, leds_m, device) for row, true, device in zip(estimates, truth, of_frame, strict=True)
-    )
+    ]
+    return summarised(variant, rows, downlink, entry_of(variant) if entry is None else entry)
+
+
+def summarised(
+    variant: str, rows: Sequence[FrameScore], downlink: IdentityScore | None, entry: VariantEntry
+) -> VariantScore:
+    """Score of one variant by the scores of all its frames, in order."""
     good = [row for row in rows if row.status == "ok"]
     sure = [row for row in good if row.nees is not None]
     groups = groups_of(good)
@@ -238,7 +247,7 @@ def score_variant(
     range_errors_m = [error.error_m for row in rows for error in row.range_errors]
     return VariantScore(
         variant=variant,
-        entry=entry_of(variant) if entry is None else entry,
+        entry=entry,
         frames=len(rows),
         ok=len(good),
         failed=len(rows) - len(good),
@@ -263,7 +272,7 @@ def score_variant(
         by_good_leds=_by_good_leds(rows),
         downlink=downlink,
         median_time_s=float(np.median([row.time_s for row in good])) if good else None,
-        rows=rows,
+        rows=tuple(rows),
     )
 
 
@@ -354,7 +363,7 @@ def score(directory: str | Path) -> Scores:
 
 def _score(folder: Path) -> Scores:
     """`score` of a folder that is locked."""
-    dataset = read_dataset(folder)
+    dataset, frame_count = read_device(folder)
     paths = estimate_paths(folder)
     if not paths:
         raise InputError(f"{folder / 'estimates'}: no estimates to score; make them with `estimator run {folder}`")
@@ -364,55 +373,37 @@ def _score(folder: Path) -> Scores:
             f"--dataset {dataset.folder} --truth KEYFILE"
         )
     sources = sources_of(folder, paths)
-    truth = read_truth(dataset.folder / "truth.parquet", len(dataset.frames))
-    devices = [record.device for record in dataset.frames]
-    true_map = () if dataset.leds or not dataset.frames else read_true_map(dataset.folder / "truth_map.parquet")
-    variants = []
-    for path in paths:
-        rows, leds_m = read_known(path, dataset, sources["frames.parquet"])
-        downlink = score_identities(rows, truth, dataset, true_map)
-        variants.append(score_variant(path.stem, rows, truth, leds_m, devices, downlink, entry_of(path.stem, dataset)))
+    true_map = () if dataset.leds or not frame_count else read_true_map(dataset.folder / "truth_map.parquet")
+    known = [KnownEstimates.of(path, dataset, frame_count, sources["frames.parquet"]) for path in paths]
+    rows: list[list[FrameScore]] = [[] for _ in paths]
+    tallies = [IdentityTally(dataset, true_map) for _ in paths]
+    poses: list[FramePose] = []
+    bounds_m2 = array("d")
+    records, truth = iter_frames(dataset, frame_count), iter_truth(dataset.folder / "truth.parquet", frame_count)
+    # One frame at a time: only what scores.json holds of it stays in memory.
+    for record, true, *estimates in zip(records, truth, *(one.rows() for one in known), strict=True):
+        poses.append(frame_pose(record, true))
+        bounds_m2.extend(true.bound_m2 or ())
+        for estimate, of, scored, tally in zip(estimates, known, rows, tallies, strict=True):
+            scored.append(score_frame(estimate, true, of.leds_m, record.device))
+            tally.add(estimate, true, record)
     scores = Scores(
         sources=sources,
         dataset=dataset.name,
         room_m=dataset.room_m,
         led_map=tuple(dataset.leds.values()),
         made_by=MadeBy.here(),
-        bound_quantiles_m=bound_quantiles_m(truth),
-        frames=frame_poses(dataset.frames, truth),
-        variants=tuple(variants),
+        bound_quantiles_m=bound_quantiles_m(np.array(bounds_m2).reshape(-1, 3, 3)),
+        frames=tuple(poses),
+        variants=tuple(
+            summarised(path.stem, scored, tally.score(), entry_of(path.stem, dataset))
+            for path, scored, tally in zip(paths, rows, tallies, strict=True)
+        ),
     )
     try:
-        write_atomically(folder / "scores.json", scores.model_dump_json(indent=1).encode() + b"\n")
+        write_atomically(folder / "scores.json", TypeAdapter(Scores).dump_json(scores, indent=1), b"\n")
     except OSError as error:
         if error.errno not in (errno.EROFS, errno.EACCES, errno.EPERM):
             raise
         logger.warning("%s: not written: %s", folder / "scores.json", error.strerror)
     return scores
-
-
-def estimate_paths(folder: Path) -> list[Path]:
-    """Files with estimates of a dataset, in order of the variants' names. Raises InputError for an unprintable name."""
-    paths = sorted((folder / "estimates").glob("*.parquet"), key=lambda path: path.stem)
-    for path in paths:
-        if not path.stem.isprintable():
-            raise InputError(f"{folder / 'estimates'}: {path.name!r}: needed a name of printable characters")
-    return paths
-
-
-def read_known(path: Path, dataset: Dataset, digest: str) -> tuple[tuple[EstimateRow, ...], dict[int, Position]]:
-    """Estimates of a file, and positions of LEDs by id: those of the map, or those that packets told.
-
-    digest: `frames_sha256` of the dataset. Raises InputError for estimates of another dataset, and for a range to an
-    LED that is in neither.
-    """
-    rows = read_estimates(path, len(dataset.frames), digest)
-    leds_m = {led.id: led.position_m for led in dataset.leds.values()}
-    if not leds_m:
-        told = [one for row in rows for one in row.identities or ()]
-        leds_m = {one.led: one.position_m for one in told if one.led is not None and one.position_m is not None}
-    for row in rows:
-        for led_range in row.ranges:
-            if led_range.led not in leds_m:
-                raise InputError(f"{path}: frame {row.frame}: a range to LED {led_range.led}, which is not in led_map")
-    return rows, leds_m

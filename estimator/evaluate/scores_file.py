@@ -5,7 +5,8 @@ from pathlib import Path
 from pydantic import BaseModel, Field, ValidationError
 
 from estimator.errors import InputError
-from estimator.evaluate.score import VERSION, Scores, estimate_paths, score
+from estimator.evaluate.known import estimate_paths
+from estimator.evaluate.score import VERSION, Scores, score
 from estimator.evaluate.sources import sources_of
 from estimator.io.records import first_problem
 

@@ -22,7 +22,8 @@ from pydantic import Field, Strict, StringConstraints, ValidationError
 
 from estimator.errors import InputError
 from estimator.evaluate.identities import score_identities
-from estimator.evaluate.score import VariantScore, estimate_paths, read_known, score_variant
+from estimator.evaluate.known import KnownEstimates, estimate_paths
+from estimator.evaluate.score import VariantScore, score_variant
 from estimator.io.atomic import write_atomically
 from estimator.io.dataset import Dataset, read_dataset
 from estimator.io.estimates import NAME, NAME_RULE, frames_sha256
@@ -101,7 +102,8 @@ def submit(folder: Path, out: Path, name: str, author: str | None = None, varian
             raise InputError(
                 f"{folder / 'estimates'}: none of variant {variant}; there are: {', '.join(paths) or 'none'}"
             )
-        read_known(paths[variant], dataset, digest)
+        for _ in KnownEstimates.of(paths[variant], dataset, len(dataset.frames), digest).rows():
+            pass  # damaged rows are refused
         files[variant] = paths[variant].read_bytes()
     try:
         description = Submission(
@@ -214,14 +216,15 @@ def _check_size(bundle: Bundle, variant: str, data: bytes, frame_count: int) -> 
 def _score(bundle: Bundle, variant: str, data: bytes, dataset: Dataset, truth: JudgedTruth) -> VariantScore:
     if not re.fullmatch(NAME, variant):
         raise InputError(f"{bundle.source}: variant {variant!r}: allowed: {NAME_RULE}")
+    chosen = set(truth.frames)
     with tempfile.TemporaryDirectory(prefix="estimator-bundle-") as opened:
         path = Path(opened) / f"{variant}.parquet"
         path.write_bytes(data)
         try:
-            rows, leds_m = read_known(path, dataset, bundle.description.frames_sha256)
+            known = KnownEstimates.of(path, dataset, len(dataset.frames), bundle.description.frames_sha256)
+            judged = [row for row in known.rows() if row.frame in chosen]
         except InputError as error:
             raise InputError(f"{bundle.source}: {str(error).replace(f'{path}', f'estimates/{path.name}')}") from None
-    judged = [rows[frame] for frame in truth.frames]
     records = tuple(dataset.frames[frame] for frame in truth.frames)
     downlink = score_identities(judged, truth.rows, replace(dataset, frames=records), truth.true_map)
-    return score_variant(variant, judged, truth.rows, leds_m, [record.device for record in records], downlink)
+    return score_variant(variant, judged, truth.rows, known.leds_m, [record.device for record in records], downlink)

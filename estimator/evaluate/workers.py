@@ -5,12 +5,13 @@ import os
 import signal
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
+from itertools import groupby
 from pathlib import Path
 
 import cv2
@@ -18,50 +19,51 @@ import cv2
 from estimator.errors import InputError
 from estimator.evaluate.batch import (
     Observed,
+    OfDevice,
     Rows,
     ShotResult,
     bursts,
-    devices,
     estimate_burst,
-    estimate_dataset,
     estimate_device,
+    estimate_frames,
     in_order,
 )
-from estimator.io.dataset import Dataset, FrameRecord, read_dataset
-from estimator.io.estimates import EstimateRow
+from estimator.io.dataset import Dataset, FrameRecord, read_device
 from estimator.methods.registry import Registry
 from estimator.methods.variant import Variant
 
 BURSTS_AHEAD = 4
-"""Bursts of the next datasets that wait for each process, so that none is idle at the end of a dataset."""
+"""Bursts that wait for each process, of the next datasets too, so that none is idle at the end of a dataset."""
 
 
 def estimate_with_workers(
-    datasets: Iterable[Dataset], names: Sequence[str], workers: int, on_frame: Callable[[], None]
-) -> Iterator[dict[str, tuple[EstimateRow, ...]]]:
-    """Rows of each dataset as by `estimate_dataset`, for variants given by name.
+    datasets: Iterable[tuple[Dataset, Iterable[FrameRecord]]],
+    names: Sequence[str],
+    workers: int,
+    on_frame: Callable[[], None],
+) -> Generator[tuple[int, Rows], None, None]:
+    """Rows as by `estimate_frames` of each dataset and its records, after the dataset's number, from 0 on.
 
-    The same `workers` processes estimate all datasets; each looks the variants up itself, and reads a dataset from its
-    folder. Raises InputError for an unknown name, and if a process dies.
+    Variants are given by name. The same `workers` processes estimate all datasets; each looks the variants up itself,
+    and reads a dataset from its folder. Raises InputError for an unknown name, and if a process dies.
     """
     registry = Registry.read()
     variants = [registry.named(name) for name in names]
     if workers <= 1:
-        for dataset in datasets:
-            yield estimate_dataset(dataset, variants, on_frame)
+        for number, (dataset, records) in enumerate(datasets):
+            for rows in estimate_frames(dataset, records, variants, on_frame):
+                yield number, rows
         return
     # A forked child of a process with threads may hang: spawn.
     pool = ProcessPoolExecutor(
         workers, multiprocessing.get_context("spawn"), _start, (tuple(names), max(1, _cores() // workers))
     )
-    begun: deque[_Begun] = deque()
     try:
-        for dataset in datasets:
-            begun.append(_Begun.of(pool, dataset))
-            while sum(len(one.tasks) for one in begun) - len(begun[0].tasks) >= BURSTS_AHEAD * workers:
-                yield begun.popleft().finished(pool, variants, on_frame)
-        while begun:
-            yield begun.popleft().finished(pool, variants, on_frame)
+        tasks = _ahead(_submitted(pool, datasets), BURSTS_AHEAD * workers)
+        for (number, folder), of_dataset in groupby(tasks, lambda task: (task.number, task.folder)):
+            results = ((task.frames, task.result.result()) for task in of_dataset if task.result is not None)
+            for rows in in_order(results, partial(_solved, pool, folder), on_frame):
+                yield number, rows
     except BrokenProcessPool:
         raise InputError(
             "a worker process died (out of memory?); the dataset's estimates were not written; try fewer --workers"
@@ -78,36 +80,41 @@ def estimate_with_workers(
 
 
 @dataclass(frozen=True, eq=False)
-class _Begun:
-    """A dataset whose bursts wait for processes, or are estimated."""
+class _Task:
+    """A burst that waits for a process, or is estimated: its number of frames, and of which dataset it is."""
 
-    dataset: Dataset
-    tasks: tuple[tuple[tuple[FrameRecord, ...], "Future[ShotResult]"], ...]
+    number: int
+    folder: Path
+    frames: int
+    result: "Future[ShotResult] | None"
+    """None at the end of a dataset."""
 
-    @classmethod
-    def of(cls, pool: ProcessPoolExecutor, dataset: Dataset) -> "_Begun":
-        """Submit the bursts of a dataset."""
-        with _interrupts_deferred():  # submit() starts child processes
-            tasks = [(records, pool.submit(_work, dataset.folder, records)) for records in bursts(dataset)]
-        return cls(dataset, tuple(tasks))
 
-    def finished(
-        self, pool: ProcessPoolExecutor, variants: Sequence[Variant], on_frame: Callable[[], None]
-    ) -> dict[str, tuple[EstimateRow, ...]]:
-        """Rows of the dataset, when all its bursts and then its devices are estimated."""
-        results = []
-        for records, task in self.tasks:
-            results.append(task.result())
-            for _ in records:
-                on_frame()
-        of_devices = devices(results)
-        solving = [pool.submit(_solve, self.dataset.folder, device) for device in of_devices]
-        solved = []
-        for device, solution in zip(of_devices, solving, strict=True):
-            solved.append(solution.result())
-            for _ in next(iter(device.values())):
-                on_frame()
-        return in_order(self.dataset, variants, [*(result.rows for result in results), *solved])
+def _submitted(pool: ProcessPoolExecutor, datasets: Iterable[tuple[Dataset, Iterable[FrameRecord]]]) -> Iterator[_Task]:
+    """Submit the bursts of all datasets, each as it is asked for."""
+    for number, (dataset, records) in enumerate(datasets):
+        for burst in bursts(dataset, records):
+            with _interrupts_deferred():  # submit() starts child processes
+                result = pool.submit(_work, dataset.folder, burst)
+            yield _Task(number, dataset.folder, len(burst), result)
+        yield _Task(number, dataset.folder, 0, None)
+
+
+def _ahead(tasks: Iterable[_Task], count: int) -> Iterator[_Task]:
+    """Tasks in order, of which `count` have been asked for before they are needed."""
+    waiting: deque[_Task] = deque()
+    for task in tasks:
+        waiting.append(task)
+        if len(waiting) > count:
+            yield waiting.popleft()
+    while waiting:
+        yield waiting.popleft()
+
+
+def _solved(pool: ProcessPoolExecutor, folder: Path, found: Sequence[OfDevice]) -> Iterator[Rows]:
+    """Rows of each device, when all its frames are observed."""
+    solving = [pool.submit(_solve, folder, device) for device in found]
+    return (task.result() for task in solving)
 
 
 @contextmanager
@@ -158,8 +165,8 @@ def _exit_with_parent() -> None:
 
 @lru_cache(maxsize=2)
 def _dataset(folder: Path) -> Dataset:
-    """A dataset of which a worker process estimates several bursts; it may have begun the next one."""
-    return read_dataset(folder)
+    """A dataset, without records, of which a worker estimates several bursts; it may have begun the next one."""
+    return read_device(folder)[0]
 
 
 def _work(folder: Path, records: tuple[FrameRecord, ...]) -> ShotResult:

@@ -2,6 +2,7 @@
 
 import hashlib
 import io
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Literal, Self
@@ -30,14 +31,16 @@ from estimator.io.frame_files import FrameFormat, frame_format, numbers_of_exr, 
 from estimator.io.led_map import AnyLed, DeviceNumber, Luminaire, MapDatum, leds_by_id, luminaires_by_id
 from estimator.io.records import (
     INT64_MAX,
+    FrameRow,
     Number,
     Positive,
     Row,
     Triple,
     first_line,
     first_problem,
+    iter_rows,
     missing_key,
-    read_rows,
+    row_count,
 )
 from estimator.io.results import dataset_folder
 from estimator.io.sensor import Sensor
@@ -67,10 +70,9 @@ OPTIONAL_FRAME_COLUMNS = {"part": pa.int64(), "split": pa.string()}
 """`part` is null in a set whose files hold one frame each, `split` in a set without a split; sets without are such."""
 
 
-class FrameRecord(Row):
+class FrameRecord(FrameRow):
     """Row of frames.parquet; the columns are in datasets/FORMAT.md."""
 
-    frame: int = Field(ge=0)
     shot: int = Field(ge=0)
     pose: int = Field(ge=0)
     file: str
@@ -178,6 +180,15 @@ def read_dataset(path: str | Path) -> Dataset:
     InputError
         A file is missing, damaged, or of another version of the format; the message names the file and the key.
     """
+    dataset, frame_count = read_device(path)
+    return replace(dataset, frames=tuple(iter_frames(dataset, frame_count)))
+
+
+def read_device(path: str | Path) -> tuple[Dataset, int]:
+    """Read dataset.json: what the device knows, without frame records, and the number of frames.
+
+    Raises InputError as `read_dataset`.
+    """
     folder = dataset_folder(path)
     description_path = folder / "dataset.json"
     if not folder.is_dir():
@@ -207,58 +218,63 @@ def read_dataset(path: str | Path) -> Dataset:
         accelerometer=description.accelerometer,
         leds=leds_by_id(description.led_map or ()),
         room_m=description.room_m,
-        frames=read_rows(folder / "frames.parquet", FRAME_COLUMNS, FrameRecord, OPTIONAL_FRAME_COLUMNS),
+        frames=(),
         luminaires=luminaires_by_id(description.luminaires, description.led_map or ()),
         map_datum=description.map_datum,
         gyroscope=description.gyroscope,
         downlink=description.downlink,
         frame_format=form,
     )
-    _check_frames(folder / "frames.parquet", dataset, description.frame_count)
-    return dataset
+    return dataset, description.frame_count
 
 
-def _check_frames(path: Path, dataset: Dataset, frame_count: int) -> None:
-    """Refuse records that disagree with dataset.json or with each other."""
-    if len(dataset.frames) != frame_count:
-        raise InputError(f"{path}: {len(dataset.frames)} rows, but dataset.json says frame_count {frame_count}")
-    shot = -1
-    for index, record in enumerate(dataset.frames):
+def iter_frames(dataset: Dataset, frame_count: int) -> Iterator[FrameRecord]:
+    """Frame records of a dataset, of which some are in memory at a time; `dataset.frames` is not used.
+
+    Raises InputError as `read_dataset`, also for a record that disagrees with dataset.json or with the one before.
+    """
+    path = dataset.folder / "frames.parquet"
+    if (rows := row_count(path)) != frame_count:
+        raise InputError(f"{path}: {rows} rows, but dataset.json says frame_count {frame_count}")
+    before = None
+    for index, record in enumerate(iter_rows(path, FRAME_COLUMNS, FrameRecord, OPTIONAL_FRAME_COLUMNS)):
         if record.frame != index:
             raise InputError(f"{path}: row {index} holds frame {record.frame}; frames have to be 0, 1, 2, ... in order")
-        if record.shot not in (max(shot, 0), shot + 1):
-            raise InputError(f"{path}: frame {index}: shot {record.shot}; shots have to be 0, 1, 2, ... in order")
-        shot = record.shot
-        if record.camera not in dataset.cameras:
-            known = ", ".join(dataset.cameras) or "none"
-            raise InputError(f"{path}: frame {index}: unknown camera {record.camera!r}; cameras: {known}")
-        problem = spots_problem(dataset.downlink, record.spots) or decoding_problem(record.spots, dataset.leds)
-        problem = problem or gravity_problem(record.accelerometer_m_s2, dataset.accelerometer)
-        problem = problem or gyro_problem(record.gyro_rad_s, dataset.gyroscope)
-        if problem is None and record.gyro_rad_s is None and dataset.gyroscope is not None:
-            problem = "gyro_rad_s is null, but gyroscope is given"
-        if problem:
+        if problem := _problem(dataset, before, record):
             raise InputError(f"{path}: frame {index}: {problem}")
-    _check_bursts(path, dataset.frames)
+        yield record
+        before = record
 
 
-def _check_bursts(path: Path, frames: tuple[FrameRecord, ...]) -> None:
-    """Refuse bursts that are not runs of shots of one device, each later than the one before."""
-    burst = -1
-    for before, record in zip((None, *frames), frames, strict=False):
-        where = f"{path}: frame {record.frame}"
-        if record.burst not in (max(burst, 0), burst + 1):
-            raise InputError(f"{where}: burst {record.burst}; bursts have to be 0, 1, 2, ... in order")
-        same = before is not None and record.burst == burst
-        burst = record.burst
-        if before is None:
-            continue
-        if record.shot == before.shot and not same:
-            raise InputError(f"{where}: burst {burst}, but its shot {record.shot} is of burst {before.burst}")
-        if same and record.device != before.device:
-            raise InputError(f"{where}: device {record.device}, but its burst {burst} is of device {before.device}")
-        if same and record.shot != before.shot and record.start_s <= before.start_s:
-            raise InputError(f"{where}: start_s {record.start_s}; has to be later than the shot before in its burst")
+def _problem(dataset: Dataset, before: FrameRecord | None, record: FrameRecord) -> str | None:
+    """Where a record disagrees with dataset.json or with the one before; None if nowhere."""
+    if record.shot not in ((0,) if before is None else (before.shot, before.shot + 1)):
+        return f"shot {record.shot}; shots have to be 0, 1, 2, ... in order"
+    if record.camera not in dataset.cameras:
+        return f"unknown camera {record.camera!r}; cameras: {', '.join(dataset.cameras) or 'none'}"
+    problem = spots_problem(dataset.downlink, record.spots) or decoding_problem(record.spots, dataset.leds)
+    problem = problem or gravity_problem(record.accelerometer_m_s2, dataset.accelerometer)
+    problem = problem or gyro_problem(record.gyro_rad_s, dataset.gyroscope)
+    if problem is None and record.gyro_rad_s is None and dataset.gyroscope is not None:
+        problem = "gyro_rad_s is null, but gyroscope is given"
+    return problem or _burst_problem(before, record)
+
+
+def _burst_problem(before: FrameRecord | None, record: FrameRecord) -> str | None:
+    """Where bursts are not runs of shots of one device, each later than the one before; None if nowhere."""
+    burst = record.burst
+    if burst not in ((0,) if before is None else (before.burst, before.burst + 1)):
+        return f"burst {burst}; bursts have to be 0, 1, 2, ... in order"
+    if before is None:
+        return None
+    same = burst == before.burst
+    if record.shot == before.shot and not same:
+        return f"burst {burst}, but its shot {record.shot} is of burst {before.burst}"
+    if same and record.device != before.device:
+        return f"device {record.device}, but its burst {burst} is of device {before.device}"
+    if same and record.shot != before.shot and record.start_s <= before.start_s:
+        return f"start_s {record.start_s}; has to be later than the shot before in its burst"
+    return None
 
 
 def read_frame(dataset: Dataset, frame: FrameRecord | int, *, with_other_cameras: bool = True) -> DeviceFrame:

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, ValidationError
+from pydantic import Field, Strict, ValidationError
 
 from estimator.errors import InputError
 from estimator.io.camera import Camera
@@ -22,6 +22,7 @@ from estimator.io.records import (
     Row,
     Triple,
     first_problem,
+    small_row,
 )
 from estimator.io.sensor import Sensor
 from estimator.io.shared import SharedResults
@@ -33,7 +34,8 @@ MAX_SENSOR_AREAS = 16
 """Upper limit of the pixels in all regions of a frame, in sensor areas; regions may extend beyond the sensor."""
 
 
-class DecodedSpot(Row):
+@small_row
+class DecodedSpot:
     """Decoded identity: the LED that a demodulator reports near this pixel. The pixel is rough, not a centroid."""
 
     led: LedId
@@ -51,7 +53,8 @@ def decoding_problem(spots: Sequence[DecodedSpot], leds: Mapping[int, Led]) -> s
     return None
 
 
-class Identity(Row):
+@small_row
+class Identity:
     """What a receiver decoded of an LED image: the LED, None if none was accepted, and the image's centre.
 
     `correlation` is that of the image's lines with the decoded wave, `bits` the chips of one period as the lines show
@@ -61,8 +64,8 @@ class Identity(Row):
     led: LedId | None
     u_px: Number
     v_px: Number
-    correlation: float = Field(ge=-1.001, le=1.001)
-    bits: str | None = None
+    correlation: Annotated[float, Field(ge=-1.001, le=1.001), Strict()]
+    bits: Annotated[str, Strict()] | None = None
     position_m: Triple | None = None
 
 

@@ -1,9 +1,11 @@
 """Estimates of a variant on disk: estimates/VARIANT.parquet, one row a frame (datasets/FORMAT.md)."""
 
 import hashlib
-import io
 import re
-from collections.abc import Sequence
+import shutil
+import tempfile
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -12,9 +14,20 @@ import pyarrow.parquet as pq
 from pydantic import Field, Strict, model_validator
 
 from estimator.errors import InputError
-from estimator.io.atomic import write_atomically
+from estimator.io.atomic import whole_file
 from estimator.io.device import Identity
-from estimator.io.records import Covariance, LedId, Number, Row, Size, Triple, read_metadata, read_rows, small_row
+from estimator.io.records import (
+    ROWS_AT_ONCE,
+    Covariance,
+    FrameRow,
+    LedId,
+    Number,
+    Size,
+    Triple,
+    iter_frame_rows,
+    read_metadata,
+    small_row,
+)
 
 COLUMNS = {
     "frame": pa.int64(),
@@ -69,7 +82,7 @@ class FoundSpot:
     snr: Size | None
 
 
-class EstimateRow(Row):
+class EstimateRow(FrameRow):
     """Estimate of one frame: a world position in metres, or `failed` and a reason `stage: what went wrong`.
 
     `covariance_m2` is the covariance of the position, row by row, if the variant reports one. `identities` are the LED
@@ -77,7 +90,6 @@ class EstimateRow(Row):
     and identified, the same for every variant; None where they are not stated.
     """
 
-    frame: int = Field(ge=0)
     status: Literal["ok", "failed"]
     reason: str
     position_m: Triple | None
@@ -117,19 +129,46 @@ def frames_sha256(dataset: Path) -> str:
     return sha256_of(dataset / "frames.parquet")
 
 
-def write_estimates(folder: Path, variant: str, rows: Sequence[EstimateRow], digest: str | None = None) -> Path:
+def write_estimates(folder: Path, variant: str, rows: Iterable[EstimateRow], digest: str | None = None) -> Path:
     """Write a variant's rows, replacing an older file atomically; returns the path. Raises InputError, OSError.
 
     digest: `frames_sha256` of the dataset at the time its frames were read; of `folder` now if None.
     """
+    with estimates_file(folder, variant, digest or frames_sha256(folder)) as add:
+        add(rows)
+    return estimates_path(folder, variant)
+
+
+@contextmanager
+def estimates_file(folder: Path, variant: str, digest: str) -> Iterator[Callable[[Iterable[EstimateRow]], None]]:
+    """Function that adds rows to a variant's file, which replaces an older one after the block, if nothing is raised.
+
+    Not more than ROWS_AT_ONCE rows are in memory. digest: as of `write_estimates`. Raises InputError, OSError.
+    """
     path = estimates_path(folder, variant)
     path.parent.mkdir(exist_ok=True)
-    columns = [*COLUMNS.items(), *SPOT_COLUMNS.items()]
-    schema = pa.schema(columns, {FRAMES_SHA256: digest or frames_sha256(folder)})
-    buffer = io.BytesIO()
-    pq.write_table(pa.Table.from_pylist([row.model_dump() for row in rows], schema), buffer)
-    write_atomically(path, buffer.getvalue())
-    return path
+    schema = pa.schema([*COLUMNS.items(), *SPOT_COLUMNS.items()], {FRAMES_SHA256: digest})
+    waiting: list[dict[str, object]] = []
+    # The temporary file has no name: nothing is left where the process dies.
+    with tempfile.TemporaryFile(dir=path.parent) as unnamed:
+        with pq.ParquetWriter(unnamed, schema) as writer:
+
+            def write() -> None:
+                writer.write_table(pa.Table.from_pylist(waiting, schema))
+                waiting.clear()
+
+            def add(rows: Iterable[EstimateRow]) -> None:
+                for row in rows:
+                    waiting.append(row.model_dump())
+                    if len(waiting) == ROWS_AT_ONCE:
+                        write()
+
+            yield add
+            if waiting:
+                write()
+        unnamed.seek(0)
+        with whole_file(path) as file:
+            shutil.copyfileobj(unnamed, file)
 
 
 def read_estimates(path: Path, frame_count: int, digest: str | None = None) -> tuple[EstimateRow, ...]:
@@ -138,17 +177,22 @@ def read_estimates(path: Path, frame_count: int, digest: str | None = None) -> t
     digest: `frames_sha256` of the dataset, where estimates of another one are to be refused.
     """
     if digest is not None:
-        stated = read_metadata(path).get(FRAMES_SHA256)
-        if stated is None:
-            raise InputError(
-                f"{path}: does not say which frames it is of (no {FRAMES_SHA256}); run `estimator run` again"
-            )
-        if stated.lower() != digest:
-            raise InputError(
-                f"{path}: estimates of another dataset: {FRAMES_SHA256} is {stated[:12]}..., but frames.parquet has "
-                f"{digest[:12]}...; run `estimator run` again"
-            )
-    rows = read_rows(path, COLUMNS, EstimateRow, SPOT_COLUMNS)
-    if [row.frame for row in rows] != list(range(frame_count)):
-        raise InputError(f"{path}: {len(rows)} rows, needed one for each of the {frame_count} frames, in order")
-    return rows
+        check_digest(path, digest)
+    return tuple(iter_estimates(path, frame_count))
+
+
+def iter_estimates(path: Path, frame_count: int) -> Iterator[EstimateRow]:
+    """Rows of `read_estimates`, of which some are in memory at a time."""
+    return iter_frame_rows(path, COLUMNS, EstimateRow, frame_count, SPOT_COLUMNS)
+
+
+def check_digest(path: Path, digest: str) -> None:
+    """Raise InputError for estimates of another dataset than the one whose `frames_sha256` is `digest`."""
+    stated = read_metadata(path).get(FRAMES_SHA256)
+    if stated is None:
+        raise InputError(f"{path}: does not say which frames it is of (no {FRAMES_SHA256}); run `estimator run` again")
+    if stated.lower() != digest:
+        raise InputError(
+            f"{path}: estimates of another dataset: {FRAMES_SHA256} is {stated[:12]}..., but frames.parquet has "
+            f"{digest[:12]}...; run `estimator run` again"
+        )

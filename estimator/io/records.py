@@ -25,6 +25,12 @@ class Row(BaseModel):
     model_config = ConfigDict(strict=True, frozen=True, allow_inf_nan=False, extra="ignore")
 
 
+class FrameRow(Row):
+    """Row of a table with a row for each frame."""
+
+    frame: int = Field(ge=0)
+
+
 class Entry(Row):
     """Record of dataset.json: it has exactly its own keys, for a reader must not skip what changes the meaning."""
 
@@ -112,7 +118,10 @@ Covariance = Annotated[
 UNION_TAGS = ("disc", "square", "code", "tone", "packet")
 
 RowT = TypeVar("RowT", bound=Row)
+FrameRowT = TypeVar("FrameRowT", bound=FrameRow)
 ROWS_AT_ONCE = 256
+BUFFER_BYTES = 2**16
+"""Bytes of a column that are read of a Parquet file at once."""
 
 
 def first_problem(error: ValidationError) -> str:
@@ -153,24 +162,58 @@ def read_rows(
     row: type[RowT],
     optional: Mapping[str, pa.DataType] = MappingProxyType({}),
 ) -> tuple[RowT, ...]:
-    """Read the named columns of a Parquet file as rows of a model, the optional ones if there; others are ignored.
+    """Rows of `iter_rows`, all in memory."""
+    return tuple(iter_rows(path, columns, row, optional))
 
-    Raises InputError if the file is missing or damaged, a column is missing or of another type, or a value is not
-    allowed.
+
+def iter_rows(
+    path: Path,
+    columns: Mapping[str, pa.DataType],
+    row: type[RowT],
+    optional: Mapping[str, pa.DataType] = MappingProxyType({}),
+) -> Iterator[RowT]:
+    """Rows of a model from the named columns of a Parquet file, the optional ones if there; others are ignored.
+
+    Not more than ROWS_AT_ONCE are in memory. Raises InputError if the file is missing or damaged, a column is missing
+    or of another type, or a value is not allowed.
     """
     with _parquet(path) as file:
         there = {name: kind for name, kind in optional.items() if name in file.schema_arrow.names}
         _check_columns(path, file.schema_arrow, {**columns, **there})
         whole = [name for name, kind in {**columns, **there}.items() if pa.types.is_integer(kind)]
-        rows: list[RowT] = []
-        # Some rows at a time: as dictionaries they take many times their memory.
+        number = 0
         for batch in file.iter_batches(ROWS_AT_ONCE, columns=[*columns, *there]):
             for record in batch.to_pylist():
                 try:
-                    rows.append(row.model_validate(_with_integers(record, whole)))
+                    validated = row.model_validate(_with_integers(record, whole))
                 except ValidationError as error:
-                    raise InputError(f"{path}: row {len(rows)}.{first_problem(error)}") from None
-    return tuple(rows)
+                    raise InputError(f"{path}: row {number}.{first_problem(error)}") from None
+                yield validated
+                number += 1
+
+
+def iter_frame_rows(
+    path: Path,
+    columns: Mapping[str, pa.DataType],
+    row: type[FrameRowT],
+    frame_count: int,
+    optional: Mapping[str, pa.DataType] = MappingProxyType({}),
+) -> Iterator[FrameRowT]:
+    """Rows of `iter_rows`; also raises InputError if there is not one for each frame, in order."""
+    rows = row_count(path)
+    refusal = InputError(f"{path}: {rows} rows, needed one for each of the {frame_count} frames, in order")
+    if rows != frame_count:
+        raise refusal
+    for number, one in enumerate(iter_rows(path, columns, row, optional)):
+        if one.frame != number:
+            raise refusal
+        yield one
+
+
+def row_count(path: Path) -> int:
+    """Number of rows of a Parquet file. Raises InputError if the file is missing or damaged."""
+    with _parquet(path) as file:
+        return int(file.metadata.num_rows)
 
 
 def read_metadata(path: Path) -> dict[str, str]:
@@ -204,7 +247,8 @@ def _is_scalar(kind: pa.DataType) -> bool:
 def _parquet(path: Path) -> Iterator[pq.ParquetFile]:
     """An open Parquet file; what fails while it is open becomes an InputError."""
     try:
-        with pq.ParquetFile(path) as file:
+        # By default, the bytes of all row groups stay in memory as long as the file is open.
+        with pq.ParquetFile(path, pre_buffer=False, buffer_size=BUFFER_BYTES) as file:
             yield file
     except InputError:
         raise

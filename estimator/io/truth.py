@@ -1,5 +1,6 @@
 """True positions of the frames and LEDs. Scores and tables alone import this module, which opens the truth's files."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
@@ -11,10 +12,12 @@ from estimator.io.led_map import LedSize
 from estimator.io.records import (
     Covariance,
     FlatRotation,
+    FrameRow,
     LedId,
     Number,
     Row,
     Triple,
+    iter_frame_rows,
     read_rows,
     read_scalars,
     small_row,
@@ -66,7 +69,7 @@ class TrueLed:
     bits: Annotated[str, Strict()] | None
 
 
-class TruthRow(Row):
+class TruthRow(FrameRow):
     """True position of a frame's camera, world metres, its building, its LEDs, and its bounds if the dataset has them.
 
     `bound_m2` is a covariance, row by row: no unbiased estimator has a smaller one. It counts what the device does not
@@ -74,7 +77,6 @@ class TruthRow(Row):
     building as built that the device is in.
     """
 
-    frame: int = Field(ge=0)
     position_m: Triple
     bound_m2: Covariance | None
     bound_exact_m2: Covariance | None
@@ -107,10 +109,12 @@ def read_true_map(path: Path) -> tuple[TrueMapLed, ...]:
 
 def read_truth(path: Path, frame_count: int) -> tuple[TruthRow, ...]:
     """Read truth.parquet; raises InputError if it is missing or damaged, or has not one row a frame, in order."""
-    rows = read_rows(path, COLUMNS, TruthRow)
-    if [row.frame for row in rows] != list(range(frame_count)):
-        raise InputError(f"{path}: {len(rows)} rows, needed one for each of the {frame_count} frames, in order")
-    return rows
+    return tuple(iter_truth(path, frame_count))
+
+
+def iter_truth(path: Path, frame_count: int) -> Iterator[TruthRow]:
+    """Rows of `read_truth`, of which some are in memory at a time."""
+    return iter_frame_rows(path, COLUMNS, TruthRow, frame_count)
 
 
 SWEPT = "sweep_"

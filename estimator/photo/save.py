@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -72,7 +73,7 @@ def save(folder: Path, name: str, frames: Sequence[DeviceFrame], provenance: dic
                 "exposure_s": frame.exposure_s,
                 "capturable": True,
                 "accelerometer_m_s2": frame.accelerometer_m_s2,
-                "spots": [spot.model_dump() for spot in frame.spots],
+                "spots": [asdict(spot) for spot in frame.spots],
                 "device": 0,
                 "burst": number,
                 "start_s": 0.0,

@@ -10,7 +10,8 @@ from markupsafe import Markup
 
 from estimator.camera.projection import projection_of
 from estimator.errors import InputError
-from estimator.evaluate.score import Scores, VariantScore, estimate_paths
+from estimator.evaluate.known import estimate_paths
+from estimator.evaluate.score import Scores, VariantScore
 from estimator.io.camera import Camera
 from estimator.io.dataset import Dataset
 from estimator.io.estimates import EstimateRow, read_estimates
