@@ -1,5 +1,7 @@
 """Upright two-point pose: exact for exact points, and in agreement with other methods."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -11,7 +13,9 @@ import estimator.methods.up2p
 from estimator.camera.leveling import level, tilt_from_gravity
 from estimator.camera.pose import rotation
 from estimator.errors import EstimationFailure
+from estimator.methods.gravity_fit import agreement, judged_by
 from estimator.methods.pnp import position_from_pixels
+from estimator.methods.up2p import _judged as judged
 from estimator.methods.up2p import fit_correspondences, pair_poses, upright_pose
 from estimator.solvers.observations import observe
 from estimator.solvers.ranging import law_of_sines, led_ranges
@@ -95,3 +99,29 @@ def test_the_first_of_the_poses_by_two_spots_ignores_how_far_outliers_are() -> N
     offsets[[0, 1, 3, 4]] = [[300.0, 0.0], [300.0, 20.0], [290.0, 0.0], [300.0, -20.0]]
     first = pair_poses(observed(offsets, np.full(9, 0.02)))[0]
     np.testing.assert_allclose(first.position_m, VIEW.position_m, atol=1e-6)
+
+
+def test_gravity_counts_beside_errors_that_the_residuals_reveal() -> None:
+    """Nine spots of a device that states no errors, displaced by 3 px, as by LEDs that are 3 mm off the map. They leave
+    2 * 9 - 6 degrees of freedom to the size of their errors, and determine the tilt to about a degree; the accelerometer
+    reads it to 0.05 deg. So the estimate is that of `gravity-fit`, of the same minimum but for the tolerance of
+    the search, a ten-thousandth of the standard deviations.
+    """
+    offsets = 3.0 * np.random.default_rng(13).standard_normal((9, 2))
+    seen = observed(offsets, np.full(9, 0.02), 0.05)
+    found, expected = judged(seen).estimate, judged_by(agreement(seen)).estimate
+    assert expected.covariance_m2 is not None
+    assert found.covariance_m2 is not None
+    sigma_m = np.sqrt(np.trace(expected.covariance_m2))
+    np.testing.assert_allclose(found.position_m, expected.position_m, atol=1e-4 * sigma_m)
+    np.testing.assert_allclose(found.covariance_m2, expected.covariance_m2, rtol=1e-3, atol=1e-3 * sigma_m**2)
+
+
+def test_gravity_that_contradicts_displaced_spots_does_not_count() -> None:
+    """The same spots; a reading off by 5 deg, said to be good to 0.05 deg, does not change the estimate at all: the
+    other one is off by as much to the other side.
+    """
+    offsets = 3.0 * np.random.default_rng(13).standard_normal((9, 2))
+    seen = observed(offsets, np.full(9, 0.02), 0.05)
+    poses = [judged(replace(seen, tilt_rad=seen.tilt_rad + np.radians([wrong, 0.0]))).estimate.position_m for wrong in (5, -5)]
+    np.testing.assert_allclose(*poses, atol=1e-6)

@@ -5,13 +5,15 @@ PoseLib's Python interface has the solver alone. The solver assumes gravity to b
 displaces the other spots under the pose of a pair; the gate at which pairs are ranked includes that displacement. The
 refinement then fits position and orientation to the spots that agree, without gravity. If these do not determine the
 orientation (fewer than four, or on one line), or the device states errors of camera or map, beside which gravity
-counts, gravity is used as a prior.
+counts, gravity is used as a prior. The same holds where the residuals reveal errors that the device does not state,
+as of a wrong map, unless the spots are likelier without gravity.
 
 With a rolling shutter the pairs are solved with the turns undone that the gyroscope says, and the refinement fits the
 velocity with the pose, as `gravity-fit` does, with gravity as a prior.
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from itertools import combinations
 
 import numpy as np
@@ -25,7 +27,7 @@ from estimator.methods.camera_statement import Judged, over_frames
 from estimator.methods.centroid_sigma import with_centroid_sigma
 from estimator.methods.variant import Estimate, Needs, Variant
 from estimator.solvers.observations import Observations, observe, observe_once
-from estimator.solvers.robust_fit import consensus
+from estimator.solvers.robust_fit import Consensus, consensus, likeliest
 from estimator.solvers.trilateration import determine_orientation
 from estimator.spots.correspondences import find_correspondences
 from estimator.spots.identify import Correspondence
@@ -84,9 +86,17 @@ def _check_gravity(frame: DeviceFrame) -> None:
 
 def _judged(observations: Observations) -> Judged:
     starts = pair_poses(observations)
+
+    def agreement(seen: Observations) -> Consensus:
+        return consensus(seen, starts[:1], lambda: [*starts[1:], *upright_pairs(observations)])
+
     if determine_orientation(observations.leds_m) and not observations.displaced:
-        observations = observations.without_gravity()
-    agreed = consensus(observations, starts[:1], lambda: [*starts[1:], *upright_pairs(observations)])
+        agreed = agreement(observations.without_gravity())
+        if agreed.adapted:
+            with suppress(EstimationFailure):
+                agreed = likeliest([agreed, agreement(observations)], observations)
+    else:
+        agreed = agreement(observations)
     estimate = Estimate(agreed.best.pose.position_m, covariance_m2=agreed.covariance_m2)
     return Judged(estimate, agreed.contradicted, agreed.doubt_m2)
 

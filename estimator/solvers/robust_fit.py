@@ -154,11 +154,16 @@ def _consensus(
         found += _explanations(observations.without_gravity(), rough, sizes=(False,))
     if not found:
         raise EstimationFailure("position", "no pose explains gravity and most of the spots")
-    best = min(found, key=lambda one: (_contradicts_camera(one, observations), _score(one, observations)))
+    best = likeliest(found, observations)
     fits = minima(best.of_inliers(), [best.best.pose, *starts])
     if fits:
         best = replace(best, best=fits[0], others=fits[1:])
     return _with_doubt(best, observations)
+
+
+def likeliest(found: Sequence[Consensus], observations: Observations) -> Consensus:
+    """The most likely of explanations of all spots and gravity; see the module."""
+    return min(found, key=lambda one: (_contradicts_camera(one, observations), _score(one, observations)))
 
 
 def _with_doubt(agreed: Consensus, observations: Observations) -> Consensus:
