@@ -12,8 +12,9 @@ from estimator.camera.pose import Pose, rotation
 from estimator.errors import EstimationFailure
 from estimator.methods.gravity_fit import _from_triples as from_triples
 from estimator.methods.gravity_fit import agreement, ambiguous
-from estimator.solvers import robust_fit
+from estimator.solvers import data_snooping, robust_fit
 from estimator.solvers.chi_square import chi2_limit
+from estimator.solvers.data_snooping import snooped
 from estimator.solvers.local_minima import minima
 from estimator.solvers.observations import Observations, observe
 from estimator.solvers.reprojection import Fit
@@ -21,7 +22,6 @@ from estimator.solvers.robust_fit import Consensus, consensus
 from estimator.solvers.robust_fit import _explains_all as explains_all
 from estimator.solvers.robust_fit import _plausible as plausible
 from estimator.solvers.robust_fit import _score as score
-from estimator.solvers.robust_fit import _snooped as data_snooping
 
 LEDS = grid(3, 3, 0.3, (3, 2, 3.0))
 VIEW = view_of((3, 2, 3.0), 2.8, 25, -15, 40, (4000, 3000, 3000.0))
@@ -136,9 +136,19 @@ def test_data_snooping_leaves_out_the_spot_that_is_off() -> None:
     """From all nine spots, of 0.2 px, and one of them off by 4 px, which pulls the fit."""
     offsets = np.zeros((9, 2))
     offsets[4] = (2.4, -3.2)
-    found = data_snooping(observed(offsets, np.full(9, 0.2)), TRUTH, np.ones(9, dtype=bool), adapted=False)
+    found = snooped(observed(offsets, np.full(9, 0.2)), TRUTH, np.ones(9, dtype=bool), adapted=False)
     assert found is not None
     assert np.flatnonzero(~found[2]).tolist() == [4]
+
+
+def test_a_spot_that_was_left_out_returns_if_it_passes() -> None:
+    """Three of nine spots, of 0.2 px, are not there to begin with; the one of them that is off by 4 px stays out."""
+    offsets, begun = np.zeros((9, 2)), ~np.isin(np.arange(9), [1, 4, 8])
+    offsets[4] = (2.4, -3.2)
+    found = snooped(observed(offsets, np.full(9, 0.2)), TRUTH, begun, adapted=False)
+    assert found is not None
+    assert np.flatnonzero(~found[2]).tolist() == [4]
+    assert len(found[1].spots_chi2) == 8
 
 
 @pytest.mark.parametrize(("share", "expected"), [(0.99, True), (1.01, False)])
@@ -276,7 +286,7 @@ def test_a_size_of_errors_that_no_fit_settles_leaves_the_other_explanations(monk
     def unsettled(*_: object) -> None:
         raise EstimationFailure("position", "the covariance of the spots is not positive definite")
 
-    monkeypatch.setattr(robust_fit, "_settled", unsettled)
+    monkeypatch.setattr(data_snooping, "_settled", unsettled)
     monkeypatch.setattr(robust_fit, "MIN_SURE_INLIERS", 99)  # so that every explanation is tried
     monkeypatch.setattr(robust_fit, "MIN_SURE_SHARE", 99.0)
     found = agreed(observed(np.vstack([np.zeros((8, 2)), [[30.0, 0.0]]]), np.full(9, 0.02)))
@@ -286,6 +296,6 @@ def test_a_size_of_errors_that_no_fit_settles_leaves_the_other_explanations(monk
 def test_a_fit_explains_gravity_up_to_the_limit_itself() -> None:
     """As with spots, whose limit belongs to what is explained."""
     seen = observed(np.zeros((9, 2)), np.ones(9))
-    limit = chi2_limit(robust_fit.OUTLIER_PROBABILITY, 2)
+    limit = chi2_limit(data_snooping.OUTLIER_PROBABILITY, 2)
     assert explains_all(fitted(limit, np.zeros(9), limit), seen)
     assert not explains_all(fitted(limit, np.zeros(9), float(np.nextafter(limit, np.inf))), seen)

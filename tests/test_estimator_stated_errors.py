@@ -15,6 +15,7 @@ from estimator.io.device import Accelerometer, DeviceFrame
 from estimator.io.led_map import DiscLed, Luminaire
 from estimator.methods import gravity_fit, pnp, up2p
 from estimator.methods.variant import Estimate
+from estimator.solvers.data_snooping import snooped
 from estimator.solvers.observations import observe
 from estimator.solvers.ordinary_covariance import ordinary_covariance
 from estimator.spots.identify import Correspondence
@@ -151,6 +152,21 @@ def test_wrong_identities_are_left_out(name: str) -> None:
         expected, found = FITS[name](one.frame, without), FITS[name](one.frame, spots)
         np.testing.assert_allclose(found.position_m, expected.position_m, atol=1e-6)
         np.testing.assert_allclose(found.covariance_m2, expected.covariance_m2, rtol=1e-3)  # type: ignore[arg-type]
+
+
+def test_right_spots_that_were_left_out_with_wrong_ones_return() -> None:
+    """Two LEDs of two luminaires exchanged; data snooping begins without them and a right spot of each luminaire. The
+    errors of the map move spots by 17 px, those of an LED in its luminaire by 2 px; LEDs are 700 px apart.
+    """
+    for k in range(4):
+        one = told(np.random.default_rng([12, k]))
+        spots = list(one.spots)
+        spots[3], spots[14] = replace(spots[3], led=one.spots[14].led), replace(spots[14], led=one.spots[3].led)
+        start, wrong = Pose(np.array(VIEW.position_m), VIEW.R_cam_world), np.isin(np.arange(18), [3, 14])
+        begun = ~wrong & ~np.isin(np.arange(18), [0, 10])
+        found = snooped(observe(one.frame, spots), start, begun, adapted=False)
+        assert found is not None
+        np.testing.assert_array_equal(found[2], ~wrong)
 
 
 @pytest.mark.slow

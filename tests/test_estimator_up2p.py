@@ -1,19 +1,23 @@
 """Upright two-point pose: exact for exact points, and in agreement with other methods."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 from estimator_correspondences import device, simulated
 from estimator_synthetic import Array, View, grid, view_of
-from test_estimator_robust_fit import VIEW, observed
+from test_estimator_robust_fit import LEDS, VIEW, observed
 
 import estimator.methods.up2p
 from estimator.camera.leveling import level, tilt_from_gravity
 from estimator.camera.pose import rotation
 from estimator.errors import EstimationFailure
+from estimator.methods.gravity_fit import agreement, judged_by
 from estimator.methods.pnp import position_from_pixels
+from estimator.methods.up2p import _judged as judged
 from estimator.methods.up2p import fit_correspondences, pair_poses, upright_pose
-from estimator.solvers.observations import observe
+from estimator.solvers.observations import Observations, observe
 from estimator.solvers.ranging import law_of_sines, led_ranges
 from estimator.solvers.trilateration import position_from_ranges
 
@@ -95,3 +99,47 @@ def test_the_first_of_the_poses_by_two_spots_ignores_how_far_outliers_are() -> N
     offsets[[0, 1, 3, 4]] = [[300.0, 0.0], [300.0, 20.0], [290.0, 0.0], [300.0, -20.0]]
     first = pair_poses(observed(offsets, np.full(9, 0.02)))[0]
     np.testing.assert_allclose(first.position_m, VIEW.position_m, atol=1e-6)
+
+
+def displaced() -> Observations:
+    """Nine spots that state 0.02 px and are 3 px off, and gravity to 0.05 deg."""
+    return observed(3.0 * np.random.default_rng(13).standard_normal((9, 2)), np.full(9, 0.02), 0.05)
+
+
+def test_gravity_counts_beside_errors_that_the_residuals_reveal() -> None:
+    """Nine spots of a device that states no errors, displaced by 3 px, as by LEDs that are 3 mm off the map. They leave
+    2 * 9 - 6 degrees of freedom to the size of their errors, and determine the tilt to 0.6 deg; the accelerometer reads
+    it to 0.05 deg. So the estimate is that of `gravity-fit`, of the same minimum but for the tolerance of the search, a
+    ten-thousandth of the standard deviations.
+    """
+    seen = displaced()
+    found, expected = judged(seen).estimate, judged_by(agreement(seen)).estimate
+    assert expected.covariance_m2 is not None
+    assert found.covariance_m2 is not None
+    sigma_m = np.sqrt(np.trace(expected.covariance_m2))
+    np.testing.assert_allclose(found.position_m, expected.position_m, atol=1e-4 * sigma_m)
+    np.testing.assert_allclose(found.covariance_m2, expected.covariance_m2, rtol=1e-3, atol=1e-3 * sigma_m**2)
+
+
+def test_gravity_that_contradicts_displaced_spots_does_not_count() -> None:
+    """The same spots; readings off by 10 deg to either side, said to be good to 0.05 deg, 16 standard deviations of
+    the tilt by the spots, give one and the same estimate: that of the spots alone.
+    """
+    seen = displaced()
+    wrong = [replace(seen, tilt_rad=seen.tilt_rad + np.radians([off_deg, 0.0])) for off_deg in (10.0, -10.0)]
+    one_m, other_m = (judged(reading).estimate.position_m for reading in wrong)
+    np.testing.assert_allclose(one_m, other_m, atol=1e-6)
+
+
+def test_gravity_does_not_count_beside_a_camera_as_sold() -> None:
+    """Five spots and a focal length that is stated as exact and 1 % wrong, which they contradict: other readings of
+    gravity, within its error, change nothing.
+    """
+    from_centre = VIEW.project(LEDS) - np.array([2000.0, 1500.0])
+    for seed in range(4):
+        noise = 0.02 * np.random.default_rng(seed).standard_normal((9, 2))
+        seen = observed(0.01 * from_centre + noise, np.full(9, 0.02), 0.05).only(np.arange(9) % 2 == 0)
+        readings = [replace(seen, tilt_rad=seen.tilt_rad + np.radians([off_deg, 0.0])) for off_deg in (0.03, -0.03)]
+        one, other = map(judged, readings)
+        assert one.contradicts
+        np.testing.assert_allclose(one.estimate.position_m, other.estimate.position_m, atol=1e-6)

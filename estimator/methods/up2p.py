@@ -5,27 +5,32 @@ PoseLib's Python interface has the solver alone. The solver assumes gravity to b
 displaces the other spots under the pose of a pair; the gate at which pairs are ranked includes that displacement. The
 refinement then fits position and orientation to the spots that agree, without gravity. If these do not determine the
 orientation (fewer than four, or on one line), or the device states errors of camera or map, beside which gravity
-counts, gravity is used as a prior.
+counts, gravity is used as a prior. The same holds where the residuals reveal errors that no camera explains, as of a
+wrong map, unless gravity contradicts the spots.
 
 With a rolling shutter the pairs are solved with the turns undone that the gyroscope says, and the refinement fits the
 velocity with the pose, as `gravity-fit` does, with gravity as a prior.
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimator.camera.leveling import MIN_ELEVATION_SINE
-from estimator.camera.pose import Pose, rotation
+from estimator.camera.pose import POSE_PARAMETERS, Pose, rotation
 from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame
 from estimator.methods.camera_statement import Judged, over_frames
 from estimator.methods.centroid_sigma import with_centroid_sigma
 from estimator.methods.variant import Estimate, Needs, Variant
+from estimator.solvers.chi_square import pair_limit
+from estimator.solvers.local_minima import minima
 from estimator.solvers.observations import Observations, observe, observe_once
-from estimator.solvers.robust_fit import consensus
+from estimator.solvers.robust_fit import Consensus, consensus
 from estimator.solvers.trilateration import determine_orientation
 from estimator.spots.correspondences import find_correspondences
 from estimator.spots.identify import Correspondence
@@ -43,6 +48,8 @@ MAX_PAIRS = 120
 GATE_SIGMA = 3.0
 GATE_PX = 3.0
 MAX_PAIR_STARTS = 3
+# Probability that spots alone contradict a true reading of gravity; its loss costs little.
+GRAVITY_PROBABILITY = 1e-3
 # World axes to PoseLib's, whose vertical axis is y.
 Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
@@ -84,11 +91,30 @@ def _check_gravity(frame: DeviceFrame) -> None:
 
 def _judged(observations: Observations) -> Judged:
     starts = pair_poses(observations)
+
+    def agreement(seen: Observations) -> Consensus:
+        return consensus(seen, starts[:1], lambda: [*starts[1:], *upright_pairs(observations)])
+
     if determine_orientation(observations.leds_m) and not observations.displaced:
-        observations = observations.without_gravity()
-    agreed = consensus(observations, starts[:1], lambda: [*starts[1:], *upright_pairs(observations)])
+        agreed = agreement(observations.without_gravity())
+        if agreed.adapted and not agreed.contradicted and _agrees_with_gravity(agreed, observations, starts[:1]):
+            with suppress(EstimationFailure):
+                agreed = agreement(observations)
+    else:
+        agreed = agreement(observations)
     estimate = Estimate(agreed.best.pose.position_m, covariance_m2=agreed.covariance_m2)
     return Judged(estimate, agreed.contradicted, agreed.doubt_m2)
+
+
+def _agrees_with_gravity(alone: Consensus, observations: Observations, starts: Sequence[Pose]) -> bool:
+    """Whether gravity agrees with a consensus of spots alone, whose errors are of a size by the residuals.
+
+    The test is Fisher's: of the increase of chi-square by the two tilts, against the size's degrees of freedom.
+    """
+    beside = replace(alone.of_inliers(), tilt_sigma_rad=observations.tilt_sigma_rad)
+    fits = minima(beside, [alone.best.pose, *starts])
+    freedom = max(2 * int(alone.inliers.sum()) - POSE_PARAMETERS, 1)
+    return bool(fits) and fits[0].chi2 - alone.best.chi2 <= pair_limit(GRAVITY_PROBABILITY, freedom)
 
 
 def pair_poses(observations: Observations) -> list[Pose]:

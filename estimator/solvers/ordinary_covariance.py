@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from estimator.camera.pose import Pose
 from estimator.solvers import second_order
 from estimator.solvers.chi_square import chi2_limit
+from estimator.solvers.data_snooping import OUTLIER_PROBABILITY
 from estimator.solvers.observations import Observations, centroid_images, pose_slopes, pose_vector
-from estimator.solvers.robust_fit import OUTLIER_PROBABILITY
 
 Floats = NDArray[np.float64]
 

@@ -1,9 +1,8 @@
 """Robust fit: the pose that explains gravity and the spots, which spots it leaves out, and how large the errors are.
 
-Data snooping (Baarda 1968) finds outliers: each spot's displacement from where the other observations put it is tested
-against its own covariance, and the worst spots are left out until none is beyond OUTLIER_PROBABILITY. Where all spots
-pass with the errors that the device states, that fit is the result. Otherwise several explanations compete, each fitted
-to the spots that it leaves in, from poses that put most spots about right:
+Data snooping finds outliers (`estimator.solvers.data_snooping`). Where all spots pass with the errors that the device
+states, that fit is the result. Otherwise several explanations compete, each fitted to the spots that it leaves in, from
+poses that put most spots about right:
 
 - errors as stated, and outliers;
 - stated errors of camera, map and gravity that are larger or smaller by a common factor, estimated from the residuals;
@@ -27,33 +26,29 @@ from estimator.camera.pose import Pose
 from estimator.camera.projection import projection_of
 from estimator.errors import EstimationFailure
 from estimator.solvers.camera_check import camera_errors, contradicts_camera
-from estimator.solvers.chi_square import chi2_limit, pair_limit
+from estimator.solvers.chi_square import chi2_limit
+from estimator.solvers.data_snooping import (
+    MODEL_ERROR_PX,
+    OUTLIER_PROBABILITY,
+    START_GATE,
+    degrees_of_freedom,
+    distances_px,
+    enough,
+    gates_px,
+    passing,
+    scalable,
+    snooped,
+    uses_gravity,
+)
 from estimator.solvers.local_minima import minima
-from estimator.solvers.observations import Observations, centroid_images, corrected_for_eccentricity
+from estimator.solvers.observations import Observations, corrected_for_eccentricity
 from estimator.solvers.reprojection import Fit, fit
 
 Floats = NDArray[np.float64]
 
-# Probability that a true spot's chi-square exceeds the limit: one spot in a million.
-OUTLIER_PROBABILITY = 1e-6
-# Upper limit of centroid errors that the image model leaves out: an edge of the background behind an LED, a lens that
-# bends the image of an LED. A spot is an outlier only beyond this and its noise.
-MODEL_ERROR_PX = 0.1
-# With fewer spots, an outlier cannot be told from the inliers.
+# With fewer spots there is no pose.
 MIN_SPOTS = 3
-MIN_INLIERS = 4
 MAX_ROBUST_STARTS = 3
-# Standard deviations about a rough pose within which spots take part in data snooping.
-START_GATE = 5.0
-# Median of chi-square with two degrees of freedom.
-CHI2_MEDIAN = 2 * np.log(2)
-# Spots beyond the limit that are excluded together have at least this share of the largest chi-square: a wrong spot
-# pulls the fit, and with it the residuals of true spots.
-MIN_EXCLUDED_SHARE = 0.5
-# Repetitions that estimate the size of errors, by the median of spots with outliers and by all spots without, and the
-# largest change of its square in one.
-ROBUST_ROUNDS = MOMENT_ROUNDS = 3
-MAX_RATIO = 100.0
 # Share of the image's width within which an outlier may lie anywhere: as far as a decoded pixel may be from a spot.
 OUTLIER_RADIUS = 0.01
 # Inliers, and their share, from which on a pose that they agree on is no chance: ten degrees of freedom.
@@ -142,7 +137,7 @@ def _consensus(
         raise EstimationFailure("position", f"LEDs identified: {len(everything)}, needed: {MIN_SPOTS}")
     fits = minima(observations, starts)
     if fits and _explains_all(fits[0], observations):
-        agreed = Consensus(fits[0], fits[1:], everything, _uses_gravity(observations))
+        agreed = Consensus(fits[0], fits[1:], everything, uses_gravity(observations))
         if _plausible(agreed, observations):
             return _with_doubt(agreed, observations)
         rough = [one.pose for one in fits]
@@ -211,7 +206,7 @@ def _explanations(
 
 def _plausible(agreed: Consensus, observations: Observations) -> bool:
     """Whether chi-square of inliers and gravity is as the errors say, and the spots do not contradict the camera."""
-    best, freedom = agreed.best, max(_freedom(observations.only(agreed.inliers)), 1)
+    best, freedom = agreed.best, max(degrees_of_freedom(observations.only(agreed.inliers)), 1)
     if best.tilt_chi2 > chi2_limit(OUTLIER_PROBABILITY, 2) or best.chi2 > chi2_limit(OUTLIER_PROBABILITY, freedom):
         return False
     return not _contradicts_camera(agreed, observations)
@@ -221,10 +216,6 @@ def _contradicts_camera(agreed: Consensus, observations: Observations) -> bool:
     """Whether the inliers contradict a camera that is taken as exact."""
     model = observations if agreed.model is None else agreed.model
     return contradicts_camera(model if agreed.inliers.all() else model.only(agreed.inliers), agreed.best)
-
-
-def _enough(inliers: NDArray[np.bool_]) -> bool:
-    return bool(inliers.sum() >= MIN_INLIERS and 2 * inliers.sum() > len(inliers))
 
 
 def _snooped_consensus(
@@ -237,23 +228,23 @@ def _snooped_consensus(
     for pose, distance_px in ranked[:MAX_ROBUST_STARTS]:
         spread_px = _spread_px(distance_px)
         near = distance_px <= START_GATE * spread_px
-        within = near | (distance_px <= _gate_px(observations, pose))
-        if adapted and not _enough(within):
+        within = near | (distance_px <= gates_px(observations, pose))
+        if adapted and not enough(within):
             # No majority agrees to the best ones' errors: all spots have errors of one size.
             within = np.isfinite(distance_px)
             spread_px = float(np.sqrt((distance_px[within] ** 2).mean() / 2))
         trial = observations
-        if adapted and not _scalable(observations):
+        if adapted and not scalable(observations):
             trial = replace(observations, added_sigma_px=spread_px)
         # Wrong identities within the errors stated may be too many for data snooping; the nearest spots have fewer.
-        found = _snooped(trial, pose, within, adapted)
+        found = snooped(trial, pose, within, adapted)
         if found is None and (near != within).any():
-            found = _snooped(trial, pose, near, adapted)
+            found = snooped(trial, pose, near, adapted)
         if found is not None:
             model, best, inliers = found
             if adapted and not _credible(model):
                 continue
-            return Consensus(best, (), inliers, _uses_gravity(observations), model, adapted)
+            return Consensus(best, (), inliers, uses_gravity(observations), model, adapted)
     return None
 
 
@@ -271,7 +262,7 @@ def _ranked(observations: Observations, poses: Sequence[Pose]) -> list[tuple[Pos
     half = len(observations.leds_m) // 2 + 1
 
     def judged(pose: Pose, velocity: Floats | None = None) -> tuple[float, Pose, Floats]:
-        distance_px = _distance_px(observations, pose, velocity)
+        distance_px = distances_px(observations, pose, velocity)
         return float((np.sort(distance_px)[:half] ** 2).sum()), pose, distance_px
 
     ranked = sorted((judged(pose) for pose in poses), key=lambda one: one[0])
@@ -291,105 +282,10 @@ def _ranked(observations: Observations, poses: Sequence[Pose]) -> list[tuple[Pos
     return [(pose, distance_px) for cost, pose, distance_px in both if np.isfinite(cost)]
 
 
-def _distance_px(observations: Observations, pose: Pose, velocity: Floats | None) -> Floats:
-    image, depth_m = observations.images(pose, velocity)
-    offset = np.linalg.solve(observations.from_pixels, (observations.image - image)[:, :, None])[:, :, 0]
-    return np.asarray(np.where(depth_m > 0, np.linalg.norm(offset, axis=1), np.inf))
-
-
 def _spread_px(distance_px: Floats) -> float:
     """Standard deviation of a coordinate, from the median of distances in the plane; at least MODEL_ERROR_PX."""
     median = float(np.sort(distance_px)[len(distance_px) // 2])
     return max(median / float(np.sqrt(2 * np.log(2))), MODEL_ERROR_PX)
-
-
-def _gate_px(observations: Observations, pose: Pose) -> Floats:
-    """Distances (n,) that errors as stated explain, with an upright pose: START_GATE standard deviations, pixels."""
-    count = len(observations.leds_m)
-    blocks = observations.total_covariance(pose).reshape(count, 2, count, 2)[np.arange(count), :, np.arange(count)]
-    of_tilt = observations.tilt_sigma_rad.max() if _uses_gravity(observations) else 0.0
-    variance = np.trace(blocks, axis1=1, axis2=2) + of_tilt**2
-    return np.asarray(START_GATE * np.sqrt(variance) / observations.camera.pixel_angle_rad)
-
-
-def _scalable(observations: Observations) -> bool:
-    """Whether the map's errors are stated, so that a common factor can explain larger residuals."""
-    return any(parameter.group == "map" for parameter in observations.uncertainty.parameters)
-
-
-def _snooped(
-    observations: Observations, pose: Pose, inliers: NDArray[np.bool_], adapted: bool
-) -> tuple[Observations, Fit, NDArray[np.bool_]] | None:
-    """Data snooping from a pose and the spots to begin with; the observations returned have the size of errors."""
-    model, rounds = observations, ROBUST_ROUNDS if adapted else 0
-    while _enough(inliers):
-        chosen = model.only(inliers)
-        try:
-            for _ in range(rounds):
-                found = fit(chosen, pose)
-                model = _with_errors(model, float(np.median(found.outlier_chi2())) / CHI2_MEDIAN)
-                chosen, pose = model.only(inliers), found.pose
-            found = fit(chosen, pose)
-        except EstimationFailure:
-            return None
-        pose, rounds = found.pose, min(rounds, 1)
-        depth_m = centroid_images(pose, chosen.leds_m, chosen.lift_m2)[1]
-        if not (pose.position_m[2] < chosen.leds_m[:, 2].min() and 2 * (depth_m > 0).sum() > len(depth_m)):
-            return None
-        passes = _passes(found, chosen, adapted)
-        if 2 * passes.sum() < len(passes):
-            return None
-        if not passes.all():
-            displaced = np.where(passes, 0.0, found.outlier_chi2(_model_error(chosen)))
-            inliers = inliers.copy()
-            inliers[np.flatnonzero(inliers)[displaced >= MIN_EXCLUDED_SHARE * displaced.max()]] = False
-            continue
-        if adapted:
-            try:
-                model, found = _settled(model, found, inliers)
-            except EstimationFailure:
-                return None
-        return model, found, inliers
-    return None
-
-
-def _settled(model: Observations, found: Fit, inliers: NDArray[np.bool_]) -> tuple[Observations, Fit]:
-    """The size of errors with which chi-square is its degrees of freedom, and the fit with it."""
-    for _ in range(MOMENT_ROUNDS):
-        freedom = max(_freedom(model.only(inliers)), 1)
-        model = _with_errors(model, found.chi2 / freedom)
-        found = fit(model.only(inliers), found.pose)
-    return model, found
-
-
-def _with_errors(observations: Observations, ratio: float) -> Observations:
-    """Observations whose adapted variance is larger by a ratio."""
-    ratio = min(max(ratio, 1 / MAX_RATIO), MAX_RATIO)
-    if _scalable(observations):
-        tilt_sigma_rad = observations.tilt_sigma_rad * np.sqrt(ratio)
-        return replace(observations, scale=observations.scale * np.sqrt(ratio), tilt_sigma_rad=tilt_sigma_rad)
-    return replace(observations, added_sigma_px=observations.added_sigma_px * np.sqrt(ratio))
-
-
-def _uses_gravity(observations: Observations) -> bool:
-    return bool(np.isfinite(observations.tilt_sigma_rad).all())
-
-
-def _freedom(observations: Observations) -> int:
-    """Degrees of freedom: two numbers a spot and two of gravity, less six of the pose."""
-    return 2 * len(observations.leds_m) + (2 if _uses_gravity(observations) else 0) - 6
-
-
-def _passes(found: Fit, observations: Observations, adapted: bool) -> NDArray[np.bool_]:
-    """Spots (n,) that pass data snooping; with errors of a size by the residuals the test is Fisher's."""
-    freedom = _freedom(observations)
-    limit = pair_limit(OUTLIER_PROBABILITY, max(freedom, 1)) if adapted else chi2_limit(OUTLIER_PROBABILITY, 2)
-    return np.asarray(found.outlier_chi2(_model_error(observations)) <= limit)
-
-
-def _model_error(observations: Observations) -> float:
-    """MODEL_ERROR_PX in normalized coordinates."""
-    return MODEL_ERROR_PX * observations.camera.pixel_angle_rad
 
 
 def _score(agreed: Consensus, observations: Observations) -> float:
@@ -422,8 +318,8 @@ def _explains_all(found: Fit, observations: Observations) -> bool:
     if found.motion_chi2 > chi2_limit(OUTLIER_PROBABILITY, MOTION_PARAMETERS):
         return False
     if observations.correlated:
-        return found.chi2 <= chi2_limit(OUTLIER_PROBABILITY, max(_freedom(observations), 1)) and bool(
-            _passes(found, observations, adapted=False).all()
+        return found.chi2 <= chi2_limit(OUTLIER_PROBABILITY, max(degrees_of_freedom(observations), 1)) and bool(
+            passing(found, observations, adapted=False).all()
         )
     return bool(_explained(found, observations).all())
 

@@ -46,7 +46,7 @@ MAX_HALVINGS = 8
 CONVERGED_CHI2 = 1e-6
 # Probability that the test of a true spot exceeds the limit: one spot in a million.
 OUTLIER_PROBABILITY = 1e-6
-# Upper limit of centroid errors that the image model leaves out (`estimator.solvers.robust_fit`).
+# Upper limit of centroid errors that the image model leaves out (`estimator.solvers.data_snooping`).
 MODEL_ERROR_PX = 0.1
 # Each round leaves out spots, or corrects standard deviations.
 MAX_ROUNDS = 20
