@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -131,7 +132,7 @@ def test_a_text_is_folded_between_words_and_within_one_that_is_too_long() -> Non
 def test_the_spread_counts_each_error_once(scores: Scores) -> None:
     """One error a variant: a single full bar, in the bin of its logarithm; with the first decade marked by a point."""
     (one,) = (one for one in scores.variants if one.variant == "pnp")
-    row = one.rows[0].model_copy(update={"error_3d_m": 2e-3})
+    row = replace(one.rows[0], error_3d_m=2e-3)
     lines = spread_lines([one.model_copy(update={"rows": (row,)})], 10.0, 80)
     # log10(2) x 8 bins a decade = 2.4: the third bin after the point at 1 mm.
     assert lines == ["spread 1 mm", "pnp    . █"]

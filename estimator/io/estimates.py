@@ -134,9 +134,10 @@ def write_estimates(folder: Path, variant: str, rows: Iterable[EstimateRow], dig
 
     digest: `frames_sha256` of the dataset at the time its frames were read; of `folder` now if None.
     """
+    path = estimates_path(folder, variant)
     with estimates_file(folder, variant, digest or frames_sha256(folder)) as add:
         add(rows)
-    return estimates_path(folder, variant)
+    return path
 
 
 @contextmanager
