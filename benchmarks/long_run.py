@@ -1,4 +1,4 @@
-"""Memory and rate of a long run: resident sets after a fifth of the frames, and at the end.
+"""Memory and rate of a long run: resident sets about a fifth of the frames, and at the end.
 
     python benchmarks/long_run.py [FRAMES] [SCALE]
 
@@ -9,6 +9,7 @@ with 1 where `generate`'s parent, one of its workers or a command has grown by m
 
 import json
 import os
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -32,6 +33,11 @@ Scores hold a row and a pose of each frame, and scores.json is in memory before 
 (56 + 23 * 8 bytes), two tuples of three numbers (2 * 64), and some 19 numbers of 24 to 32 bytes, 0.5 kB: 0.9 kB. A pose
 has 9 + 2 numbers and a tuple: 0.5 kB. As text they are 1.0 kB and 0.4 kB, which the serializer has twice where its
 buffer becomes bytes: 2.8 kB. The lists of the summaries are 0.3 kB. All else, such as LEDs and spots, is flat.
+"""
+SAMPLES = 100
+"""Times at which resident sets are read: after each hundredth of the frames. Medians of those about a fifth of the
+frames and of the last fifth are compared: a frame in work takes 20 to 90 MiB more for a moment, and the allocator keeps
+some of that for a while.
 """
 RESAMPLED = 1000
 """Frames from which on the bootstrap of `score` works on parts of the same size; below, its arrays grow with frames."""
@@ -75,11 +81,12 @@ def main() -> None:
     """Measure, print, and hold."""
     frames = int(sys.argv[1]) if len(sys.argv) > 1 else 5000
     scale = int(sys.argv[2]) if len(sys.argv) > 2 else 4
-    targets, seen, at_s = Targets(), dict[int, list[float]](), dict[int, float]()
+    targets, seen, at_s = Targets(), list[list[float]](), list[float]()
 
     def note(progress: vr.Progress) -> None:
-        if progress.stage == "frames" and progress.done in (frames // 5, frames):
-            seen[int(progress.done)], at_s[int(progress.done)] = resident_mib(), time.perf_counter()
+        if progress.stage == "frames" and progress.done and progress.done % max(frames // SAMPLES, 1) == 0:
+            seen.append(resident_mib())
+            at_s.append(time.perf_counter())
 
     plan = vr.load_recipe(ROOT / "datasets/office200.toml", [f"poses.count={frames}", "bound=false"], scale=scale)
     with tempfile.TemporaryDirectory() as folder:
@@ -97,10 +104,14 @@ def main() -> None:
             f"score: {time.perf_counter() - ran_s:.2g} s of both sets; "
             f"MiB of a fifth and of all: run {[round(m) for m in ran]}, score {[round(m) for m in scored]}"
         )
-    early, late = seen[frames // 5], seen[frames]
-    rate_hz = (frames - frames // 5) / (at_s[frames] - at_s[frames // 5])
+    fifth = len(seen) // 5
+    early, late = (
+        [statistics.median(of) for of in zip(*samples, strict=True)]
+        for samples in (seen[fifth // 2 : fifth + fifth // 2], seen[-fifth:])
+    )
+    rate_hz = (frames - frames // 5) / (at_s[-1] - at_s[fifth - 1])
     print(f"generate: {rate_hz:.3g} frames/s")
-    print(f"{frames} frames; MiB after a fifth {[round(m) for m in early]}, after all {[round(m) for m in late]}")
+    print(f"{frames} frames; MiB about a fifth {[round(m) for m in early]}, last fifth {[round(m) for m in late]}")
     for number, (before, after) in enumerate(zip(early, late, strict=True)):
         name = f"worker {number}" if number else "parent"
         targets.at_most(f"{name}: resident set after {frames} frames / after {frames // 5}", after / before, GROWTH)
