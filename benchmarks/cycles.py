@@ -1,10 +1,11 @@
 """A full office frame beside Cycles: ratio of CPU times, and of the mean luminance of what is not an LED.
 
     python3.11 -m venv out/cycles && out/cycles/bin/python -m pip install bpy==5.0.1
-    python benchmarks/cycles.py [SCALE]
+    python benchmarks/cycles.py [SCALE] [SAMPLES]
 
 Blender's `bpy` needs another NumPy than vlcrender, so it has an environment of its own; without it this is skipped. The
-ambient light is left out, which is defined at the first surface. SCALE divides the number of pixels along each side.
+ambient light is left out, which is defined at the first surface. SCALE divides the number of pixels along each side;
+SAMPLES are Cycles' samples a pixel.
 """
 
 import json
@@ -32,7 +33,7 @@ from vlcrender.sensor.signal_chain import expose
 
 ROOT = Path(__file__).parent.parent
 PYTHON = ROOT / "out/cycles/bin/python"
-SAMPLES, BOUNCES = 4, 16
+BOUNCES = 16
 STANDOFF_M = 1e-4
 """Distance of LEDs below their panel, so that rays meet them first."""
 NEAR_LEDS_PX = 3
@@ -88,6 +89,7 @@ def main() -> None:
         print(f"Cycles is skipped: {PYTHON.relative_to(ROOT)} is not there; see benchmarks/cycles.py")
         return
     scale = int(sys.argv[1]) if len(sys.argv) > 1 else 1
+    samples = int(sys.argv[2]) if len(sys.argv) > 2 else 1
     scene = load_scene(ROOT / "scenes/office.toml", ["ambient.illuminance_lux=0"])
     camera, sensor = _camera(scale), Sensor()
     renderer, posed, whole = Renderer(scene), PosedCamera(camera, POSE), Roi.of_sensor(camera)
@@ -106,7 +108,7 @@ def main() -> None:
 
         frame()
         before_s = frame()
-        command = [PYTHON, "-I", Path(__file__).parent / "cycles_scene.py", tree, image, SAMPLES, BOUNCES]
+        command = [PYTHON, "-I", Path(__file__).parent / "cycles_scene.py", tree, image, samples, BOUNCES]
         done = subprocess.run(list(map(str, command)), stdout=subprocess.PIPE, text=True, check=True)
         (line,) = (line for line in done.stdout.splitlines() if line.startswith("CPU time "))
         cycles_s = float(line.removeprefix("CPU time "))
@@ -114,7 +116,7 @@ def main() -> None:
         with OpenEXR.File(str(image), separate_channels=True) as file:
             cycles_cd_m2 = file.channels()["R"].pixels.astype(np.float64)
     size = f"{camera.width_px} x {camera.height_px}"
-    print(f"office, {size}; CPU time; Cycles: {SAMPLES} samples a pixel, {BOUNCES} bounces")
+    print(f"office, {size}; CPU time; Cycles: {samples} samples a pixel, {BOUNCES} bounces")
     targets.beside("Cycles / a frame of ours", cycles_s / ours_s)
     room = np.ones(cycles_cd_m2.shape, bool)
     for patch in renderer.expected_image(posed).patches:
