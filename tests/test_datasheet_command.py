@@ -3,27 +3,11 @@
 import json
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from vlcrender.cli import main
 from vlcrender.emva1288.datasheet import SIGMAS
-
-FULL: dict[str, Any] = {
-    "noise": "full",
-    "bits": 12,
-    "gain_e_per_dn": 1.6,
-    "full_well_e": 5500.0,
-    "black_level_dn": 100,
-    "prnu": 0.01,
-    "dark_current_e_s": 8.0,
-    "dsnu_e": 1.5,
-    "read_noise_e": 2.2,
-    "adc_noise_dn": 0.5,
-    "row_offset_e": 0.4,
-    "column_offset_e": 0.6,
-}
 
 
 def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:

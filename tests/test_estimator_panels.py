@@ -8,24 +8,17 @@ from downlink_signals import (
     EXPOSURE_S,
     PACKETS,
     Sent,
-    balanced_codes,
-    code_downlink,
     led_image,
     packet_chips,
 )
 from test_estimator_device import CAMERA
+from test_estimator_receiver import FORM
 
 from estimator.io.camera import Camera
-from estimator.receiver.codes import code_books
-from estimator.receiver.packets import PacketFormat, decode_packet
+from estimator.receiver.packets import decode_packet
 from estimator.receiver.panels import _laid as laid
 from estimator.receiver.panels import find_groups, same_images
 from estimator.receiver.signal import LedImage
-
-CHIP_S = 25e-6
-CODES = balanced_codes(200, 32, np.random.default_rng(5))
-FORM = PacketFormat(PACKETS)
-BOOKS = code_books(code_downlink(CODES))
 
 
 @dataclass(frozen=True)
