@@ -5,7 +5,7 @@ recipe is refused before Mitsuba is loaded.
 """
 
 import threading
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.roi import LedRegions, RegionImage, Roi
+from vlcrender.config.overrides import Overrides, assignments
 from vlcrender.config.packaged import find_file
-from vlcrender.config.toml_model import toml_text
 from vlcrender.errors import InputError
 from vlcrender.rendering.expected_image import ExpectedImage, Gain, Gains, Image
 from vlcrender.scene.loader import Scene
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from vlcrender.sensor.accelerometer import Imu, TiltError
 
 ScaleMode = Literal["binned", "same-photons"]
-Overrides = Mapping[str, object] | Iterable[str]
 MAX_RENDERERS = 4
 """Renderers that are kept, one for each scene and spectral response; the one used longest ago is dropped first."""
 MAX_EXPOSURE_S = 100.0
@@ -184,7 +183,7 @@ def load_recipe(
     """
     from vlcrender.dataset.recipe.plan import load_plan
 
-    return load_plan(find_file("recipe", name_or_path), _assignments(overrides), scale, scale_mode)
+    return load_plan(find_file("recipe", name_or_path), assignments(overrides), scale, scale_mode)
 
 
 def render(
@@ -427,27 +426,3 @@ def _renderer(scene: Scene, sensor: Sensor) -> "Renderer | MosaicRenderer":
         while len(_renderers) > MAX_RENDERERS:
             del _renderers[next(iter(_renderers))]
     return renderer
-
-
-def _assignments(overrides: Overrides | None) -> list[str]:
-    """`key=value` texts, values as TOML has them."""
-    if overrides is None:
-        return []
-    if isinstance(overrides, str):
-        raise InputError(
-            f"overrides = {overrides!r}: has to be a mapping of keys to values, or a list of key=value texts"
-        )
-    if isinstance(overrides, Mapping):
-        return [f"{key}={toml_text(_plain(value), f'overrides: {key}')}" for key, value in overrides.items()]
-    return list(overrides)
-
-
-def _plain(value: object) -> object:
-    """A value without arrays, numbers and paths of NumPy and pathlib."""
-    if isinstance(value, np.ndarray | np.generic):
-        return _plain(value.tolist())
-    if isinstance(value, Mapping):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    return str(value) if isinstance(value, Path) else value

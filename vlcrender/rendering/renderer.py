@@ -9,7 +9,6 @@ by the kernel of its depth (`led_blur`), and scatters a share of all light into 
 """
 
 import copy
-import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -21,7 +20,6 @@ from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.psf import blur
 from vlcrender.camera.roi import LedRegions, Roi
-from vlcrender.core.backend import dr
 from vlcrender.errors import InputError
 from vlcrender.light.lightmap import Lightmap, bake
 from vlcrender.rendering.background import Background, BackgroundRegion
@@ -436,11 +434,6 @@ def _check_size(rois: Sequence[Roi], camera: Camera) -> None:
             f"regions: overscan makes LED regions of {pixels} pixels; at most {allowed}, {MAX_SENSORS} times the "
             "sensor's, are allowed: lower margin_px, or remove overscan"
         )
-
-
-def share_cores(workers: int) -> None:
-    """Limit Dr.Jit in this process to its share of the cores: its idle threads spin and slow down other processes."""
-    dr.set_thread_count(max(1, (os.cpu_count() or 1) // workers))
 
 
 def check_inside(scene: Scene, pose: Pose) -> None:

@@ -13,11 +13,11 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+from vlcrender.core.backend import dr
 from vlcrender.dataset.format.files import first_line
 from vlcrender.dataset.format.rows import FrameRecord
 from vlcrender.dataset.run.frame_job import Job, made_frames, make_frames
 from vlcrender.errors import InputError
-from vlcrender.rendering.renderer import share_cores
 
 log = logging.getLogger(__name__)
 
@@ -103,7 +103,12 @@ def _interrupts_deferred() -> Iterator[None]:
 
 def _start_worker(workers: int) -> None:
     threading.Thread(target=_exit_with_parent, daemon=True).start()
-    share_cores(workers)
+    _share_cores(workers)
+
+
+def _share_cores(workers: int) -> None:
+    """Limit Dr.Jit in this process to its share of the cores: its idle threads spin and slow down other processes."""
+    dr.set_thread_count(max(1, (os.cpu_count() or 1) // workers))
 
 
 def _exit_with_parent() -> None:
