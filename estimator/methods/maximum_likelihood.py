@@ -8,12 +8,14 @@ bound if the model is true.
 
 What the device states with standard deviations (intrinsics, luminaires, LEDs and their sizes and profiles, the map's
 datum) is estimated with the pose, as nuisances with priors (`estimator.pixels.nuisances`); the covariance is then the
-hybrid bound. What it does not state is taken as exact, unless the images contradict: if LED images are displaced
-against each other by more than their noise explains, or have another size or profile, these become nuisances as well.
-The standard deviation of such a nuisance is that of all LEDs of the frame: a variance component (Foerstner 1979). A
-camera that states nothing, or that it is exact, is then assumed to be one as sold, and so it is where an error of its
-intrinsics explains the images better than an exact camera does (`estimator.pixels.camera_check`). A camera that states
-nothing and that the images do not check adds to the covariance.
+hybrid bound. Where the residuals of the spots show that what is stated is too small, all of it counts by the factor
+that they tell. What the device does not state is taken as exact, unless the images contradict: if LED images are
+displaced against each other by more than their noise explains, or have another size or profile, these become nuisances
+as well. The standard deviation of such a nuisance is that of all LEDs of the frame: a variance component (Foerstner
+1979). Where the pixels inside LED images have more noise than the sensor states, that noise counts
+(`estimator.spots.excess_noise`). A camera that states nothing, or that it is exact, is then assumed to be one as sold,
+and so it is where an error of its intrinsics explains the images better than an exact camera does
+(`estimator.pixels.camera_check`). A camera that states nothing and that the images do not check adds to the covariance.
 
 With a rolling shutter the velocity of the camera while the frame is read out is estimated with the pose, with the
 gyroscope's reading or a hand's motion as a prior (`estimator.solvers.shutter_motion`); the pose is that at mid-readout.
@@ -144,6 +146,7 @@ def judged(frame: DeviceFrame) -> Judged:
     observations = observe_once(frame, correspondences)
     inliers, use_gravity, is_ambiguous = np.ones(len(observations.leds_m), dtype=bool), True, False
     exact, contradicted, unchecked_m2, doubt_m2 = True, False, np.zeros((3, 3)), np.zeros((3, 3))
+    scale, student_ratio = 1.0, 1.0
     if len(observations.leds_m) < MIN_FOR_CONSENSUS:
         upright = upright_pose(observations)
         if upright is None:
@@ -153,15 +156,18 @@ def judged(frame: DeviceFrame) -> Judged:
         agreed = agreement_of(frame, observations)
         pose, inliers = agreed.best.pose, agreed.inliers
         use_gravity, is_ambiguous = agreed.gravity, ambiguous(agreed)
+        scale = agreed.stated_scale
+        student_ratio = agreed.student_ratio if scale > 1 else 1.0
         unchecked_m2, doubt_m2, contradicted = agreed.unchecked_m2, agreed.doubt_m2, agreed.contradicted
         # The centroids of large LEDs have model errors of their own, which the pixels do not have.
         limit_px = MAX_MODEL_ERROR_PX + START_SIGMA_SHARE * _radius_px(observations, pose).max()
         exact = agreed.model is None or agreed.model.added_sigma_px < limit_px
-    gravity = gravity_of(frame) if use_gravity else NO_GRAVITY
+    gravity = gravity_of(frame).scaled(scale) if use_gravity else NO_GRAVITY
     positions = set(map(tuple, observations.leds_m[inliers].tolist()))
     spots = [one for one in correspondences if one.led.position_m in positions]
-    found, is_assumed = _maximize_honestly(frame, gravity, spots, pose, exact)
-    covariance_m2 = found.covariance[:3, :3]
+    stated = Priors.of(frame, tuple(frame.leds.values())).scaled(scale)
+    found, is_assumed = _maximize_honestly(frame, gravity, stated, spots, pose, exact)
+    covariance_m2 = found.covariance[:3, :3] * student_ratio
     if isinstance(found, Maximum):
         unchecked_m2 = doubt_m2 = np.zeros((3, 3))
         if found.camera is not None and frame.camera.uncertainty is None:
@@ -191,15 +197,16 @@ def _radius_px(observations: Observations, pose: Pose) -> Floats:
 
 
 def _maximize_honestly(
-    frame: DeviceFrame, gravity: Gravity, spots: Sequence[Correspondence], pose: Pose, exact: bool
+    frame: DeviceFrame, gravity: Gravity, priors: Priors, spots: Sequence[Correspondence], pose: Pose, exact: bool
 ) -> tuple[Maximum | Start, bool]:
     """Maximum with what the device states, and with what the images reveal beside it. Raises EstimationFailure.
 
-    Also whether a camera that states no errors is taken as one as sold. `exact` says whether the spots agree with what
-    the device states. Where the pixels lead nowhere, and place or camera are uncertain, the spots' own fit is the
-    result: it is nearly as good then, since the noise of centroids is small beside that uncertainty.
+    Also whether a camera that states no errors is taken as one as sold. `priors` are of all LEDs of the map. `exact`
+    says whether the spots agree with what the device states. Where the pixels lead nowhere, and place or camera are
+    uncertain, the spots' own fit is the result: it is nearly as good then, since the noise of centroids is small beside
+    that uncertainty.
     """
-    priors = wider = Priors.of(frame, tuple(frame.leds.values()))
+    wider = priors
     found, revealed, camera = None, START_COMPONENTS, None
     if exact or not priors.exact:
         start = start_at_spots(frame, gravity, priors, spots, pose, NO_COMPONENTS)
@@ -255,7 +262,9 @@ def _revealed(
         if checks_camera:
             columns = np.concatenate([np.arange(SIZE_PARAMETER + 1), MOTION_COLUMNS[: len(priors.motion)]])
         rendered = pixels.model.render(result.nuisances.state(result.pose, frame.camera, of_leds), columns)
-        photometry = fit_photometry(pixels, rendered, result.used, Noise.of(frame), photometry, profile)
+        photometry = fit_photometry(
+            pixels, rendered, result.used, Noise.of(frame, pixels.excess_e2), photometry, profile
+        )
     information, gradient = (one[result.used] for one in score(pixels, rendered, photometry, profile))
     camera = None
     if checks_camera:

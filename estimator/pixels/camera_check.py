@@ -16,6 +16,8 @@ Floats = NDArray[np.float64]
 
 SHIFT_TOLERANCE_PX = 3e-3
 """Displacement of an LED's image from the model's that reveals no error, beside its noise: the model's own."""
+MIN_OWN_SHARE = 1e-12
+"""Share of an intrinsic's information that rounding may leave where the view makes up for all of it."""
 
 
 def camera_errors_by_pixels(
@@ -39,7 +41,7 @@ def camera_errors_by_pixels(
     # What a change of the view makes up for says nothing of the camera.
     steps = np.linalg.solve(information[np.ix_(view, view)], information[np.ix_(view, camera)])
     own = np.diag(information)[camera] - (information[np.ix_(camera, view)] * steps.T).sum(axis=1)
-    own = np.maximum(own, np.finfo(float).tiny)
+    own = np.maximum(own, np.maximum(MIN_OWN_SHARE * np.diag(information)[camera], np.finfo(float).tiny))
     centres_m = priors.positions_m[result.used]
     images = state.of(result.used).project(centres_m)
     slopes_px = intrinsic_slopes_px(images.p_cam, frame.camera.normalized(images.pixels), frame.camera)

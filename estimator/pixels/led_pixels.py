@@ -29,6 +29,7 @@ from estimator.pixels.led_model import (
 )
 from estimator.pixels.polygon_raster import RoiStack
 from estimator.pixels.psf import LensBlur
+from estimator.spots.excess_noise import excess_noise_e2
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -73,7 +74,8 @@ class LedPixels:
     light depends on the state. `gains` are those of the readings where an LED sends, None where all are steady.
     `radius_px` (n,) is half the larger side of an LED image's bounding box. Images may move by `max_move_px` before
     their pixels have to be sorted anew. `more` says whether other LEDs of the map may be in view, whose images the
-    state does not determine well enough.
+    state does not determine well enough. `excess_e2` is the variance of a pixel beside that which the device states
+    (`estimator.spots.excess_noise`).
     """
 
     leds: tuple[Led, ...]
@@ -93,6 +95,7 @@ class LedPixels:
     radius_px: Floats
     max_move_px: float
     more: bool
+    excess_e2: float
     gains: "ReadingGains | None" = None
 
     @cached_property
@@ -210,6 +213,11 @@ def gather_led_pixels(frame: DeviceFrame, view: LedsInView, parameters: Ints = P
             led_of_group.append(k)
     if not groups:
         raise EstimationFailure("fit", "no pixel of the LEDs in view is usable: all are saturated or overlap others")
+    inside_steady = (
+        (electrons, known & (share > 1 - UNIFORM_TOLERANCE))
+        for led, share, (electrons, known) in zip(leds, shares, readings, strict=True)
+        if led.id not in frame.gains
+    )
     counts = np.array([len(group.electrons) for group in groups])
     starts = np.concatenate([[0], np.cumsum(counts)])
     edges = np.concatenate([first + np.arange(len(g.cells)) for first, g in zip(starts.tolist(), groups, strict=False)])
@@ -235,6 +243,7 @@ def gather_led_pixels(frame: DeviceFrame, view: LedsInView, parameters: Ints = P
         radius_px=(footprints.high - footprints.low).max(axis=1) / 2,
         max_move_px=EDGE_PX - 1,
         more=view.more,
+        excess_e2=excess_noise_e2(inside_steady, frame.sensor),
         gains=_gains(frame, [leds[k] for k in led_of_group], groups, starts),
     )
 

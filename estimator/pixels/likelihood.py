@@ -34,7 +34,7 @@ Mask = NDArray[np.bool_]
 
 # Expected distance from saturation, in standard deviations, below which a pixel is not used. The expectation decides,
 # not the reading: excluding high readings would bias the mean.
-SATURATION_MARGIN_SIGMA = 5.0
+SATURATION_MARGIN_SIGMA = 3.0
 # Lower limit of a variance, electrons squared: keeps weights finite.
 MIN_VARIANCE_E2 = 1e-3
 # Background coefficients and amplitude of a group.
@@ -67,10 +67,10 @@ class Noise:
     saturation_e: float
 
     @staticmethod
-    def of(frame: DeviceFrame) -> "Noise":
-        """Noise of a frame's sensor."""
+    def of(frame: DeviceFrame, excess_e2: float = 0.0) -> "Noise":
+        """Noise of a frame's sensor as stated, and a variance beside it, electrons squared."""
         sensor = frame.sensor
-        dark_e2 = sensor.floor_e2() + sensor.row_offset_e**2 + sensor.column_offset_e**2
+        dark_e2 = sensor.floor_e2() + sensor.row_offset_e**2 + sensor.column_offset_e**2 + excess_e2
         saturation_e = (sensor.clipping_dn() - sensor.black_level_dn) * sensor.gain
         return Noise(dark_e2, sensor.prnu**2, saturation_e)
 

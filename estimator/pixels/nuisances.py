@@ -110,6 +110,13 @@ class Priors:
         parts = self.camera, self.datum, self.luminaires, self.leds, self.motion
         return not any(part.any() for part in parts)
 
+    def scaled(self, factor: float) -> "Priors":
+        """Priors with all stated standard deviations times a factor, but for those of a motion and of free tilts."""
+        leds = self.leds * factor
+        leds[:, TILTS] = self.leds[:, TILTS]
+        of_frame = self.camera * factor, self.datum * factor, self.luminaires * factor
+        return replace(self, camera=of_frame[0], datum=of_frame[1], luminaires=of_frame[2], leds=leds)
+
     def position_sigma_m(self) -> Floats:
         """Standard deviation (n,) of each LED's position along its worst axis, without the datum."""
         of_luminaire = np.zeros((len(self.leds), 3))
@@ -263,6 +270,10 @@ class Gravity:
 
     tilts: Floats
     sigma: Floats
+
+    def scaled(self, factor: float) -> "Gravity":
+        """The same with a standard deviation times a factor."""
+        return replace(self, sigma=self.sigma * factor)
 
     def residual(self, angles: Floats) -> Floats:
         """Measured minus the rig's (tilt_x, tilt_y, yaw), in standard deviations, (2,)."""

@@ -114,7 +114,7 @@ class Search:
         self._pixels = pixels
         self._gravity = gravity
         self._priors = priors
-        self._noise = Noise.of(frame)
+        self._noise = Noise.of(frame, pixels.excess_e2)
         self._start_information = start_information
         self._first_damping = damping
         # Of a large LED, a point of the rim moves more than the centre.

@@ -91,12 +91,28 @@ class Consensus:
         It is scaled by chi-square per degree of freedom if chi-square is too large by OUTLIER_PROBABILITY. With errors
         of a size by the residuals, of n degrees of freedom, it is that of Student's distribution, n / (n - 2) times.
         """
-        freedom = 2 * len(self.best.spots_chi2) + (2 if self.gravity else 0) - 6
         if self.adapted:
-            return self.best.covariance_m2 * (max(freedom, 3) / (max(freedom, 3) - 2)) + self.unchecked_m2
-        total = self.best.chi2
+            return self.best.covariance_m2 * self.student_ratio + self.unchecked_m2
+        total, freedom = self.best.chi2, self._freedom
         scale = total / freedom if freedom > 0 and total > chi2_limit(OUTLIER_PROBABILITY, freedom) else 1.0
         return self.best.covariance_m2 * scale + self.unchecked_m2
+
+    @property
+    def _freedom(self) -> int:
+        return 2 * len(self.best.spots_chi2) + (2 if self.gravity else 0) - 6
+
+    @property
+    def stated_scale(self) -> float:
+        """Factor, at least 1, by which what the device states is too small, as far as the residuals tell."""
+        return 1.0 if self.model is None else max(self.model.scale, 1.0)
+
+    @property
+    def student_ratio(self) -> float:
+        """Variance of Student's distribution over that of a normal one, n / (n - 2) of n degrees of freedom; 1 where
+        the residuals do not give the size of errors.
+        """
+        freedom = max(self._freedom, 3)
+        return freedom / (freedom - 2) if self.adapted else 1.0
 
     def of_inliers(self) -> Observations:
         """The observations of the inliers, with the size of errors that explains them."""

@@ -11,6 +11,7 @@ from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame
 from estimator.spots.denoise import DENOISERS, Denoiser
 from estimator.spots.detect import Spot, detect
+from estimator.spots.excess_noise import excess_noise_of_spots_e2
 from estimator.spots.identify import Correspondence, gate_px, identify
 from estimator.spots.lamps import has_stripes, lamps_of, light_centre_px
 from estimator.spots.led_light import Readout
@@ -67,7 +68,12 @@ def _detected(frame: DeviceFrame, denoiser: Denoiser, with_covariances: bool = T
         decoded_px = np.array([(spot.u_px, spot.v_px) for spot in frame.spots]).reshape(-1, 2)
         sensor_px = frame.camera.width_px * frame.camera.height_px
         rest = _gate_px(frame, denoiser), lens_blur(frame.camera), sensor.crosstalk, with_covariances
-        return detect(readouts, sensor_px, denoiser.radius_px, decoded_px, any_square, *rest)
+        spots = detect(readouts, sensor_px, denoiser.radius_px, decoded_px, any_square, *rest)
+        excess_e2 = excess_noise_of_spots_e2(readouts, spots, sensor) if with_covariances else 0.0
+        if excess_e2 > 0:
+            readouts = [replace(readout, floor_e2=readout.floor_e2 + excess_e2) for readout in readouts]
+            spots = detect(readouts, sensor_px, denoiser.radius_px, decoded_px, any_square, *rest)
+        return spots
 
     return frame.once(("spots", denoiser, frame.spots, any_square, with_covariances), detected)
 

@@ -1,0 +1,131 @@
+"""Noise that pixels have beside what the device states, by the pixels inside LED images.
+
+A pixel minus the mean of its two neighbours in a row or column has 3/2 of a pixel's variance, whatever the light's
+level or slope. Inside an LED image the light is even, so that these differences tell the variance of a lit pixel. Where
+it is well above the one stated, the rest is taken as noise that does not depend on the light.
+"""
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.io.sensor import Sensor
+from estimator.spots.detect import Spot
+from estimator.spots.led_light import SMOOTHING_PX, Readout
+
+Floats = NDArray[np.float64] | NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+# Half the side of a window in an LED image, for the radius of a disc of its area: a square inside an ellipse of half
+# the width that it is long, which is a disc tilted by 60 deg.
+WINDOW_SHARE = 0.5
+EDGE_PX = 1.5
+MAX_HALF_PX = 12
+# Half the side of a box around an LED image, for the same radius: around that ellipse, and its rim.
+BOX_SHARE = 1.5
+# Percentile of the smoothed pixels of a box that is background.
+DARK_PERCENT = 10
+# Differences, and LED images, that are enough to see that there is no excess.
+ENOUGH_DIFFERENCES, ENOUGH_IMAGES = 500, 5
+# Variance over the stated one from which on the sensor is noisier than stated. Stated noise stays below by the second
+# limit, in standard deviations of the mean of n squares of differences, sqrt(53 / 9 n): those of neighbours overlap.
+MIN_RATIO = 1.5
+SURE_SIGMA = 6.0
+SQUARES_VARIANCE = 53 / 9
+
+
+def excess_noise_e2(images: Iterable[tuple[Floats, Mask]], sensor: Sensor) -> float:
+    """Variance of a pixel beside that of the sensor as stated, electrons squared; 0 where they agree.
+
+    `images` are electrons around LEDs (rows, columns), and which of them are wholly inside an LED image and known. The
+    median of the images decides, so that a few with a structure do not.
+    """
+    if sensor.gain_e_per_dn is None:
+        return 0.0
+    stated, measured, differences = [], [], 0
+    for electrons, inside in images:
+        level_e2, count = _differences(electrons, inside, sensor)
+        if not count:
+            continue
+        level_e = float(electrons[inside].mean())
+        stated.append(level_e + sensor.floor_e2() + (sensor.prnu * level_e) ** 2)
+        measured.append(level_e2)
+        differences += count
+        enough = differences >= ENOUGH_DIFFERENCES and len(stated) >= ENOUGH_IMAGES
+        if enough and not _exceed(measured, stated, differences):
+            return 0.0
+    return float(np.median(np.subtract(measured, stated))) if _exceed(measured, stated, differences) else 0.0
+
+
+def _differences(electrons: Floats, inside: Mask, sensor: Sensor) -> tuple[float, int]:
+    """Variance of a pixel by the differences along rows and columns, without offsets, and their number."""
+    apart = 1 if sensor.mosaic == "none" else 2
+    total, number = 0.0, 0
+    # Along a row its offset cancels, those of the columns do not.
+    for pixels, known, offset_e in (
+        (electrons, inside, sensor.column_offset_e),
+        (electrons.T, inside.T, sensor.row_offset_e),
+    ):
+        own, before, after = np.s_[:, apart:-apart], np.s_[:, : -2 * apart], np.s_[:, 2 * apart :]
+        off = (pixels[own] - (pixels[before] + pixels[after]) / 2)[known[own] & known[before] & known[after]]
+        total += float(np.einsum("i,i", off, off, dtype=np.float64)) / 1.5 - off.size * offset_e**2
+        number += off.size
+    return total / max(number, 1), number
+
+
+def _exceed(measured: Sequence[float], stated: Sequence[float], differences: int) -> bool:
+    """Whether the median of variances exceeds those stated."""
+    limit = max(MIN_RATIO, 1 + SURE_SIGMA * math.sqrt(SQUARES_VARIANCE / differences)) if differences else math.inf
+    ratios = np.divide(measured, stated)
+    return len(ratios) > 0 and float(np.median(ratios)) > limit
+
+
+def excess_noise_of_spots_e2(readouts: Sequence[Readout], spots: Sequence[Spot], sensor: Sensor) -> float:
+    """`excess_noise_e2` of detected spots: by squares in their middles, and where these exceed, by all of them."""
+    middles = (_middle(*one) for one in _placed(readouts, spots))
+    whole = ((middle, np.ones(middle.shape, dtype=bool)) for middle in middles if middle is not None)
+    if excess_noise_e2(whole, sensor) == 0:
+        return 0.0
+    return excess_noise_e2((_lit(*one) for one in _placed(readouts, spots)), sensor)
+
+
+def _placed(readouts: Sequence[Readout], spots: Sequence[Spot]) -> Iterator[tuple[Readout, Spot]]:
+    """Spots without saturated pixels, each with its region."""
+    for spot in spots:
+        for readout in () if spot.saturated else readouts:
+            height_px, width_px = readout.raw_e.shape
+            if 0 <= spot.u_px - readout.column < width_px and 0 <= spot.v_px - readout.row < height_px:
+                yield readout, spot
+                break
+
+
+def _box(readout: Readout, spot: Spot, half_px: int) -> tuple[slice, slice]:
+    """Rows and columns of a region, up to `half_px` from the pixel of the spot."""
+    row, column = math.floor(spot.v_px - readout.row), math.floor(spot.u_px - readout.column)
+    return tuple(slice(max(at - half_px, 0), at + half_px + 1) for at in (row, column))  # type: ignore[return-value]
+
+
+def _middle(readout: Readout, spot: Spot) -> NDArray[np.float32] | None:
+    """A square inside the LED image; None for a small or cut one."""
+    half_px = min(int(WINDOW_SHARE * math.sqrt(spot.area_px / math.pi) - EDGE_PX), MAX_HALF_PX)
+    if half_px < 1 or spot.touches_border:
+        return None
+    return readout.raw_e[_box(readout, spot, half_px)]
+
+
+def _lit(readout: Readout, spot: Spot) -> tuple[NDArray[np.float32], Mask]:
+    """Electrons around a spot, and pixels as far inside its part above half level as the smoothing reaches."""
+    box = _box(readout, spot, math.ceil(BOX_SHARE * math.sqrt(spot.area_px / math.pi)) + SMOOTHING_PX)
+    raw_e = np.ascontiguousarray(readout.raw_e[box])
+    size = (SMOOTHING_PX, SMOOTHING_PX)
+    smooth = cv2.blur(raw_e, size, borderType=cv2.BORDER_REPLICATE)
+    row, column = (
+        math.floor(spot.v_px - readout.row) - box[0].start,
+        math.floor(spot.u_px - readout.column) - box[1].start,
+    )
+    half_e = (float(smooth[row, column]) + float(np.percentile(smooth, DARK_PERCENT))) / 2
+    inside = cv2.erode((smooth >= half_e).view(np.uint8), np.ones(size, dtype=np.uint8), borderValue=0)
+    return raw_e, inside.view(np.bool_) & ~readout.clipped[box]
