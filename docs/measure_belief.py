@@ -5,8 +5,9 @@
 Sections: `stated` (the three levels), `wide` (the same with a phone's wide lens), `wrong_identities` (a tenth of the
 identities exchanged), `stated_wrongly` (standard deviations stated three times too large and too small), `unstated` (a
 map that is wrong and states nothing, a camera that is wrong and stated as exact), `hall` (luminaires of 60 cm),
-`effects` (a halo, uneven faces, small spots), `levels` (the plot of error against level). Datasets that are complete
-are kept, interrupted ones continued; estimates are made anew, but for `levels`, which takes those that are there.
+`effects` (a halo, uneven faces, small spots), `noise` (of pixels, beside the noise that is stated), `levels` (the plot
+of error against level). Datasets that are complete are kept, interrupted ones continued; estimates are made anew, but
+for `levels`, which takes those that are there.
 """
 
 import argparse
@@ -60,6 +61,8 @@ SMALL_SPOT_SCALES = (2, 4, 8, 20, 25)
 """LED images of office200 are some 58 px high at full size, 29 to 2.3 px here."""
 UNCHECKED_SCALES = (20, 25)
 """Scales at which many frames' residuals do not check the focal length."""
+NOISE_DB = (-26.0, -20.0)
+"""Levels of the added noise, a twentieth and a tenth of the brightest pixel; shot noise is a sixtieth of it."""
 HEADINGS = ("variant", "failed", "with 4 LEDs or more", "RMSE (95 % interval)", "RMSE / bound", "NEES (99 % interval)")
 
 
@@ -263,6 +266,16 @@ def effects(chosen: Chosen) -> None:
             chosen.print_scores(told(folder, f"silent-{folder.name}", _with_a_silent_camera))
 
 
+def noise(chosen: Chosen) -> None:
+    """Noise of each pixel that the device is not told of, relative to the brightest pixel; all else is exact."""
+    for level_db in NOISE_DB:
+        figure("added noise over the brightest pixel", f"{level_db:g} dB")
+        of_noise = {"added_noise.level_db": level_db, "added_noise.relative_to": "peak"}
+        folder = chosen.scaled("office200", 1, {"poses.count": chosen.frames, **of_noise})
+        chosen.print_scores(folder)
+        figure("bound, root mean square", length(_bound_rms_m(folder)))
+
+
 def levels(chosen: Chosen) -> None:
     """Error against level: the plot of the page, from the benchmark recipe and the three levels."""
     ideal = chosen.measurement.dataset(f"office200-{chosen.frames}", "office200", {"poses.count": chosen.frames})
@@ -324,7 +337,7 @@ def copied(dataset: Path, name: str) -> Path:
 
 SECTIONS: dict[str, Callable[[Chosen], None]] = {
     section.__name__: section
-    for section in (stated, wide, wrong_identities, stated_wrongly, unstated, hall, effects, levels)
+    for section in (stated, wide, wrong_identities, stated_wrongly, unstated, hall, effects, noise, levels)
 }
 
 
