@@ -12,8 +12,10 @@ from test_estimator_maximum_likelihood import frame_of, misread
 
 from estimator.io.device import DeviceFrame
 from estimator.io.sensor import Sensor
+from estimator.methods import maximum_likelihood
 from estimator.methods.gravity_fit import gravity_fit
 from estimator.methods.maximum_likelihood import ml
+from estimator.pixels.led_pixels import LedPixels, LedsInView, gather_led_pixels
 from estimator.spots.correspondences import find_correspondences
 from estimator.spots.excess_noise import excess_noise_e2
 
@@ -176,3 +178,26 @@ def test_centroids_count_the_noise_found_as_if_it_were_stated() -> None:
     # Some 60 pixels inside an LED image have 80 differences; of six the median's standard deviation is 0.14.
     for led, covariance_px2 in found.items():
         assert np.trace(covariance_px2) == pytest.approx(np.trace(loud[led]), rel=0.5)
+
+
+def test_noise_that_hides_most_leds_ends_the_search_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pixels within three standard deviations of saturation are not used: of LEDs at two thirds of the full well, with
+    noise of a third of it, the rims alone are left. Their images would wander; the answer is that of the spots.
+    """
+    gathered: list[int] = []
+
+    def counted(frame: DeviceFrame, view: LedsInView, parameters: NDArray[np.int64]) -> LedPixels:
+        gathered.append(1)
+        return gather_led_pixels(frame, view, parameters)
+
+    monkeypatch.setattr(maximum_likelihood, "gather_led_pixels", counted)
+    random = np.random.default_rng(4)
+    noisy = random.poisson(EXPECTED_E) + 1500.0 * random.standard_normal(EXPECTED_E.shape)
+    frame = frame_of(VIEW, LEDS_M, np.clip(np.rint(noisy + BLACK_DN), 0, 4500 + BLACK_DN).astype(np.uint32))
+    wells = {"black_level_dn": float(BLACK_DN), "full_well_e": 4500.0}
+    frame = replace(frame, sensor=frame.sensor.model_copy(update=wells))
+    estimate = ml(frame)
+    assert len(gathered) <= 2
+    assert estimate.covariance_m2 is not None
+    # Centroids of six LEDs of some 150 pixels, with noise of half their light: tenths of a pixel, millimetres.
+    assert np.linalg.norm(estimate.position_m - VIEW.position_m) < 0.1

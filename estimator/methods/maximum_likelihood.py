@@ -100,6 +100,7 @@ MAX_GATHERS = 12
 # Share of the LEDs in view below which it is not the LEDs that are wrong, but the model.
 MIN_USED_SHARE = 0.75
 MAX_ROUNDS = 3
+FAINT = "the light of most LEDs in view is lost in the noise of the pixels that are not saturated"
 # Standard deviation of the position above which the pixels do not determine it.
 MAX_SIGMA_M = 1.0
 
@@ -327,6 +328,8 @@ def maximize(frame: DeviceFrame, gravity: Gravity, priors: Priors, start: Start)
         used = ~excluded[pixels.index]
         search = Search(frame, pixels, gravity, priors.only(pixels.index), start_information, damping)
         result = search.run(used, pose, nuisances.only(pixels.index), components)
+        if not result.converged and 2 * result.faint.sum() > used.sum():
+            raise EstimationFailure("fit", FAINT)
         while result.converged and (wrong_ones := unexplained(result)).any():
             used &= ~wrong_ones
             wrong += 0 if result.faint.any() else int(wrong_ones.sum())
