@@ -19,9 +19,9 @@ from estimator.spots.led_light import SMOOTHING_PX, Readout
 Floats = NDArray[np.float64] | NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-# Half the side of a window in an LED image, for the radius of a disc of its area: a square inside an ellipse of half
-# the width that it is long, which is a disc tilted by 60 deg.
-WINDOW_SHARE = 0.5
+# Half the side of a square in an LED image, for the radius of a disc of its area: one inside an ellipse of half the
+# width that it is long, which is a disc tilted by 60 deg.
+SQUARE_SHARE = 0.5
 EDGE_PX = 1.5
 MAX_HALF_PX = 12
 # Half the side of a box around an LED image, for the same radius: around that ellipse, and its rim.
@@ -47,12 +47,12 @@ def excess_noise_e2(images: Iterable[tuple[Floats, Mask]], sensor: Sensor) -> fl
         return 0.0
     stated, measured, differences = [], [], 0
     for electrons, inside in images:
-        level_e2, count = _differences(electrons, inside, sensor)
+        variance_e2, count = _variance(electrons, inside, sensor)
         if not count:
             continue
         level_e = float(electrons[inside].mean())
         stated.append(level_e + sensor.floor_e2() + (sensor.prnu * level_e) ** 2)
-        measured.append(level_e2)
+        measured.append(variance_e2)
         differences += count
         enough = differences >= ENOUGH_DIFFERENCES and len(stated) >= ENOUGH_IMAGES
         if enough and not _exceed(measured, stated, differences):
@@ -60,8 +60,8 @@ def excess_noise_e2(images: Iterable[tuple[Floats, Mask]], sensor: Sensor) -> fl
     return float(np.median(np.subtract(measured, stated))) if _exceed(measured, stated, differences) else 0.0
 
 
-def _differences(electrons: Floats, inside: Mask, sensor: Sensor) -> tuple[float, int]:
-    """Variance of a pixel by the differences along rows and columns, without offsets, and their number."""
+def _variance(electrons: Floats, inside: Mask, sensor: Sensor) -> tuple[float, int]:
+    """Variance of a pixel by the differences along rows and columns, without offsets, and the number of these."""
     apart = 1 if sensor.mosaic == "none" else 2
     total, number = 0.0, 0
     # Along a row its offset cancels, those of the columns do not.
@@ -110,7 +110,7 @@ def _box(readout: Readout, spot: Spot, half_px: int) -> tuple[slice, slice]:
 
 def _middle(readout: Readout, spot: Spot) -> NDArray[np.float32] | None:
     """A square inside the LED image; None for a small or cut one."""
-    half_px = min(int(WINDOW_SHARE * math.sqrt(spot.area_px / math.pi) - EDGE_PX), MAX_HALF_PX)
+    half_px = min(int(SQUARE_SHARE * math.sqrt(spot.area_px / math.pi) - EDGE_PX), MAX_HALF_PX)
     if half_px < 1 or spot.touches_border:
         return None
     return readout.raw_e[_box(readout, spot, half_px)]
