@@ -84,6 +84,23 @@ def test_a_set_that_is_all_saturated_is_warned_of(tmp_path: Path) -> None:
     assert names == ["LEDs a frame", "field of view", "saturated", "brightest LED", "background", "disk use"]
 
 
+@pytest.mark.parametrize(
+    ("electrons", "text"),
+    [
+        (0.0123456, "0.01235"),
+        (17.446, "17.45"),
+        (9999.4, "9999"),
+        (9999.6, "10000"),
+        (13832.0, "13830"),
+        (2e6, "2000000"),
+    ],
+)
+def test_electrons_have_four_digits_and_no_exponent(rendered_set: Path, electrons: float, text: str) -> None:
+    of_set = Summary.model_validate(summary(rendered_set)).model_copy(update={"brightest_e": electrons})
+    (line,) = (line for line in summary_lines(of_set) if line.startswith("brightest LED"))
+    assert line.split()[2] == text
+
+
 def test_saturated_pixels_in_every_frame_are_warned_of(tmp_path: Path) -> None:
     """LEDs alone: the ceiling is far below."""
     assert vr.generate(small_plan("poses.count=1", "exposure_s=4e-6"), tmp_path / "set")

@@ -112,11 +112,20 @@ def summary_lines(summary: Summary) -> list[str]:
         percent = f"{share:.2g}" if share < 10 else f"{share:.0f}"
         lines += [
             ("saturated", f"{percent} % of the pixels" if summary.saturated_share else "no pixel"),
-            ("brightest LED", f"{summary.brightest_e:.4g} electrons; a pixel saturates at {summary.saturation_e:.4g}"),
-            ("background", f"{summary.background_e:.3g} electrons (median; mostly the ceiling)"),
+            (
+                "brightest LED",
+                f"{_number(summary.brightest_e)} electrons; a pixel saturates at {_number(summary.saturation_e)}",
+            ),
+            ("background", f"{_number(summary.background_e, 3)} electrons (median; mostly the ceiling)"),
         ]
     lines.append(("disk use", size_text(summary.bytes)))
     return [f"{name:<14}{value}" for name, value in lines] + [f"warning: {text}" for text in summary.warnings]
+
+
+def _number(value: float, digits: int = 4) -> str:
+    """A number to some digits, without an exponent where it is large."""
+    text = f"{value:.{digits}g}"
+    return f"{float(text):.0f}" if float(text) >= 10**digits else text
 
 
 def size_text(count: float) -> str:
