@@ -2,7 +2,8 @@
 
 A pixel minus the mean of its two neighbours in a row or column has 3/2 of a pixel's variance, whatever the light's
 level or slope. Inside an LED image the light is even, so that these differences tell the variance of a lit pixel. Where
-it is well above the one stated, the rest is taken as noise that does not depend on the light.
+it is well above the one stated, the rest is taken as noise that does not depend on the light. Noise is alike along rows
+and columns. The stripes of an LED that sends are not: where the two variances differ, the smaller one counts.
 """
 
 import math
@@ -28,13 +29,13 @@ MAX_HALF_PX = 12
 BOX_SHARE = 1.5
 # Percentile of the smoothed pixels of a box that is background.
 DARK_PERCENT = 10
-# Differences, and LED images, that are enough to see that there is no excess.
+# Differences along rows or columns, and LED images, that are enough to see that there is no excess.
 ENOUGH_DIFFERENCES, ENOUGH_IMAGES = 500, 5
 # Variance over the stated one from which on the sensor is noisier than stated. Stated noise stays below by the second
-# limit, in standard deviations of the mean of n squares of differences, sqrt(53 / 9 n): those of neighbours overlap.
+# limit, in standard deviations of the mean of n squares of differences, sqrt(35 / 9 n): those of neighbours overlap.
 MIN_RATIO = 1.5
 SURE_SIGMA = 6.0
-SQUARES_VARIANCE = 53 / 9
+SQUARES_VARIANCE = 35 / 9
 
 
 def excess_noise_e2(images: Iterable[tuple[Floats, Mask]], sensor: Sensor) -> float:
@@ -47,23 +48,29 @@ def excess_noise_e2(images: Iterable[tuple[Floats, Mask]], sensor: Sensor) -> fl
         return 0.0
     stated, measured, differences = [], [], 0
     for electrons, inside in images:
-        variance_e2, count = _variance(electrons, inside, sensor)
+        variances_e2, count = _variances(electrons, inside, sensor)
         if not count:
             continue
         level_e = float(electrons[inside].mean())
         stated.append(level_e + sensor.floor_e2() + (sensor.prnu * level_e) ** 2)
-        measured.append(variance_e2)
+        measured.append(variances_e2)
         differences += count
         enough = differences >= ENOUGH_DIFFERENCES and len(stated) >= ENOUGH_IMAGES
         if enough and not _exceed(measured, stated, differences):
             return 0.0
-    return float(np.median(np.subtract(measured, stated))) if _exceed(measured, stated, differences) else 0.0
+    if not stated or not _exceed(measured, stated, differences):
+        return 0.0
+    low_e2, high_e2 = sorted(np.median(np.subtract(measured, np.array(stated)[:, None]), axis=0).tolist())
+    alike = high_e2 - low_e2 < SURE_SIGMA * math.sqrt(2 * SQUARES_VARIANCE / differences) * (low_e2 + stated[0])
+    return float((low_e2 + high_e2) / 2 if alike else low_e2)
 
 
-def _variance(electrons: Floats, inside: Mask, sensor: Sensor) -> tuple[float, int]:
-    """Variance of a pixel by the differences along rows and columns, without offsets, and the number of these."""
+def _variances(electrons: Floats, inside: Mask, sensor: Sensor) -> tuple[tuple[float, float], int]:
+    """Variances of a pixel by the differences along rows and along columns, without offsets, and the smaller number of
+    these.
+    """
     apart = 1 if sensor.mosaic == "none" else 2
-    total, number = 0.0, 0
+    found, numbers = [], []
     # Along a row its offset cancels, those of the columns do not.
     for pixels, known, offset_e in (
         (electrons, inside, sensor.column_offset_e),
@@ -71,16 +78,16 @@ def _variance(electrons: Floats, inside: Mask, sensor: Sensor) -> tuple[float, i
     ):
         own, before, after = np.s_[:, apart:-apart], np.s_[:, : -2 * apart], np.s_[:, 2 * apart :]
         off = (pixels[own] - (pixels[before] + pixels[after]) / 2)[known[own] & known[before] & known[after]]
-        total += float(np.einsum("i,i", off, off, dtype=np.float64)) / 1.5 - off.size * offset_e**2
-        number += off.size
-    return total / max(number, 1), number
+        found.append(float(np.einsum("i,i", off, off, dtype=np.float64)) / (1.5 * max(off.size, 1)) - offset_e**2)
+        numbers.append(off.size)
+    return (found[0], found[1]), min(numbers)
 
 
-def _exceed(measured: Sequence[float], stated: Sequence[float], differences: int) -> bool:
-    """Whether the median of variances exceeds those stated."""
-    limit = max(MIN_RATIO, 1 + SURE_SIGMA * math.sqrt(SQUARES_VARIANCE / differences)) if differences else math.inf
-    ratios = np.divide(measured, stated)
-    return len(ratios) > 0 and float(np.median(ratios)) > limit
+def _exceed(measured: Sequence[tuple[float, float]], stated: Sequence[float], differences: int) -> bool:
+    """Whether the medians of the variances (n, 2) exceed those stated (n,) along rows and columns."""
+    limit = max(MIN_RATIO, 1 + SURE_SIGMA * math.sqrt(SQUARES_VARIANCE / differences))
+    ratios = np.divide(measured, np.array(stated)[:, None])
+    return float(np.median(ratios, axis=0).min()) > limit
 
 
 def excess_noise_of_spots_e2(readouts: Sequence[Readout], spots: Sequence[Spot], sensor: Sensor) -> float:
