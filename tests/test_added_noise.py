@@ -113,6 +113,15 @@ SETS = {
 }
 
 
+def test_a_set_whose_level_is_an_exposure_is_complete_and_valid(tmp_path: Path) -> None:
+    """No noise is added, and none is missed."""
+    small = [one for one in SMALL if not one.startswith("exposure_s")]
+    plan = load_plan(QUICKSTART, [*small, "poses.count=1", 'added_noise={ level_db = -9, relative_to = "photon" }'])
+    assert vr.generate(plan, tmp_path / "set")
+    assert not vr.generate(plan, tmp_path / "set")  # nothing is left to do
+    assert vr.verify(tmp_path / "set") == []
+
+
 @pytest.mark.parametrize("relative_to", SETS)
 def test_a_frame_has_the_noise_that_its_truth_states(relative_to: str, tmp_path: Path) -> None:
     """Noise-free but for it: 2 e/DN, no photon noise. Residuals are those of rounding and of normal numbers."""

@@ -103,7 +103,8 @@ def _truth_row_problems(truth: TruthRow, shot: int, map_number: int, recipe: Rec
     moves = recipe.motion is not None
     if {truth.angular_velocity_rad_s is not None, truth.linear_velocity_m_s is not None} != {moves}:
         problems.append(f"{where}: velocities and [motion] of the recipe: one is null")
-    if (truth.added_noise_dn is not None) != (recipe.added_noise is not None) or (truth.added_noise_dn or 0) < 0:
+    adds = recipe.added_noise is not None and recipe.added_noise.metering is None
+    if (truth.added_noise_dn is not None) != adds or (truth.added_noise_dn or 0) < 0:
         problems.append(f"{where}: added_noise_dn = {truth.added_noise_dn}: contradicts [added_noise] of the recipe")
     ids = [led.led for led in truth.leds]
     if ids != sorted(set(ids)):
