@@ -224,6 +224,19 @@ def test_a_bright_led_may_be_displaced_by_a_twentieth_of_a_pixel(shift_px: float
     assert ((excess_chi2(pixels, pixels.rendered, photometry) < 0) == is_explained).all()
 
 
+@pytest.mark.parametrize(("sigmas", "is_used"), [(3.3, True), (2.7, False)])
+def test_faces_are_used_up_to_three_standard_deviations_below_saturation(sigmas: float, is_used: bool) -> None:
+    """Of a normal variable that is cut there the mean is 4e-4 standard deviations low. Without noise in the image, the
+    expectation is the face's to a thousandth, where 0.3 standard deviations are 5 thousandths.
+    """
+    frame = frame_of(VIEW, SIX, np.rint(render(VIEW, SIX, 0.01, 3000.0, samples=48)).astype(np.uint32))
+    full_well_e = 3000.0 + sigmas * np.sqrt(3000.0)
+    frame = replace(frame, sensor=frame.sensor.model_copy(update={"full_well_e": full_well_e}))
+    pixels = gathered(frame, true_pose(frame))
+    photometry = fit_photometry(pixels, pixels.rendered, np.ones(6, dtype=bool), Noise.of(frame))
+    assert ((photometry.weight[pixels.uniform_light > 0] > 0) == is_used).all()
+
+
 @pytest.mark.parametrize("bright", [2, 6])
 def test_saturated_leds_are_left_out_beside_others(bright: int) -> None:
     """Faces of three times the full well say where their edge is only if the amplitude is known: they are used where
