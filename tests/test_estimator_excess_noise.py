@@ -183,8 +183,8 @@ def test_centroids_count_the_noise_found_as_if_it_were_stated() -> None:
     louder = replace(frame, sensor=frame.sensor.model_copy(update={"noise": "full", "read_noise_e": MORE_E}))
     loud = {one.led.id: one.spot.covariance_px2 for one in find_correspondences(louder)}
     found = {one.led.id: one.spot.covariance_px2 for one in find_correspondences(frame)}
-    # Some 60 pixels inside an LED image have 40 differences along rows and 40 along columns, which share pixels: the mean
-    # of all 80 squares has a standard deviation of sqrt(53 / 9 / 80) = 0.27, the median of six 0.14.
+    # Some 60 pixels inside an LED image have 40 differences along rows and 40 along columns, which share pixels: the
+    # mean of all 80 squares has a standard deviation of sqrt(53 / 9 / 80) = 0.27, the median of six 0.14.
     for led, covariance_px2 in found.items():
         assert np.trace(covariance_px2) == pytest.approx(np.trace(loud[led]), rel=0.5)
 
