@@ -100,7 +100,7 @@ def test_the_covariance_of_a_centroid_of_box_means_by_each_raw_pixel() -> None:
     support, variance_e2 = rng.random(shape) < 0.6, rng.uniform(1.0, 9.0, shape)
     u_px, v_px = np.arange(20.0, 32.0)[None, :] + 0.5, np.arange(30.0, 39.0)[:, None] + 0.5
     signal_e = np.where(support, 100.0, 0.0)
-    light = Light(np.s_[30:39, 20:32], u_px, v_px, signal_e, support, signal_e, lambda: variance_e2)
+    light = Light(np.s_[30:39, 20:32], u_px, v_px, signal_e, support, signal_e, lambda: variance_e2, signal_e)
     centre, expected = np.array([25.7, 34.2]), np.zeros((2, 2))
     for row in range(9):
         for column in range(12):

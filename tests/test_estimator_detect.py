@@ -442,3 +442,30 @@ def test_the_largest_variance_decides_as_all_variances_do(background_e: float, a
     assert light.variance_e2.max() <= light.max_variance_e2
     for limit in (0.1, 1.0, 0.99 * light.signal_to_noise, 1.01 * light.signal_to_noise, 1000.0):
         assert light.is_fainter(limit) == (light.signal_to_noise <= limit)
+
+
+def disc(u_px: float, v_px: float, radius_px: float, led_e: float) -> Array:
+    """A disc on 60 x 60 px, by 20 x 20 samples a pixel."""
+    at = (np.arange(1200) + 0.5) / 20
+    inside = (at[None] - u_px) ** 2 + (at[:, None] - v_px) ** 2 <= radius_px**2
+    return led_e * inside.reshape(60, 20, 60, 20).mean(axis=(1, 3))
+
+
+def test_led_images_that_the_smoothing_merges_are_told_apart() -> None:
+    """Discs of 2.3 px with centres 4.3 px apart: a dark column between them is dark before the 5 x 5 mean alone."""
+    centres_px = [(20.5, 20.5), (24.8, 21.1), (29.1, 21.7)]
+    image = blank(13_000.0) + sum(disc(u, v, 1.15, 400_000.0) for u, v in centres_px)
+    spots = by_nearest(spots_of(image), np.array(centres_px))
+    assert len(spots_of(image)) == len(centres_px)
+    np.testing.assert_allclose(spots, 0.0, atol=0.02)
+
+
+def test_an_uneven_background_does_not_move_the_centroid_of_a_small_led_image() -> None:
+    """A fifth more light from 2 px beside the LED on, one step of a coarse ADC: the disc has 13 % of a pixel's light
+    more for each of some ten pixels 3 px away, which would move the centroid by 0.02 px.
+    """
+    even = blank(13_000.0) + disc(30.2, 30.4, 1.15, 400_000.0)
+    uneven = even.copy()
+    uneven[:, 33:] += 3_000.0
+    (before,), (after,) = spots_of(even), spots_of(uneven)
+    assert abs(after.u_px - before.u_px) < 2e-3

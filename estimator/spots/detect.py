@@ -4,7 +4,8 @@ Blobs are found in a lightly smoothed copy with one low threshold. The part of a
 an ellipse. The ellipse of a small LED image, which the smoothing widens, is replaced by that of its light's second
 moments. The centroid is computed over the ellipse padded by a margin, so that it contains all light of the LED image,
 blurred or not, and the background around it cancels. What the sampling by pixels adds is subtracted
-(`estimator.spots.sampling`).
+(`estimator.spots.sampling`). The light of a small LED image by a sharp lens is that of the pixels which it touches: a
+background that is not even would move the centroid by several times its noise.
 
 The light of a large LED image, or of one that may be square, is summed over the padded part above half level itself,
 which holds less background than an ellipse around it (`estimator.spots.led_light`).
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 from estimator.errors import EstimationFailure
 from estimator.spots.led_light import (
     MARGIN_PX,
+    MIN_PIECE,
     RING_PX,
     SMOOTHING_PX,
     Ellipse,
@@ -44,8 +46,6 @@ MIN_BLOB_PX = 16
 MAX_BLOBS = 1000
 # A blob larger than a tenth of the frame is a wall or a window of the room.
 MAX_BLOB_OF_FRAME = 0.1
-# Pieces of a blob above half level count as separate LED images from a fifth of the largest piece's area on.
-MIN_PIECE = 0.2
 # A square of half side r has the second moments of a disc of radius 2 r / sqrt(3), and its vertices at sqrt(2) r.
 SQUARE_STRETCH = 1.5**0.5
 # A disc of blur extends a quarter further than to where it has fallen to the threshold.
@@ -136,7 +136,8 @@ def detect(
         stretch = SQUARE_STRETCH if any_square else 1.0
         ellipses, sizes = _ellipses(image, background_e, threshold_e, MAX_BLOB_OF_FRAME * sensor_px, stretch)
         found, small, large = found + len(ellipses), small + sizes[0], large + sizes[1]
-        measured += _spots(readout, ellipses, denoise_radius_px, with_covariances)
+        sharp_reach_px = (0 if crosstalk == 0 else 1) if lens.sharp and denoise_radius_px == 0 else None
+        measured += _spots(readout, ellipses, denoise_radius_px, with_covariances, sharp_reach_px)
     if not measured:
         causes = [
             (small, f"smaller than {MIN_BLOB_PX} px"),
@@ -152,14 +153,24 @@ def detect(
 
 
 def _spots(
-    readout: Readout, ellipses: Sequence[Ellipse], denoise_radius_px: int, with_covariances: bool
+    readout: Readout,
+    ellipses: Sequence[Ellipse],
+    denoise_radius_px: int,
+    with_covariances: bool,
+    sharp_reach_px: int | None,
 ) -> list[_Measured]:
-    """Measure each ellipse of a region, given those near it."""
+    """Measure each ellipse of a region, given those near it.
+
+    `sharp_reach_px` says how far from a sharp LED image its light is; None where it is blurred.
+    """
+    if sharp_reach_px is not None:
+        around = list(_with_neighbours(ellipses, denoise_radius_px))
+        ellipses = [part for e, others in around for part in _parted(readout, e, others, sharp_reach_px)]
     if denoise_radius_px == 0:
-        narrowed = [_narrowed(readout, e, others) for e, others in _with_neighbours(ellipses, denoise_radius_px)]
-        ellipses = narrowed
+        around = list(_with_neighbours(ellipses, denoise_radius_px))
+        ellipses = [_narrowed(readout, e, others, sharp_reach_px) for e, others in around]
     measured = [
-        _measure(readout, ellipse, others, denoise_radius_px, with_covariances)
+        _measure(readout, ellipse, others, denoise_radius_px, with_covariances, sharp_reach_px)
         for ellipse, others in _with_neighbours(ellipses, denoise_radius_px)
     ]
     return [spot for spot in measured if spot is not None]
@@ -300,7 +311,28 @@ def _principal_axes(moments: NDArray[np.float64]) -> tuple[NDArray[np.float64], 
     return np.array([middle + half, middle - half]), np.array([[c, -s], [s, c]])
 
 
-def _narrowed(readout: Readout, ellipse: Ellipse, others: list[Ellipse]) -> Ellipse:
+def _parted(readout: Readout, ellipse: Ellipse, others: list[Ellipse], reach_px: int) -> list[Ellipse]:
+    """The ellipse, or those of the small LED images in it, which the smoothing has merged."""
+    if ellipse.semi_axes_px.min() > SMALL_PX:
+        return [ellipse]
+    parts = light_of(readout, ellipse, others, 0).lit(reach_px)
+    if len(parts) == 1:
+        return [ellipse]
+    areas_px = [int(np.count_nonzero(part.signal_e > part.signal_e.max() / 2)) for part in parts]
+    return [replace(_of_moments(ellipse, part), area_px=area) for part, area in zip(parts, areas_px, strict=True)]
+
+
+def _of_moments(ellipse: Ellipse, light: Light) -> Ellipse:
+    """The ellipse of the second moments of light in it."""
+    centroid = light.centroid_px()
+    variances, axes = _principal_axes(light.moments_px2(centroid))
+    semi_axes_px = 2 * ellipse.stretch * np.sqrt(np.maximum(variances, 0)) + 0.5
+    found = replace(ellipse, centre_px=centroid, axes=axes, semi_axes_px=semi_axes_px)
+    half_extent = found.half_extent(0.0)
+    return replace(found, low_px=centroid - half_extent, high_px=centroid + half_extent)
+
+
+def _narrowed(readout: Readout, ellipse: Ellipse, others: list[Ellipse], sharp_reach_px: int | None) -> Ellipse:
     """The ellipse, or that of the light's second moments if the smoothing has widened it."""
     if ellipse.semi_axes_px.max() > SMALL_PX:
         return ellipse
@@ -308,14 +340,10 @@ def _narrowed(readout: Readout, ellipse: Ellipse, others: list[Ellipse]) -> Elli
         light = light_of(readout, ellipse, others, 0)
         if light.signal_to_noise < MIN_SIGNAL_FOR_MOMENTS:
             return ellipse
-        centroid = light.centroid_px()
-        variances, axes = _principal_axes(light.moments_px2(centroid))
-        semi_axes_px = 2 * ellipse.stretch * np.sqrt(np.maximum(variances, 0)) + 0.5
-        if (semi_axes_px >= ellipse.semi_axes_px).any():
+        found = _of_moments(ellipse, light if sharp_reach_px is None else light.lit(sharp_reach_px)[0])
+        if (found.semi_axes_px >= ellipse.semi_axes_px).any():
             return ellipse
-        ellipse = replace(ellipse, centre_px=centroid, axes=axes, semi_axes_px=semi_axes_px)
-        half_extent = ellipse.half_extent(0.0)
-        ellipse = replace(ellipse, low_px=centroid - half_extent, high_px=centroid + half_extent)
+        ellipse = found
     return ellipse
 
 
@@ -354,13 +382,20 @@ def _corrected_for_sampling(
 
 
 def _measure(
-    readout: Readout, ellipse: Ellipse, others: list[Ellipse], denoise_radius_px: int, with_covariance: bool
+    readout: Readout,
+    ellipse: Ellipse,
+    others: list[Ellipse],
+    denoise_radius_px: int,
+    with_covariance: bool,
+    sharp_reach_px: int | None,
 ) -> _Measured | None:
     """Centroid and covariance of one spot; None if its signal-to-noise ratio is too small."""
     height_px, width_px = readout.image_e.shape
     light = light_of(readout, ellipse, others, denoise_radius_px)
     if light.is_fainter(MIN_SIGNAL_TO_NOISE):
         return None
+    if sharp_reach_px is not None and ellipse.semi_axes_px.max() <= SMALL_PX:
+        light = light.lit(sharp_reach_px)[0]
     centroid, u_px, v_px = light.centroid_px(), light.u_px, light.v_px
 
     brightest, saturated = _brightest(light, ellipse, readout.clipped[light.roi])

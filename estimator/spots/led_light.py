@@ -8,7 +8,7 @@ tells the fall-off by its own light, and the background is subtracted with it.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import TypeVar
 
@@ -39,6 +39,10 @@ MIN_INSIDE_PIXELS = 20
 FALL_OFF_RANGE = 0.5, 2.0
 # A ring whose variance exceeds the noise's by this many standard deviations has a structure.
 STRUCTURE_SIGMA = 4.0
+# A pixel that a sharp LED image touches is beside one with more than this share of its brightest pixel's light.
+LIT_SHARE = 0.1
+# Pieces of a blob count as separate LED images from this share of the largest piece on, by area or by light.
+MIN_PIECE = 0.2
 # Below this share of the variance, which noise of half a step exceeds, rounding errors are independent.
 MAX_ROUNDING_SHARE = 0.25
 
@@ -133,8 +137,9 @@ class Moments:
 class Light:
     """Light of an LED image: pixels of a rectangle `roi` at u (1, columns) and v (rows, 1), of its region's own.
 
-    `signal_e` (rows, columns) are electrons above the background, 0 outside the support; `variances_e2` gives the
-    variance of every pixel, none of which exceeds `max_variance_e2`.
+    `above_e` (rows, columns) are electrons above the background, `signal_e` those of the support and 0 outside it;
+    `variances_e2` gives the variance of every pixel, none of which exceeds `max_variance_e2`. Noise of the background
+    stays below `gate_e`.
     """
 
     roi: tuple[slice, slice]
@@ -144,7 +149,9 @@ class Light:
     support: NDArray[np.bool_]
     signal_e: NDArray[np.float64]
     variances_e2: Callable[[], Pixels]
+    above_e: Pixels
     max_variance_e2: float = math.inf
+    gate_e: float = math.inf
 
     @cached_property
     def variance_e2(self) -> Pixels:
@@ -175,6 +182,42 @@ class Light:
         # Most LED images are much brighter even if all pixels had the largest variance; the factor covers rounding.
         max_noise_e = math.sqrt(np.count_nonzero(self.support) * self.max_variance_e2)
         return not self.flux_e > 1.001 * limit * max_noise_e and self.signal_to_noise <= limit
+
+    def lit(self, reach_px: int) -> "list[Light]":
+        """The light of each sharp LED image in it, brightest first, in the pixels that it can touch and up to
+        `reach_px` from them; all in one where noise does not tell which these are.
+
+        A background that is not even moves a centroid by its light in all pixels of the support. A dim pixel beside two
+        LED images has light of both, half of it of either by default.
+        """
+        limit_e = LIT_SHARE * float(self.signal_e.max())
+        if limit_e <= self.gate_e:
+            return [self]
+        bright = self.above_e > limit_e
+        count, images = cv2.connectedComponents(bright.view(np.uint8), connectivity=8)
+        fluxes, in_support = (
+            np.bincount(images.ravel(), np.where(bright, light, 0.0).ravel(), count)
+            for light in (self.above_e, self.signal_e)
+        )
+        # An LED image that the border of the support cuts is the neighbour's that has most of it.
+        fluxes[2 * in_support <= fluxes] = 0.0
+        if not fluxes.any():
+            return [self]
+        own = np.argsort(-fluxes)[: np.count_nonzero(fluxes >= MIN_PIECE * fluxes.max())].tolist()
+        return [self._lit_by(images == image, bright, 1 + reach_px) for image in own]
+
+    def _lit_by(self, own: NDArray[np.bool_], bright: NDArray[np.bool_], reach_px: int) -> "Light":
+        """The light up to `reach_px` from `own` of the pixels that are `bright`."""
+        square = np.ones((2 * reach_px + 1, 2 * reach_px + 1), dtype=np.uint8)
+        near, near_others = (cv2.dilate(one.view(np.uint8), square).view(np.bool_) for one in (own, bright & ~own))
+        shared = near & near_others & ~bright
+        support = (self.support & near & ~bright) | own | shared
+        signal_e = np.where(support, self.above_e, 0.0)
+        signal_e[shared] /= 2
+        # The share of light in a pixel is between 0 and 1.
+        by_share_e2 = np.where(shared, self.above_e**2 / 12, 0.0)
+        variances_e2 = self.variances_e2
+        return replace(self, support=support, signal_e=signal_e, variances_e2=lambda: variances_e2() + by_share_e2)
 
     def centroid_px(self) -> NDArray[np.float64]:
         """Centroid (u, v), (2,)."""
@@ -240,7 +283,7 @@ def light_of(readout: Readout, ellipse: Ellipse, others: list[Ellipse], denoise_
         other_distance2 = other.distance2(u_px, v_px, MARGIN_PX + max(denoise_radius_px, other.fringe_px))
         support &= distance2 <= other_distance2
         ring &= other_distance2 > 1
-    above_e, raw_e = electrons, readout.raw_e[roi]
+    above_e, raw_e, gate_e = electrons, readout.raw_e[roi], math.inf
     of_ring = np.flatnonzero(ring)
     if len(of_ring):
         ring_e = raw_e.take(of_ring)
@@ -270,7 +313,7 @@ def light_of(readout: Readout, ellipse: Ellipse, others: list[Ellipse], denoise_
     max_e = max(float(raw_e.max()), -float(raw_e.min()))
     max_variance_e2 = readout.variance_e2(max_e) + MAX_SAMPLE_RATIO * (max_e / FALL_OFF_RANGE[0]) ** 2
     signal_e = np.where(support, above_e, 0.0)
-    return Light(roi, u_px, v_px, electrons, support, signal_e, variances_e2, max_variance_e2)
+    return Light(roi, u_px, v_px, electrons, support, signal_e, variances_e2, above_e, max_variance_e2, gate_e)
 
 
 def _median(values: NDArray[np.float64]) -> float:

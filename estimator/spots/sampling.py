@@ -14,6 +14,7 @@ is up to 0.02 px for a = 1 px and falls as a^-1.5. A lens that blurs the image l
 """
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,8 +35,11 @@ MIN_HALF_EXTENT_PX = 0.7
 # A centroid that moves by less than this share of the LED image's movement says little about it.
 MIN_SLOPE = 0.3
 # Second moment by light beyond the two columns around the centroid below which the half extent is not determined: 1 %
-# of the light in a third column adds 0.02 px^2 at most.
+# of the light in a third column adds 0.02 px^2 at most. Noise, by these standard deviations, may have added it as well.
 MIN_THIRD_COLUMN_PX2 = 0.02
+THIRD_COLUMN_SIGMA = 3.0
+# Half extent of the narrowest LED image, a disc of MIN_HALF_EXTENT_PX tilted by 60 deg.
+NARROWEST_PX = 0.35
 MAX_ROUNDS = 30
 CONVERGED_PX = 1e-5
 SOLVED_PX = 1e-3
@@ -62,6 +66,26 @@ def lens_blur(camera: Camera) -> LensBlur:
     f_number = camera.f_number * camera.image_distance_mm / camera.focal_length_mm
     s = min(camera.psf_wavelength_nm / 1000 * f_number / camera.pixel_pitch_um, 1.0)
     return LensBlur(sharp=False, transfer=float(2 / np.pi * (np.arccos(s) - s * np.sqrt(1 - s**2))))
+
+
+@cache
+def _of_two_columns() -> tuple[Floats, Floats, Floats]:
+    """Expected error of a centroid with light in two columns alone, and its variance, by the share p of one, all (n,).
+
+    A disc of half extent a <= 1 at d from the border of the columns, a + |d| <= 1, has the share p = 1/2 +
+    (asin(d / a) + d / a sqrt(1 - (d / a)^2)) / pi; any a down to NARROWEST_PX and any d are equally likely.
+    """
+    half, offset = (grid.ravel() for grid in np.meshgrid(np.linspace(NARROWEST_PX, 1, 141), np.linspace(-1, 1, 4001)))
+    inside = half + np.abs(offset) <= 1
+    ratio = np.clip(offset[inside] / half[inside], -1, 1)
+    shares = 0.5 + (np.arcsin(ratio) + ratio * np.sqrt(1 - ratio**2)) / np.pi
+    errors = shares - 0.5 - offset[inside]
+    edges = np.linspace(0, 1, 51)
+    count, first, second = (np.histogram(shares, edges, weights=errors**power)[0] for power in range(3))
+    mean = first / count
+    shares = np.pad((edges[1:] + edges[:-1]) / 2, 1, constant_values=(0, 1))
+    # By symmetry the error of light in one column alone, and in two equally, is 0 on average.
+    return shares, np.pad((mean - mean[::-1]) / 2, 1), np.pad(np.maximum(second / count - mean**2, 0.0), 1, "edge")
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +118,9 @@ def sampling_error(centroid_px: Floats, moments_px2: Floats, moment_sigmas_px2: 
     A coordinate is u or v; its second moment about the centroid, which has the standard deviation `moment_sigmas_px2`
     by noise, gives the half extent along it. A standard deviation s of the half extent makes the phase of U(k)
     uncertain by 2 pi k s: the expected error shrinks by the mean of a cosine, exp(-(2 pi k s)^2 / 2), and the rest is
-    variance. If the pixels do not determine position and size, the error is 0 and its variance that over all positions.
+    variance. Light in two columns alone does not tell position and size: error and variance are then those of all
+    positions and sizes with this share of light in one (`_of_two_columns`). Where no size is found otherwise, the error
+    is 0 and its variance that over all positions.
     """
     true_px, half_px, solved = _solve(centroid_px, moments_px2)
     step_px = 1e-3
@@ -113,10 +139,19 @@ def sampling_error(centroid_px: Floats, moments_px2: Floats, moment_sigmas_px2: 
     rest = (envelope2 * (1 - shrinking**2) / (np.pi * HARMONICS) ** 2).sum(axis=1) / 2
     # Light in two columns alone has the second moment p (1 - p) with the share p of one: nothing of its half extent.
     share = (centroid_px - 0.5) % 1
-    usable = solved & (slope > MIN_SLOPE) & (moments_px2 - share * (1 - share) > MIN_THIRD_COLUMN_PX2)
+    third_px2 = moments_px2 - share * (1 - share) - MIN_THIRD_COLUMN_PX2
+    two_columns = third_px2 <= 0
+    # An image of more than two pixels has light in a third column.
+    by_noise = (half_px < 1) & (third_px2 <= THIRD_COLUMN_SIGMA * moment_sigmas_px2)
+    usable = solved & (slope > MIN_SLOPE) & ~two_columns & ~by_noise
+    shares, expected_px, spread_px2 = _of_two_columns()
     return SamplingError(
-        error_px=np.where(usable, error_px, 0.0),
-        variance_px2=np.where(usable, rest, sampling_variance_px2(half_px, square=False)),
+        error_px=np.select([usable, two_columns], [error_px, np.interp(share, shares, expected_px)]),
+        variance_px2=np.select(
+            [usable, two_columns],
+            [rest, np.interp(share, shares, spread_px2)],
+            sampling_variance_px2(half_px, square=False),
+        ),
         slope=np.where(usable, slope, 1.0),
     )
 
