@@ -25,6 +25,8 @@ MARGIN_PX = 2.0
 RING_PX = 3.0
 # Pixels of the ring this many standard deviations from its median are no background of the LED.
 BACKGROUND_SIGMA = 3.0
+# Standard deviation of normal numbers over the median of their absolute deviations.
+SIGMA_OF_MEDIAN = 1.4826
 # Of fewer pixels the variance is not measured.
 MIN_RING_PIXELS = 20
 # Variance of a sample, by n - 1, over its mean square deviation, at most.
@@ -139,7 +141,7 @@ class Light:
 
     `above_e` (rows, columns) are electrons above the background, `signal_e` those of the support and 0 outside it;
     `variances_e2` gives the variance of every pixel, none of which exceeds `max_variance_e2`. Noise of the background
-    stays below `gate_e`.
+    stays below `noise_e`.
     """
 
     roi: tuple[slice, slice]
@@ -151,7 +153,7 @@ class Light:
     variances_e2: Callable[[], Pixels]
     above_e: Pixels
     max_variance_e2: float = math.inf
-    gate_e: float = math.inf
+    noise_e: float = math.inf
 
     @cached_property
     def variance_e2(self) -> Pixels:
@@ -191,7 +193,7 @@ class Light:
         LED images has light of both, half of it of either by default.
         """
         limit_e = LIT_SHARE * float(self.signal_e.max())
-        if limit_e <= self.gate_e:
+        if limit_e <= self.noise_e:
             return [self]
         bright = self.above_e > limit_e
         count, images = cv2.connectedComponents(bright.view(np.uint8), connectivity=8)
@@ -204,7 +206,8 @@ class Light:
         if not fluxes.any():
             return [self]
         own = np.argsort(-fluxes)[: np.count_nonzero(fluxes >= MIN_PIECE * fluxes.max())].tolist()
-        return [self._lit_by(images == image, bright, 1 + reach_px) for image in own]
+        found = [self._lit_by(images == image, bright, 1 + reach_px) for image in own]
+        return [light for light in found if light.flux_e > 0] or [self]
 
     def _lit_by(self, own: NDArray[np.bool_], bright: NDArray[np.bool_], reach_px: int) -> "Light":
         """The light up to `reach_px` from `own` of the pixels that are `bright`."""
@@ -293,7 +296,8 @@ def light_of(readout: Readout, ellipse: Ellipse, others: list[Ellipse], denoise_
         ring_fall_off = np.ones(len(of_ring)) if fall_off is None else fall_off.take(of_ring)
         even_e = electrons.take(of_ring) / ring_fall_off
         # The ring without pixels of another surface or light; all of it where its median is between two surfaces.
-        even = np.abs(even_e - _median(even_e)) <= gate_e
+        off_e = np.abs(even_e - _median(even_e))
+        even = off_e <= gate_e
         if not even.any():
             even[:] = True
         background_e = float(even_e[even].mean())
@@ -313,7 +317,9 @@ def light_of(readout: Readout, ellipse: Ellipse, others: list[Ellipse], denoise_
     max_e = max(float(raw_e.max()), -float(raw_e.min()))
     max_variance_e2 = readout.variance_e2(max_e) + MAX_SAMPLE_RATIO * (max_e / FALL_OFF_RANGE[0]) ** 2
     signal_e = np.where(support, above_e, 0.0)
-    return Light(roi, u_px, v_px, electrons, support, signal_e, variances_e2, above_e, max_variance_e2, gate_e)
+    # The device may not know of all noise.
+    noise_e = max(gate_e, BACKGROUND_SIGMA * SIGMA_OF_MEDIAN * _median(off_e)) if len(of_ring) else gate_e
+    return Light(roi, u_px, v_px, electrons, support, signal_e, variances_e2, above_e, max_variance_e2, noise_e)
 
 
 def _median(values: NDArray[np.float64]) -> float:
