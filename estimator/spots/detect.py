@@ -53,6 +53,10 @@ FRINGE_EXTENSION = 1.25
 MIN_SIGNAL_TO_NOISE = 5.0
 # The 5 x 5 mean widens the part above half level of LED images with a smaller semi-axis than about its own width.
 SMALL_PX = 6.0
+# Of LED images with smaller semi-axes, 3 px of which the mean adds up to 1 px, the background in the margin matters: the
+# light is that of the pixels they touch.
+TINY_PX = 3.0
+TINY_SMOOTH_PX = 4.0
 # Across a disc with a larger semi-axis the lens's fall-off changes the background by more than noise. The ellipse
 # around a square contains so much background that this holds from SMALL_PX on.
 LARGE_PX = 40.0
@@ -336,11 +340,12 @@ def _narrowed(readout: Readout, ellipse: Ellipse, others: list[Ellipse], sharp_r
     """The ellipse, or that of the light's second moments if the smoothing has widened it."""
     if ellipse.semi_axes_px.max() > SMALL_PX:
         return ellipse
+    lit_px = sharp_reach_px if ellipse.semi_axes_px.min() <= TINY_SMOOTH_PX else None
     for _ in range(2):
         light = light_of(readout, ellipse, others, 0)
         if light.signal_to_noise < MIN_SIGNAL_FOR_MOMENTS:
             return ellipse
-        found = _of_moments(ellipse, light if sharp_reach_px is None else light.lit(sharp_reach_px)[0])
+        found = _of_moments(ellipse, light if lit_px is None else light.lit(lit_px)[0])
         if (found.semi_axes_px >= ellipse.semi_axes_px).any():
             return ellipse
         ellipse = found
@@ -394,7 +399,7 @@ def _measure(
     light = light_of(readout, ellipse, others, denoise_radius_px)
     if light.is_fainter(MIN_SIGNAL_TO_NOISE):
         return None
-    if sharp_reach_px is not None and ellipse.semi_axes_px.max() <= SMALL_PX:
+    if sharp_reach_px is not None and ellipse.semi_axes_px.max() <= TINY_PX:
         light = light.lit(sharp_reach_px)[0]
     centroid, u_px, v_px = light.centroid_px(), light.u_px, light.v_px
 
