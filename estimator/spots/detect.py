@@ -53,7 +53,7 @@ FRINGE_EXTENSION = 1.25
 MIN_SIGNAL_TO_NOISE = 5.0
 # The 5 x 5 mean widens the part above half level of LED images with a smaller semi-axis than about its own width.
 SMALL_PX = 6.0
-# Of LED images with smaller semi-axes, 3 px of which the mean adds up to 1 px, the background in the margin matters: the
+# The background in the margin matters for LED images with smaller semi-axes, and for the smoothed ones, 1 px larger: their
 # light is that of the pixels they touch.
 TINY_PX = 3.0
 TINY_SMOOTH_PX = 4.0
