@@ -53,8 +53,8 @@ FRINGE_EXTENSION = 1.25
 MIN_SIGNAL_TO_NOISE = 5.0
 # The 5 x 5 mean widens the part above half level of LED images with a smaller semi-axis than about its own width.
 SMALL_PX = 6.0
-# The background in the margin matters for LED images with smaller semi-axes, and for the smoothed ones, 1 px larger: their
-# light is that of the pixels they touch.
+# The background in the margin matters for LED images with smaller semi-axes, and for the smoothed ones, 1 px larger:
+# their light is that of the pixels they touch.
 TINY_PX = 3.0
 TINY_SMOOTH_PX = 4.0
 # Across a disc with a larger semi-axis the lens's fall-off changes the background by more than noise. The ellipse
