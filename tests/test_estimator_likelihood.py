@@ -266,3 +266,51 @@ def test_a_phase_that_the_light_does_not_tell_is_that_of_the_prior() -> None:
         found = fit_photometry(pixels, pixels.rendered, used, Noise.of(frame), begun)
         # The amplitudes of the two fits, whose ratio is a factor of the step, agree to far better than that.
         np.testing.assert_allclose(found.phase, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize(("steps", "measured"), [("alike", True), ("apart", True), ("fine", False)])
+def test_pixels_of_a_background_that_are_rounded_alike_have_no_rounding_errors(
+    rng: np.random.Generator, steps: str, measured: bool
+) -> None:
+    """By hand: of a variance of 100 of which 90 is by the ADC's steps, pixels that read the same have 10 left. Where
+    the rounding errors are apart, n = 400 squares have a mean within 4 sqrt(2 / n) = 0.28 of the variance, which is
+    not exceeded. Steps of less than the noise, and lit pixels, are left alone.
+    """
+    stated = np.full(800, 100.0)
+    unlit = np.arange(800) < 400
+    off = rng.normal(0, 10.0, 800) if steps == "apart" else np.zeros(800)
+    noise = Noise(90.0, 0.0, 1e6, 20.0 if steps == "fine" else 90.0)
+    found = noise.reduced_where_alike(stated, off, np.ones(800), unlit, np.zeros(800, dtype=np.int64))
+    assert (found[~unlit] == 100).all()
+    assert (found <= 100).all()
+    if steps == "alike":
+        np.testing.assert_allclose(found[unlit], 10.0)
+    else:
+        assert (found[unlit] > (72 if measured else 99.9)).all()
+
+
+def test_each_background_has_the_variance_measured_in_it() -> None:
+    """One LED's background is rounded alike, another's is not: readings a step to either side of their mean."""
+    group = np.repeat([0, 1], 50)
+    off = np.where(group == 1, 10.0 * (-1) ** np.arange(100), 0.0)
+    found = Noise(90.0, 0.0, 1e6, 90.0).reduced_where_alike(
+        np.full(100, 100.0), off, np.ones(100), np.ones(100, dtype=bool), group
+    )
+    np.testing.assert_allclose(found, np.where(group == 0, 10.0, 100.0))
+
+
+def test_readings_beside_an_led_image_have_the_weight_of_their_own_noise() -> None:
+    """An ADC with steps of 3 000 electrons reads an even background of some 100 as 0: these readings have the
+    background's own variance, less than the 750 000 by the steps, which pixels inside the LED image keep.
+    """
+    frame = drawn(200_000.0, 3, full_well_e=1e6)
+    pixels = gathered(frame, true_pose(frame))
+    pixels = replace(pixels, electrons=3000.0 * np.round(pixels.electrons / 3000.0))
+    used = np.ones(len(pixels.leds), dtype=bool)
+    photometry = fit_photometry(pixels, pixels.rendered, used, Noise(750_000.0, 0.0, 1e6, 750_000.0))
+    stated = 1 / (pixels.pixel_counts * (np.maximum(photometry.expected / pixels.pixel_counts, 0) + 750_000.0))
+    unlit = pixels.light(pixels.rendered) < 1e-4 * pixels.pixel_counts
+    assert unlit.sum() > 20
+    assert (photometry.weight[unlit] > 10 * stated[unlit]).all()
+    inside = pixels.light(pixels.rendered) > 0.5 * pixels.pixel_counts
+    np.testing.assert_allclose(photometry.weight[inside], stated[inside], rtol=1e-6)

@@ -96,8 +96,8 @@ def test_an_uncertain_size_leaves_the_centroid_as_it_is() -> None:
 
 
 @pytest.mark.parametrize("half_px", [20.0, 40.0])
-def test_a_size_is_uncertain_by_3_in_1000_without_noise(half_px: float) -> None:
-    """s = 0.003 a makes the phase of the k-th harmonic uncertain by 2 pi k s. Its share 1 - exp(-(2 pi k s)^2) of the
+def test_a_size_is_uncertain_by_1_in_1000_without_noise(half_px: float) -> None:
+    """s = 0.001 a makes the phase of the k-th harmonic uncertain by 2 pi k s. Its share 1 - exp(-(2 pi k s)^2) of the
     envelope's mean square, 4 / (pi x^3) / (pi k)^2 with x = 2 pi k a, is variance.
 
     The second moment changes by a / 2 with the half extent, and harmonics add to that up to 8 U(k), relative, with
@@ -105,7 +105,7 @@ def test_a_size_is_uncertain_by_3_in_1000_without_noise(half_px: float) -> None:
     """
     k = np.arange(1.0, 9.0)
     x = 2 * np.pi * k * half_px
-    shares = 1 - np.exp(-((2 * np.pi * k * 0.003 * half_px) ** 2))
+    shares = 1 - np.exp(-((2 * np.pi * k * 0.001 * half_px) ** 2))
     expected = (4 / (np.pi * x**3) / (np.pi * k) ** 2 * shares).sum()
     found = sampling_error(*sampled(half_px, 20.2), NO_NOISE).variance_px2
     np.testing.assert_allclose(found, expected, rtol=16 * np.sqrt(8 / (np.pi * x**3)).sum())
@@ -127,7 +127,7 @@ def test_noise_of_a_moment_makes_a_size_uncertain_at_a_known_centroid(half_px: f
         return float(sampled(half, same)[1][0])
 
     slope = (moment_px2(half_px + step_px) - moment_px2(half_px - step_px)) / (2 * step_px)
-    sigma_px = np.hypot(sigma_px2, 0.003 * half_px**2 / 2) / slope
+    sigma_px = np.hypot(sigma_px2, 0.001 * half_px**2 / 2) / slope
     k = np.arange(1.0, 9.0)
     x = 2 * np.pi * k * half_px
     expected = (4 / (np.pi * x**3) / (np.pi * k) ** 2 * (1 - np.exp(-((2 * np.pi * k * sigma_px) ** 2)))).sum()

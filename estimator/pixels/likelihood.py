@@ -27,6 +27,7 @@ from estimator.camera.motion import MOTION_PARAMETERS
 from estimator.io.device import DeviceFrame
 from estimator.pixels.led_model import IMAGE_PARAMETERS, LOCAL_PARAMETERS, PROFILE_PARAMETERS, RenderedLeds
 from estimator.pixels.led_pixels import LedPixels
+from estimator.spots.led_light import MAX_ROUNDING_SHARE
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -56,15 +57,21 @@ HALO_SHARE = 0.05
 # edge, at most this share of the LED's light: by an inaccurate blur of the lens, or a shift of 0.05 px.
 CHI2_SIGMA = 5.0
 MODEL_ERROR_SHARE = 0.05
+# Share of an LED's light below which a pixel counts as unlit.
+MAX_UNLIT_SHARE = 1e-3
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Noise beside shot noise: variance of a dark pixel, PRNU squared, and the electrons that saturate a pixel."""
+    """Noise beside shot noise: variance of a dark pixel, PRNU squared, and the electrons that saturate a pixel.
+
+    `rounding_e2` is the part of the dark pixel's variance that is by the ADC's steps.
+    """
 
     dark_e2: float
     prnu2: float
     saturation_e: float
+    rounding_e2: float = 0.0
 
     @staticmethod
     def of(frame: DeviceFrame, excess_e2: float = 0.0) -> "Noise":
@@ -72,7 +79,23 @@ class Noise:
         sensor = frame.sensor
         dark_e2 = sensor.floor_e2() + sensor.row_offset_e**2 + sensor.column_offset_e**2 + excess_e2
         saturation_e = (sensor.clipping_dn() - sensor.black_level_dn) * sensor.gain
-        return Noise(dark_e2, sensor.prnu**2, saturation_e)
+        return Noise(dark_e2, sensor.prnu**2, saturation_e, sensor.rounding_e2())
+
+    def reduced_where_alike(self, variance: Floats, off_e: Floats, n: Floats, unlit: Mask, group: Ints) -> Floats:
+        """Variances (m,) of pixels; those of `unlit` ones as measured in each group where the ADC's steps exceed noise.
+
+        Pixels of an even background are then rounded alike, while `variance` has independent rounding errors. `off_e`
+        are the readings, of `n` pixels each, less what is expected.
+        """
+        alike = np.flatnonzero(unlit & (self.rounding_e2 > MAX_ROUNDING_SHARE * variance))
+        if not len(alike):
+            return variance
+        of_group, stated = group[alike], variance[alike]
+        squares = np.bincount(of_group, off_e[alike] ** 2 / (stated * n[alike]))
+        freedom = np.maximum(np.bincount(of_group) - AMPLITUDE, 1)
+        reduced = variance.copy()
+        reduced[alike] = np.clip(stated * (squares / freedom)[of_group], stated - self.rounding_e2, stated)
+        return reduced
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,6 +141,7 @@ def fit_photometry(
     light = pixels.light(rendered)
     if profile is not None:
         light = light * (1 + np.einsum("mi,mi->m", pixels.face, profile[pixels.led][group]))
+    unlit = light < MAX_UNLIT_SHARE * pixels.background[:, 0]
     phase = gain = None
     if pixels.gains is not None:
         phase = np.zeros(len(pixels.led)) if before is None or before.phase is None else before.phase
@@ -152,7 +176,8 @@ def fit_photometry(
         coefficients = np.einsum("gij,gj->gi", covariance, right)
         expected = (columns[:-1] * np.repeat(coefficients.T, np.diff(pixels.starts), axis=1)).sum(axis=0)
         per_pixel = np.maximum(expected / n, 0.0)
-        variance = np.maximum(per_pixel + noise.dark_e2 + noise.prnu2 * per_pixel**2, MIN_VARIANCE_E2)
+        variance = per_pixel + noise.dark_e2 + noise.prnu2 * per_pixel**2
+        variance = np.maximum(noise.reduced_where_alike(variance, y - expected, n, unlit, group), MIN_VARIANCE_E2)
         unsaturated = per_pixel + SATURATION_MARGIN_SIGMA * np.sqrt(variance) < noise.saturation_e
         weight = np.where(of_used_led & unsaturated & determined[group], 1 / (variance * n), 0.0)
         if phase is not None:

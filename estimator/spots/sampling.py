@@ -27,9 +27,9 @@ Floats = NDArray[np.float64]
 # U(k) / k falls as k^-2.5: the eighth is 0.6 % of the first.
 HARMONICS = np.arange(1.0, 9.0)
 PIXEL_VARIANCE = 1 / 12
-# Relative uncertainty of the half extent that a second moment gives: a gradient of the luminance over the face and a
-# halo change the moment. Ours.
-SHAPE_UNCERTAINTY = 0.003
+# Relative uncertainty of the half extent that a second moment gives, on a face that is not uniform: a gradient of 4 %
+# from the centre to the rim changes it by g^2 / 8 = 2e-4, and a fall-off of 1.2 % by 1.2 % / 12. Ours.
+SHAPE_UNCERTAINTY = 0.001
 # The light of a smaller image is in one or two pixels, which do not determine its centre and its size.
 MIN_HALF_EXTENT_PX = 0.7
 # A centroid that moves by less than this share of the LED image's movement says little about it.

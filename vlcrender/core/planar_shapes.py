@@ -269,6 +269,14 @@ def quadrilateral_area(quads: Array) -> Array:
     return area
 
 
+def quadrilateral_centroid(quads: Array) -> Array:
+    """Centroid of convex quadrilaterals (n, 4, 2), (n, 2)."""
+    a, b, c, d = np.moveaxis(quads, 1, 0)
+    first, second = np.abs(_cross(b - a, c - a))[:, None], np.abs(_cross(c - a, d - a))[:, None]
+    centroid: Array = (first * (a + b + c) + second * (a + c + d)) / (3 * (first + second))
+    return centroid
+
+
 def _polygon_area(vertices: Array) -> float:
     u, v = vertices.T
     return abs(float(np.dot(u, np.roll(v, -1)) - np.dot(v, np.roll(u, -1)))) / 2
