@@ -207,14 +207,21 @@ def _scale_change(posed: PosedCamera, face: LedFace) -> Array | None:
     """Relative change, by a pixel along u and along v, of the area in the face's plane that a pixel at its centre has,
     (2,); None below MIN_SCALE_CHANGE and at the horizon.
     """
-    u, v = posed.project(face.center_m)
-    around = np.array([-1.0, 0.0, 1.0])
-    x, y = intersections_with_plane(posed, face.center_m, u + around[None, :], v + around[:, None])
-    if max(np.abs(x).max(), np.abs(y).max()) >= BEYOND_HORIZON_M:
-        return None
-    areas = quadrilateral_area(_quads(x, y, np.ones((2, 2), dtype=bool))).reshape(2, 2)
-    (left, right), (top, bottom) = areas.sum(axis=0), areas.sum(axis=1)
-    change = np.log([right / left, bottom / top])
+    if posed.camera.lens_projection.keeps_lines_straight:
+        # The area is proportional to the depth cubed, and 1 / depth is linear in the pixels.
+        depth_m = float(posed.rotation[2] @ (face.center_m - posed.position_m))
+        height_m = float(face.center_m[2] - posed.position_m[2])
+        by_pixel = np.array(posed.camera.inverse_matrix())[:2, :2]
+        change = -3 * depth_m / height_m * (posed.rotation[:2, 2] @ by_pixel)
+    else:
+        u, v = posed.project(face.center_m)
+        around = np.array([-1.0, 0.0, 1.0])
+        x, y = intersections_with_plane(posed, face.center_m, u + around[None, :], v + around[:, None])
+        if max(np.abs(x).max(), np.abs(y).max()) >= BEYOND_HORIZON_M:
+            return None
+        areas = quadrilateral_area(_quads(x, y, np.ones((2, 2), dtype=bool))).reshape(2, 2)
+        (left, right), (top, bottom) = areas.sum(axis=0), areas.sum(axis=1)
+        change = np.log([right / left, bottom / top])
     return change if np.hypot(*change) >= MIN_SCALE_CHANGE else None
 
 
@@ -268,25 +275,29 @@ def _coverage_of_cells(
 
     `change` is that of scale, by which an area of the plane fills less of its pixel the farther it is along it.
     """
-    shares = face.shape.shared_area(quads) / quadrilateral_area(quads)
-    if change is not None:
-        shares *= np.exp(-_offsets_in_cells(face, quads) @ change)
     coverage = whole.astype(float)
+    if change is None:
+        shares = face.shape.shared_area(quads) / quadrilateral_area(quads)
+    else:
+        area, x, y, _ = face.shape.shared_moments(quads)
+        part = np.stack([x, y], axis=1) / np.maximum(area, np.finfo(float).tiny)[:, None]
+        # A part whose moments are rounding is anywhere in its cell.
+        part = np.clip(part, quads.min(axis=1), quads.max(axis=1))
+        offsets_px = _in_pixels(part - quadrilateral_centroid(quads), quads)
+        shares = area / quadrilateral_area(quads) * np.exp(-offsets_px @ change)
     coverage[mixed] = np.clip(shares, 0.0, 1.0)
     return coverage
 
 
-def _offsets_in_cells(face: LedFace, quads: Array) -> Array:
-    """From the centroid of each cell to that of its part that the face covers, pixels along u and v, (n, 2)."""
-    area, x, y, _ = face.shape.shared_moments(quads)
+def _in_pixels(offsets: Array, quads: Array) -> Array:
+    """Offsets (n, 2) in the face's plane as pixels along u and v, in the cell (n, 4, 2) of each."""
     a, b, c, d = np.moveaxis(quads, 1, 0)
-    along_u, along_v = (b - a + c - d) / 2, (d - a + c - b) / 2
-    middle = quadrilateral_centroid(quads)
-    # A part whose moments are rounding is anywhere in its cell.
-    part = np.stack([x, y], axis=1) / np.maximum(area, np.finfo(float).tiny)[:, None]
-    part = np.clip(part, quads.min(axis=1), quads.max(axis=1))
-    offsets: Array = np.linalg.solve(np.stack([along_u, along_v], axis=-1), (part - middle)[:, :, None])[:, :, 0]
-    return offsets
+    along_u, along_v = b - a + c - d, d - a + c - b  # of two pixels each
+    both = along_u[:, 0] * along_v[:, 1] - along_u[:, 1] * along_v[:, 0]
+    u = offsets[:, 0] * along_v[:, 1] - offsets[:, 1] * along_v[:, 0]
+    v = along_u[:, 0] * offsets[:, 1] - along_u[:, 1] * offsets[:, 0]
+    pixels: Array = 2 * np.stack([u, v], axis=1) / both[:, None]
+    return pixels
 
 
 def _runs(chosen: NDArray[np.bool_]) -> list[list[int]]:
