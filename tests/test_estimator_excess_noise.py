@@ -108,6 +108,12 @@ def test_a_sensor_without_a_gain_has_no_noise_to_compare_with() -> None:
     assert excess_noise_e2(lit(SHOT, 1000.0), SHOT.model_copy(update={"gain_e_per_dn": None})) == 0
 
 
+def test_a_black_image_has_no_excess() -> None:
+    black = np.zeros((30, 30)), np.ones((30, 30), dtype=bool)
+    with np.errstate(all="raise"):
+        assert excess_noise_e2([black] * 6, SHOT) == 0
+
+
 def test_pixels_that_are_not_inside_do_not_count() -> None:
     """A square of six by six pixels: 24 differences, whose mean's standard deviation is sqrt(35 / 9 / 24) = 0.4."""
     ((electrons, _),) = lit(SHOT, 1000.0, count=1, side=25)

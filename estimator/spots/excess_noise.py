@@ -86,7 +86,8 @@ def _variances(electrons: Floats, inside: Mask, sensor: Sensor) -> tuple[tuple[f
 def _exceed(measured: Sequence[tuple[float, float]], stated: Sequence[float], differences: int) -> bool:
     """Whether the medians of the variances (n, 2) exceed those stated (n,) along rows and columns."""
     limit = max(MIN_RATIO, 1 + SURE_SIGMA * math.sqrt(SQUARES_VARIANCE / differences))
-    ratios = np.divide(measured, np.array(stated)[:, None])
+    # A black image of a sensor with shot noise alone has no variance, stated or measured.
+    ratios = np.divide(measured, np.maximum(stated, np.finfo(float).tiny)[:, None])
     return float(np.median(ratios, axis=0).min()) > limit
 
 
