@@ -342,9 +342,12 @@ def _explains_all(found: Fit, observations: Observations) -> bool:
 
 def _explained(found: Fit, observations: Observations) -> NDArray[np.bool_]:
     """Spots, (n,), that a fit explains by their noise and MODEL_ERROR_PX."""
+    limit = chi2_limit(OUTLIER_PROBABILITY, 2)
+    if observations.added_sigma_px == 0 and found.spots_chi2.max() <= limit:
+        return np.ones(len(found.spots_chi2), dtype=bool)  # by their noise alone
     offset = observations.images(found.pose, found.velocity)[0] - observations.image
     spread = np.linalg.inv(observations.whitening)
     model_error2 = (MODEL_ERROR_PX * observations.camera.pixel_angle_rad) ** 2
     covariance = spread @ spread.transpose(0, 2, 1) + model_error2 * np.eye(2)
     distance2 = np.einsum("ni,ni->n", offset, np.linalg.solve(covariance, offset[:, :, None])[:, :, 0])
-    return np.asarray(distance2 <= chi2_limit(OUTLIER_PROBABILITY, 2))
+    return np.asarray(distance2 <= limit)
