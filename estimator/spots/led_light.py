@@ -141,7 +141,7 @@ class Light:
 
     `above_e` (rows, columns) are electrons above the background, `signal_e` those of the support and 0 outside it;
     `variances_e2` gives the variance of every pixel, none of which exceeds `max_variance_e2`. Noise of the background
-    stays below `noise_e`.
+    stays below `gate_e`, as far as the device knows of it; `ring_off_e` (n,) is how far pixels of the ring are from it.
     """
 
     roi: tuple[slice, slice]
@@ -153,7 +153,8 @@ class Light:
     variances_e2: Callable[[], Pixels]
     above_e: Pixels
     max_variance_e2: float = math.inf
-    noise_e: float = math.inf
+    gate_e: float = math.inf
+    ring_off_e: Pixels | None = None
 
     @cached_property
     def variance_e2(self) -> Pixels:
@@ -168,6 +169,13 @@ class Light:
     def _noise(self) -> Moments:
         """Variances of the pixels of the support."""
         return Moments(np.where(self.support, self.variance_e2, 0.0))
+
+    @property
+    def noise_e(self) -> float:
+        """What noise of the background stays below, by the device and by the ring's own spread."""
+        if self.ring_off_e is None:
+            return self.gate_e
+        return max(self.gate_e, BACKGROUND_SIGMA * SIGMA_OF_MEDIAN * _median(self.ring_off_e))
 
     @property
     def flux_e(self) -> float:
@@ -287,6 +295,7 @@ def light_of(readout: Readout, ellipse: Ellipse, others: list[Ellipse], denoise_
         support &= distance2 <= other_distance2
         ring &= other_distance2 > 1
     above_e, raw_e, gate_e = electrons, readout.raw_e[roi], math.inf
+    off_e: Pixels | None = None
     of_ring = np.flatnonzero(ring)
     if len(of_ring):
         ring_e = raw_e.take(of_ring)
@@ -317,9 +326,7 @@ def light_of(readout: Readout, ellipse: Ellipse, others: list[Ellipse], denoise_
     max_e = max(float(raw_e.max()), -float(raw_e.min()))
     max_variance_e2 = readout.variance_e2(max_e) + MAX_SAMPLE_RATIO * (max_e / FALL_OFF_RANGE[0]) ** 2
     signal_e = np.where(support, above_e, 0.0)
-    # The device may not know of all noise.
-    noise_e = max(gate_e, BACKGROUND_SIGMA * SIGMA_OF_MEDIAN * _median(off_e)) if len(of_ring) else gate_e
-    return Light(roi, u_px, v_px, electrons, support, signal_e, variances_e2, above_e, max_variance_e2, noise_e)
+    return Light(roi, u_px, v_px, electrons, support, signal_e, variances_e2, above_e, max_variance_e2, gate_e, off_e)
 
 
 def _median(values: NDArray[np.float64]) -> float:
