@@ -471,6 +471,31 @@ def test_an_uneven_background_does_not_move_the_centroid_of_a_small_led_image() 
     assert abs(after.u_px - before.u_px) < 2e-3
 
 
+def test_the_background_of_a_small_led_image_is_that_beside_it() -> None:
+    """A surface that is brighter by three quarters under the LED and 3 px around it, while the ring is beyond: 3 000
+    electrons of some twenty pixels would be light of the LED, not evenly about the disc, and move it by 0.008 px.
+    """
+    alone, on_a_surface = blank(4_000.0) + disc(30.2, 30.4, 1.15, 400_000.0), blank(4_000.0)
+    on_a_surface[26:35, 27:35] += 3_000.0
+    on_a_surface += disc(30.2, 30.4, 1.15, 400_000.0)
+    (before,), (after,) = spots_of(alone), spots_of(on_a_surface)
+    assert abs(after.u_px - before.u_px) < 2e-3
+    assert abs(after.v_px - before.v_px) < 2e-3
+
+
+def test_an_led_image_between_the_margins_of_others_has_its_background_subtracted() -> None:
+    """Eight others 7 px away, whose margins hold all pixels of the ring: what is beyond their images is background."""
+
+    def face(u_px: float, v_px: float) -> Ellipse:
+        centre = np.array([u_px, v_px])
+        return Ellipse(centre, np.eye(2), np.full(2, 3.0), centre - 3.0, centre + 3.0, 25, 1.0)
+
+    others = [face(30.0 + du, 30.0 + dv) for du in (-7, 0, 7) for dv in (-7, 0, 7) if du or dv]
+    image = (4_000.0 + disc(30.0, 30.0, 1.15, 400_000.0)).astype(np.float32)
+    light = light_of(Readout(0, 0, image, image, np.zeros(image.shape, bool)), face(30.0, 30.0), others, 0)
+    assert light.flux_e == pytest.approx(float(disc(30.0, 30.0, 1.15, 400_000.0).sum()), rel=1e-6)
+
+
 def test_noise_that_is_not_stated_hides_which_pixels_are_lit() -> None:
     """Noise of a quarter of the light, a hundred times the shot noise of its background: a tenth of the brightest pixel
     is below three of its standard deviations, and all of the support counts.

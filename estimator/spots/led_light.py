@@ -218,12 +218,18 @@ class Light:
         return [light for light in found if light.flux_e > 0] or [self]
 
     def _lit_by(self, own: NDArray[np.bool_], bright: NDArray[np.bool_], reach_px: int) -> "Light":
-        """The light up to `reach_px` from `own` of the pixels that are `bright`."""
+        """The light up to `reach_px` from `own` of the pixels that are `bright`.
+
+        Where the pixels beside these are of another surface than most of the ring, their median is the background.
+        """
         square = np.ones((2 * reach_px + 1, 2 * reach_px + 1), dtype=np.uint8)
         near, near_others = (cv2.dilate(one.view(np.uint8), square).view(np.bool_) for one in (own, bright & ~own))
         shared = near & near_others & ~bright
         support = (self.support & near & ~bright) | own | shared
-        signal_e = np.where(support, self.above_e, 0.0)
+        beside = cv2.dilate(near.view(np.uint8), np.ones((3, 3), dtype=np.uint8)).view(np.bool_) & ~near & ~near_others
+        beside_e = _median(self.above_e[beside]) if beside.any() else 0.0
+        above_e = self.above_e - beside_e if abs(beside_e) > self.gate_e else self.above_e
+        signal_e = np.where(support, above_e, 0.0)
         signal_e[shared] /= 2
         # The share of light in a pixel is between 0 and 1.
         by_share_e2 = np.where(shared, self.above_e**2 / 12, 0.0)
@@ -289,11 +295,16 @@ def light_of(readout: Readout, ellipse: Ellipse, others: list[Ellipse], denoise_
         fall_off = _relative_fall_off(electrons, inside)
         support, ring = _within(face, margin_px, margin_px + RING_PX)
     ring &= ~support
+    around = ring.copy()
     for other in others:
         # A pixel in two supports belongs to the nearer spot.
         other_distance2 = other.distance2(u_px, v_px, MARGIN_PX + max(denoise_radius_px, other.fringe_px))
         support &= distance2 <= other_distance2
         ring &= other_distance2 > 1
+    if not ring.any():  # only the margins of others are beside it
+        ring = around
+        for other in others:
+            ring &= other.distance2(u_px, v_px, 0.0) > 1
     above_e, raw_e, gate_e = electrons, readout.raw_e[roi], math.inf
     off_e: Pixels | None = None
     of_ring = np.flatnonzero(ring)
