@@ -129,6 +129,7 @@ def test_light_that_is_even_over_its_pixels_has_no_amplitude(spread: float, dete
         **{"pixel_counts": n, "electrons": 500 + sign, "group": np.zeros(100, dtype=np.int64), "gains": None},
         **{"led": np.zeros(1, dtype=np.int64), "starts": np.array([0, 100]), "light": lambda _: light},
         background=np.column_stack([n, np.sin(waves)]),
+        sum_by_group=lambda values: values.sum(keepdims=True),
     )
     frame = frame_of(VIEW, SIX, np.zeros((1, 1), dtype=np.uint32))
     fitted = fit_photometry(pixels, None, np.ones(1, dtype=bool), Noise.of(frame))  # type: ignore[arg-type]
@@ -314,3 +315,19 @@ def test_readings_beside_an_led_image_have_the_weight_of_their_own_noise() -> No
     assert (photometry.weight[unlit] > 10 * stated[unlit]).all()
     inside = pixels.light(pixels.rendered) > 0.5 * pixels.pixel_counts
     np.testing.assert_allclose(photometry.weight[inside], stated[inside], rtol=1e-6)
+
+
+def test_no_pixel_has_less_noise_than_half_of_the_background_s() -> None:
+    """A background of 0.05 electrons a pixel by shot noise alone, as some LED's readings extrapolate it, is negative in
+    places, where a single electron would outweigh all other pixels.
+    """
+    image = poisson(render(VIEW, SIX, 0.01, 8.0, background_e=0.05, samples=48), 7)
+    frame = frame_of(VIEW, SIX, image.astype(np.uint32))
+    pixels = gathered(frame, true_pose(frame))
+    used = np.ones(len(pixels.leds), dtype=bool)
+    photometry = fit_photometry(pixels, pixels.rendered, used, Noise(0.0, 0.0, 1e6))
+    assert photometry.expected.min() < 0
+    unlit = pixels.light(pixels.rendered) < 1e-3 * pixels.background[:, 0]
+    sums, sizes = (pixels.sum_by_group(np.where(unlit, of, 0.0)) for of in (pixels.electrons, pixels.pixel_counts))
+    variance = 1 / (photometry.weight * pixels.pixel_counts)
+    assert (variance > 0.49 * (sums / sizes)[pixels.group]).all()

@@ -142,6 +142,7 @@ def fit_photometry(
     if profile is not None:
         light = light * (1 + np.einsum("mi,mi->m", pixels.face, profile[pixels.led][group]))
     unlit = light < MAX_UNLIT_SHARE * pixels.background[:, 0]
+    floor_e = _floor_e(pixels, unlit)
     phase = gain = None
     if pixels.gains is not None:
         phase = np.zeros(len(pixels.led)) if before is None or before.phase is None else before.phase
@@ -175,7 +176,7 @@ def fit_photometry(
         covariance = _inverse(normal) * determined[:, None, None]
         coefficients = np.einsum("gij,gj->gi", covariance, right)
         expected = (columns[:-1] * np.repeat(coefficients.T, np.diff(pixels.starts), axis=1)).sum(axis=0)
-        per_pixel = np.maximum(expected / n, 0.0)
+        per_pixel = np.maximum(expected / n, floor_e)
         variance = per_pixel + noise.dark_e2 + noise.prnu2 * per_pixel**2
         variance = np.maximum(noise.reduced_where_alike(variance, y - expected, n, unlit, group), MIN_VARIANCE_E2)
         unsaturated = per_pixel + SATURATION_MARGIN_SIGMA * np.sqrt(variance) < noise.saturation_e
@@ -203,6 +204,17 @@ def fit_photometry(
         phase,
         gain,
     )
+
+
+def _floor_e(pixels: LedPixels, unlit: Mask) -> Floats:
+    """Half of the mean of the unlit pixels of each reading's group, (m,): no expectation is lower.
+
+    The background of a few counts, extrapolated, may come out at 0 or less: its pixels would have no noise. Half a
+    count more (Jeffreys 1946), so that no counts at all do not either.
+    """
+    counts = pixels.sum_by_group(np.where(unlit, pixels.electrons, 0.0))
+    sizes = pixels.sum_by_group(np.where(unlit, pixels.pixel_counts, 0.0))
+    return np.asarray(((np.maximum(counts, 0.0) + 0.5) / np.maximum(sizes, 1.0))[pixels.group] / 2)
 
 
 def _normal_equations(starts: Ints, columns: Floats, weight: Floats) -> tuple[Floats, Floats]:
