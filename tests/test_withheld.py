@@ -57,10 +57,18 @@ def released(withheld: Path, key: Path, tmp_path_factory: pytest.TempPathFactory
 
 
 @pytest.fixture(scope="module")
-def partly(key: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def split_key(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A key whose seed puts frames on both sides of the split: by chance, all six would be on one once in 32 keys."""
+    path = tmp_path_factory.mktemp("keys") / "split"
+    path.write_text(f"vlcrender-truth-key-1 {'01' * 32}\n")
+    return path
+
+
+@pytest.fixture(scope="module")
+def partly(split_key: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Six frames of LED regions, of which the test frames are withheld."""
     folder = tmp_path_factory.mktemp("partly") / "set"
-    assert vr.generate(small_plan(*REGIONS, *SPLIT), folder, withhold_truth=key)
+    assert vr.generate(small_plan(*REGIONS, *SPLIT), folder, withhold_truth=split_key)
     with unchanged(folder):
         yield folder
 
@@ -316,7 +324,7 @@ def test_the_key_alone_opens_the_truth_as_the_docs_say(
     assert (tmp_path / "truth/truth.parquet").read_bytes() == (released / "truth.parquet").read_bytes()
 
 
-def test_training_rows_are_there_and_test_rows_are_not(partly: Path, key: Path, tmp_path: Path) -> None:
+def test_training_rows_are_there_and_test_rows_are_not(partly: Path, split_key: Path, tmp_path: Path) -> None:
     splits = pq.read_table(partly / "frames.parquet")["split"].to_pylist()
     test = [frame for frame, split in enumerate(splits) if split == "test"]
     assert 0 < len(test) < 6
@@ -325,7 +333,7 @@ def test_training_rows_are_there_and_test_rows_are_not(partly: Path, key: Path, 
     assert told == [frame for frame, split in enumerate(splits) if split == "train"]
     assert vr.verify(partly) == []
     folder = copy_of(partly, tmp_path / "set")
-    vr.release(folder, key)
+    vr.release(folder, split_key)
     assert vr.verify(folder) == []
     assert revealed(partly, secrets_of(folder, test), seed_of(folder)) == []
     # A split that the seed decides tells nothing new; its truth has the positions that it was made of.
@@ -370,14 +378,14 @@ def test_the_organiser_scores_what_the_released_truth_scores(
     assert score_bundles([bundle], released) == [entry]
 
 
-def test_entrants_score_training_frames_without_a_key(partly: Path, key: Path, tmp_path: Path) -> None:
+def test_entrants_score_training_frames_without_a_key(partly: Path, split_key: Path, tmp_path: Path) -> None:
     folder = copy_of(partly, tmp_path / "released")
-    vr.release(folder, key)
+    vr.release(folder, split_key)
     sealed = estimated(copy_of(partly, tmp_path / "sealed"), folder, 0.01)
     bundle = tmp_path / "mine.zip"
     submit(sealed, bundle, "mine")
     splits = [record.split for record in est.read_dataset(sealed).frames]
-    for split, key_file in (("train", None), ("test", key)):
+    for split, key_file in (("train", None), ("test", split_key)):
         (entry,) = score_bundles([bundle], sealed, key_file, split)  # type: ignore[arg-type]
         assert [row.frame for row in entry.score.rows] == [n for n, own in enumerate(splits) if own == split]
     with pytest.raises(est.InputError, match="has no validation frame"):
