@@ -1,5 +1,7 @@
 """Search of the most likely pose: the length of its steps, and LEDs that it leaves out."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from estimator_synthetic import Array, poisson, render, view_of
@@ -110,6 +112,36 @@ def test_a_background_makes_the_size_of_a_small_image_uncertain() -> None:
     share = np.array([(photometry.background / photometry.amplitude)[pixels.led == k].max() for k in range(6)])
     sizes = made._with_edge_errors(photometry).leds[:, SIZE]
     np.testing.assert_allclose(sizes, np.hypot(priors.leds[:, SIZE], 0.02 * share / radius_px), rtol=1e-6)
+
+
+@pytest.mark.parametrize("seed", [0, 3, 4, 5])
+def test_readings_near_saturation_do_not_go_round(monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
+    """Faces of 2000 e with noise of 200 e saturate at 2600 e, three standard deviations above: a brighter amplitude
+    excludes faces, without which it is darker. A search in which they enter and leave for ever takes all forty steps;
+    without saturation the same images take six at most: half of forty is far from either.
+    """
+    view, noise_e, black_dn = view_of(TARGET, 3.0, 25.0, -15.0, 30.0), 200.0, 4000.0
+    expected_e = render(view, SIX, 0.01, 2000.0)
+    rng = np.random.default_rng(seed)
+    image = np.rint(rng.poisson(expected_e) + rng.normal(black_dn, noise_e, expected_e.shape))
+    frame = frame_of(view, SIX, np.clip(image, 0, black_dn + 2600.0).astype(np.uint32))
+    sensor = {"noise": "full", "read_noise_e": noise_e, "black_level_dn": black_dn, "full_well_e": 2600.0}
+    frame = replace(frame, sensor=frame.sensor.model_copy(update=sensor))
+    pose, priors = true_pose(frame), Priors.of(frame, tuple(frame.leds.values()))
+    steps = 0
+
+    def counted(
+        pixels: LedPixels, rendered: RenderedLeds, photometry: PhotometricFit, profile: Array | None
+    ) -> tuple[Array, Array]:
+        nonlocal steps
+        steps += 1
+        return score(pixels, rendered, photometry, profile)
+
+    monkeypatch.setattr(search, "score", counted)
+    pixels = gathered(frame, pose)
+    made = Search(frame, pixels, gravity_of(frame), priors, np.eye(6), 0.0)
+    assert made.run(np.ones(len(pixels.leds), dtype=bool), pose, Nuisances.zero(priors), NO_COMPONENTS).converged
+    assert steps <= 20
 
 
 def result_of(excess: Array, used: Array, faint: Array) -> ScoringResult:

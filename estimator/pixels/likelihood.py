@@ -131,11 +131,12 @@ def fit_photometry(
     noise: Noise,
     before: PhotometricFit | None = None,
     profile: Floats | None = None,
+    may_enter: bool = True,
 ) -> PhotometricFit:
     """Amplitude and background of every group, weighted by the variances of a previous fit, if any.
 
     `used` (n,) are the LEDs to use; `profile` (n, 3) are the coefficients of a, b and a^2 + b^2 - 1/2 of each LED's
-    luminance, 0 if None.
+    luminance, 0 if None. Readings that the previous fit did not use may enter if `may_enter`, and else may only leave.
     """
     n, y, group = pixels.pixel_counts, pixels.electrons, pixels.group
     light = pixels.light(rendered)
@@ -180,7 +181,10 @@ def fit_photometry(
         variance = per_pixel + noise.dark_e2 + noise.prnu2 * per_pixel**2
         variance = np.maximum(noise.reduced_where_alike(variance, y - expected, n, unlit, group), MIN_VARIANCE_E2)
         unsaturated = per_pixel + SATURATION_MARGIN_SIGMA * np.sqrt(variance) < noise.saturation_e
-        weight = np.where(of_used_led & unsaturated & determined[group], 1 / (variance * n), 0.0)
+        usable = of_used_led & unsaturated & determined[group]
+        if before is not None and not may_enter:
+            usable &= before.weight > 0
+        weight = np.where(usable, 1 / (variance * n), 0.0)
         if phase is not None:
             bright = coefficients[:, AMPLITUDE]
             change = np.divide(coefficients[:, -1], bright, out=np.zeros_like(bright), where=bright > 0)

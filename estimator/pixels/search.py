@@ -48,6 +48,9 @@ CONVERGED_PX = 0.02
 # A step that multiplies the mean deviance by more was too long. Smaller increases occur when readings near saturation
 # enter or leave.
 MAX_DEVIANCE_RATIO = 1.01
+# After so many steps readings near saturation may only leave: amplitudes decide which are used and come from them,
+# so that they could enter and leave for ever.
+SETTLING_STEPS = 4
 # A step is shortened so many times at most: where a wrong LED's weights change, the deviance grows without a step.
 MAX_SHORTENED = 3
 # A step that takes back more than this share of the one before overshoots and is halved: where an edge enters a pixel,
@@ -131,14 +134,19 @@ class Search:
         photometry: PhotometricFit | None = None
         factor, accepted, min_deviance = 1.0, (pose, nuisances), np.inf
         step: Solution | None = None
-        damping, shortened = self._first_damping, 0
+        damping, shortened, steps = self._first_damping, 0, 0
         for _ in range(MAX_STEPS):
             state = nuisances.state(pose, camera, priors)
             rendered = self._rendered(state)
             profile = nuisances.profile() if priors.leds[:, PROFILE].any() else None
             angles = pose.rig_angles(camera)
             first = photometry is None and profile is None and rendered is pixels.rendered
-            candidate = at_start if first else fit_photometry(pixels, rendered, used, self._noise, photometry, profile)
+            may_enter = steps < SETTLING_STEPS
+            candidate = (
+                at_start
+                if first
+                else fit_photometry(pixels, rendered, used, self._noise, photometry, profile, may_enter)
+            )
             of_priors = self._gravity.deviance(angles) + nuisances.deviance(priors)
             deviance = candidate.deviance + of_priors / len(pixels.electrons)
             too_long = deviance > MAX_DEVIANCE_RATIO * min_deviance  # for the linearization
@@ -147,7 +155,7 @@ class Search:
                 factor /= 4
                 pose, nuisances = self._moved(accepted, step, factor)
                 continue
-            photometry, accepted, shortened = candidate, (pose, nuisances), 0
+            photometry, accepted, shortened, steps = candidate, (pose, nuisances), 0, steps + 1
             rows, right = square_root(*score(pixels, rendered, photometry, profile))
             before = step
             if damping > 0:
