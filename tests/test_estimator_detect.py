@@ -414,6 +414,18 @@ def test_a_ring_of_two_surfaces_has_a_background() -> None:
     assert abs(spot.u_px - 30.0) < 14 * 14 * 4950 * 3.5 / 42e6
 
 
+def test_a_pixel_is_as_far_from_an_ellipse_alone_as_among_others() -> None:
+    """Of a turned ellipse, whose ends are at 1; sums of a dozen products in another order differ by 1e-14."""
+    c, s = np.cos(0.7), np.sin(0.7)
+    axes = np.array([[c, -s], [s, c]])
+    ellipse = Ellipse(np.array([30.2, 28.6]), axes, np.array([9.0, 4.0]), np.zeros(2), np.full(2, 60.0), 50, 1.0)
+    for k in (0, 1):
+        assert ellipse.distance2_at(*(ellipse.centre_px + axes[:, k] * (9.0, 4.0)[k]).tolist()) == pytest.approx(1.0)
+    u_px, v_px = np.arange(20.5, 40.5)[None], np.arange(18.5, 38.5)[:, None]
+    one_by_one = [[ellipse.distance2_at(u, v) for u in u_px[0].tolist()] for v in v_px[:, 0].tolist()]
+    np.testing.assert_allclose(one_by_one, ellipse.distance2(u_px, v_px, 0.0), atol=1e-12)
+
+
 @pytest.mark.parametrize("background_e", [0.0, 40.0])
 @pytest.mark.parametrize("amplitude_e", [0.5, 3.0, 30.0, 3000.0])
 def test_the_largest_variance_decides_as_all_variances_do(background_e: float, amplitude_e: float) -> None:

@@ -14,6 +14,7 @@ which holds less background than an ellipse around it (`estimator.spots.led_ligh
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -99,10 +100,10 @@ class _Measured:
     light: Light
     centroid_px: NDArray[np.float64]
 
-    @property
+    @cached_property
     def moments_px2(self) -> NDArray[np.float64]:
         """Second moments along u and v, (2,)."""
-        return np.diag(self.light.moments_px2(self.centroid_px))
+        return self.light.moments_along_px2(self.centroid_px)
 
 
 def detect(
@@ -253,9 +254,11 @@ def _ellipses(
     for outline in sorted(outer, key=len, reverse=True)[:MAX_BLOBS]:
         left, top, width, height = cv2.boundingRect(outline)
         roi = np.s_[top : top + height, left : left + width]
-        column, row = outline[0, 0]
-        count, labels = cv2.connectedComponents(mask[roi], connectivity=8)
-        own = labels == labels[row - top, column - left] if count > 2 else mask[roi].view(bool)
+        own = mask[roi].view(bool)
+        if len(outer) > 1:
+            column, row = outline[0, 0]
+            count, labels = cv2.connectedComponents(mask[roi], connectivity=8)
+            own = labels == labels[row - top, column - left] if count > 2 else own
         values = smooth[roi][own]
         if not MIN_BLOB_PX <= len(values) <= largest_px:
             small, large = small + (len(values) < MIN_BLOB_PX), large + (len(values) > largest_px)
@@ -425,7 +428,7 @@ def _measure(
 def _brightest(light: Light, ellipse: Ellipse, clipped: NDArray[np.bool_]) -> tuple[tuple[int, int], bool]:
     """Row and column of the brightest pixel in an ellipse, and whether one there is among those `clipped`."""
     row, column = divmod(int(light.electrons.argmax()), light.electrons.shape[1])
-    here = ellipse.distance2(light.u_px[:, column : column + 1], light.v_px[row : row + 1], 0.0)
+    here = ellipse.distance2_at(float(light.u_px[0, column]), float(light.v_px[row, 0]))
     if here < CLEARLY_INSIDE and not clipped.any():
         return (row, column), False
     inside = ellipse.distance2(light.u_px, light.v_px, 0.0) <= 1
