@@ -50,7 +50,10 @@ def frame_of(folder: Path, recipe: Path, overrides: list[str]) -> Callable[[int]
 
 
 def peak_bytes(folder: Path, overrides: list[str]) -> int:
-    """Peak memory of a process that makes one frame."""
+    """Peak memory of a process that makes one frame.
+
+    To be called before this process makes any: Linux counts its own peak as that of the processes it starts.
+    """
     command = [sys.executable, __file__, "--peak", str(folder), *overrides]
     return int(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
 
@@ -67,13 +70,14 @@ def main() -> None:
         folder = Path(name)
         plain = frame_of(folder, QUICKSTART, [])
         small = peak_bytes(folder, SMALL)
-        targets.at_most("plain: peak bytes a pixel", (peak_bytes(folder, []) - small) / PIXELS, 35.0)
-        for option, (overrides, most, bytes_a_pixel) in OPTIONS.items():
+        memory = {"plain": ([], 35.0)} | {option: (one[0], one[2]) for option, one in OPTIONS.items()}
+        for option, (overrides, bytes_a_pixel) in memory.items():
+            used = (peak_bytes(folder, overrides) - small) / PIXELS
+            targets.at_most(f"{option}: peak bytes a pixel", used, bytes_a_pixel)
+        for option, (overrides, most, _) in OPTIONS.items():
             other = frame_of(folder, QUICKSTART, overrides)
             seconds = alternating_s([partial(other, 0), partial(plain, 0)], repeats, time.process_time)
             targets.at_most(f"{option} / plain frame", ratio(*seconds), most)
-            used = (peak_bytes(folder, overrides) - small) / PIXELS
-            targets.at_most(f"{option}: peak bytes a pixel", used, bytes_a_pixel)
         on, off = (frame_of(folder, REGIONS, [f"bound={word}"]) for word in ("true", "false"))
         works = [lambda make=make: [make(number) for number in range(8)] for make in (on, off)]
         seconds = alternating_s(works, repeats, time.process_time)
