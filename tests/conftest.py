@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from estimator_synthetic import small_dataset
+from hypothesis import settings
 
 import vlcrender as vr
 from estimator.cli import main as estimator_main
@@ -24,6 +25,11 @@ from vlcrender.dataset.format.manifest import seal_dataset
 
 os.environ.setdefault("VLCRENDER_CACHE", tempfile.mkdtemp(prefix="vlcrender-tests-"))
 # No bake of an earlier run is taken, and processes that tests start share this one's.
+
+settings.register_profile("alike", deadline=None, derandomize=True)
+settings.register_profile("random", deadline=None)
+settings.load_profile("alike")
+# The same examples in every run, however slow; others by --hypothesis-profile=random.
 
 ROOT = Path(__file__).parent.parent
 SMALL = (

@@ -45,7 +45,7 @@ def judge(folder: Path, capsys: pytest.CaptureFixture[str]) -> int:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("file", ["estimates/pnp.parquet", "truth.parquet", "scores.json"])
-@settings(max_examples=20, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@settings(max_examples=20, suppress_health_check=list(HealthCheck))
 @given(data=st.data())
 def test_damaged_bytes_are_read_or_refused(
     good: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], file: str, data: st.DataObject

@@ -378,7 +378,7 @@ def test_missing_parts_are_named(folder: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("file", ["dataset.json", "frames.parquet"])
-@settings(max_examples=60, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@settings(max_examples=60, suppress_health_check=list(HealthCheck))
 @given(data=st.data())
 def test_damaged_bytes_are_read_or_refused(good: Path, tmp_path: Path, file: str, data: st.DataObject) -> None:
     folder = Path(shutil.copytree(good, tmp_path / "damaged", dirs_exist_ok=True))

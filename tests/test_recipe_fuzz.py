@@ -94,7 +94,7 @@ def smaller(plan: Plan) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=80, suppress_health_check=[HealthCheck.too_slow])
 @given(
     st.lists(st.sampled_from([(key, toml(value)) for key, value in PLAUSIBLE.items()]), max_size=4),
     st.lists(st.tuples(KEYS, st.one_of(VALUES.map(toml), st.text(max_size=12))), max_size=2),
@@ -109,7 +109,7 @@ def test_any_assignment_is_valid_or_refused(sound: list[tuple[str, str]], odd: l
 
 
 @pytest.mark.slow
-@settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=80, suppress_health_check=[HealthCheck.too_slow])
 @given(
     st.dictionaries(
         st.sampled_from(sorted(TABLES)),

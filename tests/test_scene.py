@@ -218,7 +218,7 @@ def test_a_room_without_leds_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
 def test_a_damaged_scene_file_gives_a_scene_or_one_line(tmp_path: Path, data: st.DataObject) -> None:
     """Cut, overwrite or splice the file anywhere."""
