@@ -20,6 +20,7 @@ from cyclopts import App, CycloptsError, Parameter
 
 import estimator
 from estimator.errors import InputError
+from estimator.io.arguments import Whole
 from estimator.io.process import INTERRUPTED, ending_at_second_interrupt, prepare_streams, progress_console
 from estimator.report.benchmark_commands import leaderboard, submit
 from estimator.report.score_commands import score
@@ -65,7 +66,7 @@ def run(
     /,
     *,
     variant: Annotated[list[str] | None, Parameter(negative=())] = None,
-    workers: int = 1,
+    workers: Whole = 1,
     centroid_sigma: float | None = None,
     out: Path | None = None,
 ) -> int:

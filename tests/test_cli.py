@@ -76,6 +76,8 @@ GENERATE_MISTAKES: dict[str, tuple[list[str], list[str]]] = {
     "scale mode": (["--scale", "10", "--scale-mode", "averaged"], ["--scale-mode", "averaged", "same-photons"]),
     "workers": (["--workers", "0"], ["--workers 0", "1 or more"]),
     "workers is a word": (["--workers", "many"], ["--workers", "many"]),
+    "workers and a half": (["--workers", "1.5"], ["--workers", "1.5 is not a whole number"]),
+    "scale with a point": (["--scale", "10.4"], ["--scale", "10.4 is not a whole number"]),
     "unknown option": (["--frobnicate"], ["--frobnicate"]),
     "overscan behind distortion": (
         ["--set", 'regions={kind="leds", overscan=true}', "--set", "camera.distortion.k1=-0.05"],
@@ -107,6 +109,12 @@ def test_generate_refuses_an_output_folder_below_a_file(tmp_path: Path) -> None:
     out = str(tmp_path / "file" / "below")
     assert_refused(run("vlcrender", "generate", RECIPE, "--out", out, *SETS), str(tmp_path / "file"))
     assert (tmp_path / "file").read_text() == "mine"
+
+
+@pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="needs a folder that has no others")
+def test_generate_refuses_an_output_folder_that_the_system_does_not_make() -> None:
+    out = "/proc/frames"
+    assert_refused(run("vlcrender", "generate", RECIPE, "--out", out, *SETS), f"{out}: cannot be made: No such file")
 
 
 def test_a_recipe_with_an_out_of_room_pose_is_refused(tmp_path: Path) -> None:

@@ -186,6 +186,7 @@ ERRORS = [
     (["score", "{data}", "--jsn"], "--jsn"),
     (["run", "{data}", "--workers", "0"], "--workers 0: is not 1 or more"),
     (["run", "{data}", "--workers", "many"], "--workers"),
+    (["run", "{data}", "--workers", "1.5"], "--workers: 1.5 is not a whole number"),
     (["compare", "{data}", "pnp"], "B"),
     (["compare", "{data}", "pnp", "pnp"], "pnp and pnp: needed two different variants"),
     (["compare", "{data}", "pnp", "best"], "none of variant best; there are: "),

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, CycloptsError, Parameter
 
+from vlcrender.core.arguments import Whole
 from vlcrender.core.process import INTERRUPTED, ending_at_second_interrupt, prepare_streams
 from vlcrender.errors import InputError
 from vlcrender.report.report_command import report
@@ -49,9 +50,9 @@ def generate(
     *,
     out: Path,
     set_: Annotated[list[str] | None, Parameter(name="--set", negative=())] = None,
-    scale: int = 1,
+    scale: Whole = 1,
     scale_mode: Literal["binned", "same-photons"] = "binned",
-    workers: int = 1,
+    workers: Whole = 1,
     scheduler: str | None = None,
     withhold_truth: Path | None = None,
     dry_run: Annotated[bool, Parameter(negative=())] = False,
@@ -130,7 +131,7 @@ def verify(
     *,
     repair: Annotated[bool, Parameter(negative=())] = False,
     scene_folder: Path | None = None,
-    workers: int = 1,
+    workers: Whole = 1,
 ) -> None:
     """Check that a dataset, or each cell of a sweep, is complete and intact; the exit code is 0 only then.
 
@@ -215,7 +216,7 @@ def datasheet(
     *,
     out: Path | None = None,
     wavelength_nm: float = 530.0,
-    side_px: int = 512,
+    side_px: Whole = 512,
     json_: Annotated[bool, Parameter(name="--json", negative=())] = False,
 ) -> None:
     """Measure a sensor by photon transfer on its own frames (EMVA 1288); print measured values beside the set ones.
@@ -287,9 +288,9 @@ def budget(
     /,
     *,
     set_: Annotated[list[str] | None, Parameter(name="--set", negative=())] = None,
-    scale: int = 1,
+    scale: Whole = 1,
     scale_mode: Literal["binned", "same-photons"] = "binned",
-    poses: int = 40,
+    poses: Whole = 40,
     camera: str = "main",
     bound: bool = True,
     plot: Path | None = None,

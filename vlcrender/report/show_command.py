@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
+from vlcrender.core.arguments import Whole
 from vlcrender.errors import InputError
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ def show(
     recipe: str | None = None,
     /,
     *,
-    frame: int = 0,
+    frame: Whole = 0,
     set_: Annotated[list[str] | None, Parameter(name="--set", negative=())] = None,
     out: Path | None = None,
     reference: Annotated[bool, Parameter(negative=())] = False,

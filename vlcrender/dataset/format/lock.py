@@ -69,13 +69,15 @@ def _held(directory: Path, kind: int, command: str) -> Iterator[None]:
 
 def _acquired(path: Path, kind: int, command: str) -> int | None:
     """Descriptor of the lock's file; None where there can be no lock."""
+    missing: OSError | None = None
     for _ in range(ATTEMPTS):
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             descriptor = _opened(path)
         except FileExistsError:
             raise InputError(f"{path.parent}: not a folder; nothing was changed; choose another --out") from None
-        except FileNotFoundError:
+        except FileNotFoundError as error:
+            missing = error
             continue  # a run that was refused has removed the folder that it had made
         if descriptor is None:
             return None
@@ -93,6 +95,8 @@ def _acquired(path: Path, kind: int, command: str) -> int | None:
                 log.warning("%s: has no locks (%s): start no second run in it", path.parent, error.strerror)
                 return None
         os.close(descriptor)
+    if missing is not None:
+        raise InputError(f"{path.parent}: cannot be made: {missing.strerror}; choose another --out")
     raise InputError(f"{path}: cannot be locked: other runs replace the file all the time")
 
 
