@@ -10,7 +10,7 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from paper_figures import BARE, BARE_CENTROID, CENTROID, PAPER, REDUCED, REDUCED_CENTROID
 from paper_items import ITEMS, Item
-from paper_sets import PAGE, ROOT, key_text
+from paper_sets import BOUND, PAGE, ROOT, key_text
 
 from estimator.evaluate.table_text import value_text
 
@@ -200,6 +200,10 @@ CLAIMS = (
 )
 
 
+VERDICT = 6
+"""Column of the verdict in a claim's row."""
+
+
 class Figure(float):
     """A number in a sentence: the format `m` is a length, `%` a share with one digit, `.3%` with three."""
 
@@ -211,22 +215,29 @@ class Figure(float):
 
 
 def kept(name: str) -> dict[str, Any] | None:
-    """What docs/paper/ keeps of an item; None where it was not run."""
+    """What docs/paper/ keeps of an item, or of `full/ITEM` at the paper's size; None where it was not run."""
     path = PAGE / f"{name}.json"
     return json.loads(path.read_text()) if path.is_file() else None
 
 
-def claim_row(claim: Claim, figures: Mapping[str, float] | None) -> list[str]:
-    """Cells of a claim: item, text, paper, ours, ratio, threshold, verdict."""
+def claim_row(claim: Claim, figures: Mapping[str, float] | None, full: Mapping[str, float] | None) -> list[str]:
+    """Cells of a claim: item, text, paper, ours, ratio, threshold, verdict; ours and verdict at the paper's size."""
     sign = ">=" if claim.at_least else "<="
     threshold = f"{sign} {claim.holds:g} ({claim.in_part:g})"
-    value = None if figures is None else figures.get(claim.figure)
+    (ours, ratio, verdict), (of_full, _, full_verdict) = (_judged(claim, one) for one in (figures, full))
     paper = _number(claim.paper, claim.unit)
+    cells = [claim.item, claim.text, paper, ours, ratio, threshold, verdict]
+    return [*cells, "" if full is None else f"{of_full}: {full_verdict}"]
+
+
+def _judged(claim: Claim, figures: Mapping[str, float] | None) -> tuple[str, str, str]:
+    """Ours, its ratio to the paper's, and the verdict."""
     if figures is None:
-        return [claim.item, claim.text, paper, "", "", threshold, "not run"]
+        return "", "", "not run"
+    value = figures.get(claim.figure)
     ours = math.nan if value is None else value
     ratio = ours / claim.paper
-    return [claim.item, claim.text, paper, _number(ours, claim.unit), _ratio(ratio), threshold, claim.verdict(ratio)]
+    return _number(ours, claim.unit), _ratio(ratio), claim.verdict(ratio)
 
 
 def _ratio(value: float) -> str:
@@ -271,7 +282,7 @@ def _statistic(view: Mapping[str, Any], row: Mapping[str, Any] | None) -> str:
     if row is None:
         return ""
     value, low, high = row[view["shown"]]
-    failed = row["frames"] - row["answered"]
+    failed = 0 if row["group"] == BOUND else row["frames"] - row["answered"]
     more = f"; {failed} failed" if failed else ""
     if value is None:
         return more.removeprefix("; ") or "–"
@@ -280,12 +291,16 @@ def _statistic(view: Mapping[str, Any], row: Mapping[str, Any] | None) -> str:
 
 
 def failures(view: Mapping[str, Any]) -> list[str]:
-    """Failed frames of a table by variant and reason."""
-    counts: dict[tuple[str, str], int] = {}
+    """Failed frames of a table: each reason, the most frequent first, with the frames of each variant."""
+    counts: dict[str, dict[str, int]] = {}
     for row in view["rows"]:
-        for reason, count in row["failures"].items():
-            counts[row["group"], reason] = counts.get((row["group"], reason), 0) + count
-    return [f"{NAMES.get(group, group)}: {count} x {reason}" for (group, reason), count in counts.items()]
+        for reason, count in {} if row["group"] == BOUND else row["failures"].items():
+            of_reason, name = counts.setdefault(reason, {}), NAMES.get(row["group"], row["group"])
+            of_reason[name] = of_reason.get(name, 0) + count
+    return [
+        f"{reason}: {', '.join(f'{name} {count}' for name, count in of_reason.items())}"
+        for reason, of_reason in sorted(counts.items(), key=lambda one: -sum(one[1].values()))
+    ]
 
 
 def sentence(item: Item, figures: Mapping[str, float | None]) -> str:
@@ -315,15 +330,28 @@ def section(item: Item) -> dict[str, Any]:
         "inside": f"{inside} of {means}" if means else "",
         "cpu_s": sum(one["generate_s"] + one["estimate_s"] for one in record["sets"]),
         "frames": sum(one["frames"] for one in record["sets"]),
+        "full": full_size(item),
     }
+
+
+def full_size(item: Item) -> dict[str, Any] | None:
+    """What the templates show of an item at the paper's size; None where it was not run."""
+    record = kept(f"full/{item.name}")
+    if record is None:
+        return None
+    frames = sum(one["frames"] for one in record["sets"])
+    views = [{"title": view["title"], "stem": f"full/{item.name}-{view['name']}"} for view in record["views"]]
+    return {"command": record["command"], "commit": record["commit"], "frames": frames, "views": views}
 
 
 def pages() -> dict[str, str]:
     """Texts of docs/paper.md and docs/paper.html by name."""
-    figures = {name: (record := kept(name)) and record["figures"] for name in ITEMS}
-    claims = [claim_row(claim, figures[claim.item]) for claim in CLAIMS]
+    figures, full = (
+        {name: (record := kept(folder + name)) and record["figures"] for name in ITEMS} for folder in ("", "full/")
+    )
+    claims = [claim_row(claim, figures[claim.item], full[claim.item]) for claim in CLAIMS]
     sections = [section(item) for item in ITEMS.values()]
-    verdicts = [row[-1] for row in claims]
+    verdicts = [row[VERDICT] for row in claims]
     counts = {one: verdicts.count(one) for one in ("holds", "in part", "does not hold", "no answer", "not run")}
     context = {
         "claims": claims,

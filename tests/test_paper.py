@@ -96,7 +96,7 @@ def test_kept_tables_are_of_the_recipes_as_they_are() -> None:
     """A recipe that changed after its set was measured is noticed."""
     import hashlib
 
-    for path in PAPER.glob("*.json"):
+    for path in PAPER.rglob("*.json"):
         for one in json.loads(path.read_text())["sets"]:
             recipe = (PAPER / f"{one['name']}.toml").read_bytes()
             assert one["recipe"] == hashlib.sha256(recipe).hexdigest(), one["name"]
