@@ -352,10 +352,12 @@ def pages() -> dict[str, str]:
     claims = [claim_row(claim, figures[claim.item], full[claim.item]) for claim in CLAIMS]
     sections = [section(item) for item in ITEMS.values()]
     verdicts = [row[VERDICT] for row in claims]
-    counts = {one: verdicts.count(one) for one in ("holds", "in part", "does not hold", "no answer", "not run")}
+    full_verdicts = [row[VERDICT + 1].rpartition(": ")[2] for row in claims]
+    differ = [one for one, other in zip(full_verdicts, verdicts, strict=True) if one and one != other]
     context = {
         "claims": claims,
-        "counts": counts,
+        "counts": _counts(verdicts),
+        "full_counts": _counts(full_verdicts) | {"differ": len(differ)},
         "open": next(one for one in sections if one["name"] == "open"),
         "sections": [one for one in sections if one["name"] != "open"],
         "not_run": [one["title"] for one in sections if not one["run"]],
@@ -375,6 +377,11 @@ def pages() -> dict[str, str]:
         environment.filters["row"] = markdown_row
         texts[name] = environment.get_template(name).render(context)
     return texts
+
+
+def _counts(verdicts: Sequence[str]) -> dict[str, int]:
+    """How many claims have each verdict."""
+    return {one: verdicts.count(one) for one in ("holds", "in part", "does not hold", "no answer", "not run")}
 
 
 def markdown_row(cells: Sequence[object]) -> str:
