@@ -18,7 +18,7 @@ from estimator.camera.pose import Pose
 from estimator.evaluate.statistics import Groups, nees, nees_by_map, rmse_interval
 from estimator.io.dataset import Dataset, read_dataset
 from estimator.io.truth import read_truth
-from estimator.solvers.self_calibration import DeviceView, Unknowns, _Frame
+from estimator.solvers.device_equations import DeviceEquations, DeviceView, Unknowns
 
 SETS = 2000
 SETS_OF_RMSE = 400
@@ -58,7 +58,7 @@ def main(folder: Path) -> None:
     groups = Groups.of([record.device for record in dataset.frames], [true.map for true in truth])
     gains, roots, inverses, total = [], [], [], []
     for view in views:
-        line = _Frame(view, unknowns).linear(view.pose, np.zeros(7), np.zeros(unknowns.count))
+        line = DeviceEquations(view, unknowns).linear(view.pose, np.zeros(7), np.zeros(unknowns.count))
         # With y the common errors: the position errs by G S^-1 y, S = I + rows^T rows, and by the frame's own errors.
         S = np.eye(len(line.columns)) + line.rows.T @ line.rows
         gain = np.zeros((3, unknowns.count))

@@ -10,8 +10,9 @@ from pathlib import Path
 
 from target import Targets
 
+from vlcrender.dataset.format.files import EXPECTED, FRAMES, PREVIEWS
 from vlcrender.dataset.recipe.plan import load_plan
-from vlcrender.dataset.run.frame_job import EXPECTED, FRAMES, PREVIEWS, Job, make_frame
+from vlcrender.dataset.run.frame_job import Job, make_frame
 
 
 def peak_gib() -> float:
