@@ -1,5 +1,7 @@
 """Frames of a dataset: what is new in each frame and what is shared, and the bound of a frame against a direct call."""
 
+import gc
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +35,34 @@ def pixels(path: Path) -> np.ndarray:
     with OpenEXR.File(str(path), separate_channels=True) as file:
         image: np.ndarray = file.channels()["Y"].pixels.astype(float)
     return image
+
+
+def test_the_memory_of_a_view_is_free_as_soon_as_the_next_is_rendered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without Python's search for circles of references, which would find the images of some 15 full frames later."""
+    for name in ("frames", "expected", "previews"):
+        (tmp_path / name).mkdir()
+    plan, views = plan_of("poses.count=2", "bound=true"), []
+    rendered = frame_job._rendered
+
+    def noted(*place: object) -> object:
+        view = rendered(*place)  # type: ignore[arg-type]
+        views.append(weakref.ref(view))
+        return view
+
+    monkeypatch.setattr(frame_job, "_rendered", noted)
+    job = Job.of(plan, tmp_path)
+    gc.collect()
+    gc.disable()
+    try:
+        for frame in range(2):
+            frame_job.make_frame(job, frame)
+        first, second = views
+        assert first() is None
+        assert second() is not None
+    finally:
+        gc.enable()
 
 
 SHOTS = 4

@@ -46,7 +46,7 @@ from vlcrender.dataset.world.true_world import (
     shots_differ,
     true_camera,
 )
-from vlcrender.dataset.world.views import View
+from vlcrender.dataset.world.views import ExposedView, View
 from vlcrender.errors import InputError
 from vlcrender.light.lightmap import bake
 from vlcrender.modulation.exposure import MeanWave
@@ -183,12 +183,12 @@ def make_frame(job: Job, frame: int, twin: Files | None = None, shard: Shard | N
     in_frame = number if shots_differ(recipe) else None
     views = _views_at(job.scene_key, keyed.seen, *place, in_frame)
     if which not in views:
-        views[which] = _rendered(job, *place, which, in_frame)
-    view = views[which]
+        views[which] = ExposedView(_rendered(job, *place, which, in_frame))
+    view = views[which].view
     image, pose = view.image, view.posed.pose
     waves = _world_of(job).waves(map_number)
     start_s = recipe.start_s(shot, bool(waves))
-    exposure = view.exposure(recipe, keyed.files_key)
+    exposure = views[which].exposure(recipe, keyed.files_key)
     exposed = exposure.frame(waves, start_s)
     file, part = frame_file(frame, recipe.files.format), None
     others: list[str] = []
@@ -298,7 +298,7 @@ def _led_truth(patch: LedPatch, wave: Wave | None, start_s: float) -> LedTruth:
 
 
 @lru_cache(maxsize=1)
-def _views_at(scene: SceneKey, seen: Seen, pose_number: int, number: int, frame: int | None) -> dict[int, View]:
+def _views_at(scene: SceneKey, seen: Seen, pose_number: int, number: int, frame: int | None) -> dict[int, ExposedView]:
     """Views of the cameras of a rig at a place, by the camera's number; kept until frames at another place are made."""
     return {}
 

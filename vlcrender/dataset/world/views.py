@@ -38,21 +38,11 @@ class View:
     image: ExpectedImage
     room: MeanWave
     """Light of all LEDs of the room."""
-    _latest: dict[str, "Exposure"] = field(default_factory=dict)
 
     @property
     def posed(self) -> PosedCamera:
         """The camera in the middle of its frame."""
         return self.mounted.posed(self.middle)
-
-    def exposure(self, recipe: Recipe, files_key: str) -> "Exposure":
-        """The exposure by a recipe; the latest one is kept for recipes with the same `files_key`."""
-        exposure = self._latest.get(files_key)
-        if exposure is None:
-            exposure = Exposure(self, recipe, recipe.time_s(self.image))
-            self._latest.clear()
-            self._latest[files_key] = exposure
-        return exposure
 
     @cached_property
     def slopes(self) -> FrameSlopes | None:
@@ -71,6 +61,27 @@ class View:
 
 
 @dataclass(frozen=True, eq=False)
+class ExposedView:
+    """A view and its latest exposure.
+
+    A view does not know its exposures, nor a frame its exposure: the memory of images in a circle of references
+    would be free only when Python looks for circles, some 15 full frames later.
+    """
+
+    view: View
+    _latest: dict[str, "Exposure"] = field(default_factory=dict)
+
+    def exposure(self, recipe: Recipe, files_key: str) -> "Exposure":
+        """The exposure by a recipe; the latest one is kept for recipes with the same `files_key`."""
+        exposure = self._latest.get(files_key)
+        if exposure is None:
+            exposure = Exposure(self.view, recipe, recipe.time_s(self.view.image))
+            self._latest.clear()
+            self._latest[files_key] = exposure
+        return exposure
+
+
+@dataclass(frozen=True, eq=False)
 class Exposure:
     """Exposures of a view by a recipe, and by all whose frames have the same files."""
 
@@ -80,18 +91,23 @@ class Exposure:
 
     def frame(self, waves: Mapping[int, Wave], start_s: float) -> "NoiselessFrame":
         """The frame that starts at `start_s`; computed once where all light is steady."""
-        return NoiselessFrame(self, waves, start_s) if waves else self._steady
+        return self._frame(waves, start_s) if waves else self._steady
 
     @cached_property
     def _steady(self) -> "NoiselessFrame":
-        return NoiselessFrame(self, {}, 0.0)
+        return self._frame({}, 0.0)
+
+    def _frame(self, waves: Mapping[int, Wave], start_s: float) -> "NoiselessFrame":
+        return NoiselessFrame(self.view, self.recipe, self.exposure_s, waves, start_s)
 
 
 @dataclass(frozen=True, eq=False)
 class NoiselessFrame:
-    """A frame before its noise."""
+    """A frame of a view by the recipe of its exposure, before its noise."""
 
-    exposure: Exposure
+    view: View
+    recipe: Recipe
+    exposure_s: float
     waves: Mapping[int, Wave]
     start_s: float
     _bounds: dict[tuple[float, float], tuple[Flat9 | None, Flat9 | None]] = field(default_factory=dict)
@@ -101,24 +117,23 @@ class NoiselessFrame:
         """Gains of the LEDs and of the room's light."""
         if not self.waves:
             return None, 1.0
-        view, exposure_s = self.exposure.view, self.exposure.exposure_s
-        starts_s = self.start_s + view.mounted.camera.line_starts_s()
-        return LineGains(self.waves, starts_s, exposure_s), view.room.mean(starts_s, exposure_s)
+        starts_s = self.start_s + self.view.mounted.camera.line_starts_s()
+        return LineGains(self.waves, starts_s, self.exposure_s), self.view.room.mean(starts_s, self.exposure_s)
 
     @cached_property
     def expected(self) -> list[RegionImage]:
         """Electrons of each region."""
         gains, room_gain = self._gains
         return [
-            RegionImage(part.roi, part.expected_electrons(self.exposure.exposure_s, gains, room_gain))
-            for part in self.exposure.view.image.parts
+            RegionImage(part.roi, part.expected_electrons(self.exposure_s, gains, room_gain))
+            for part in self.view.image.parts
         ]
 
     @cached_property
     def added_dn(self) -> float | None:
         """Standard deviation of the noise that is added, digital numbers; None where none is."""
-        recipe = self.exposure.recipe
-        return None if recipe.added_noise is None else recipe.added_noise_dn(self.expected)
+        noise = self.recipe.added_noise
+        return None if noise is None else self.recipe.added_noise_dn(self.expected)
 
     def added(self, key: str) -> AddedDn | None:
         """The noise that is added, by the random numbers that `key` names."""
@@ -130,10 +145,9 @@ class NoiselessFrame:
         recipe: one with the same files, whose accelerometer counts. The bound takes gains of LEDs as known. None where
         the recipe does not ask for bounds, or where the frame does not determine a position.
         """
-        view = self.exposure.view
         if not recipe.bound or self._slopes is None:
             return None, None
-        tilts_deg = tilt_sigmas_deg(recipe, view.main)
+        tilts_deg = tilt_sigmas_deg(recipe, self.view.main)
         if tilts_deg not in self._bounds:
             self._bounds[tilts_deg] = self._bounds_with(recipe, self._slopes, tilts_deg)
         return self._bounds[tilts_deg]
@@ -141,7 +155,7 @@ class NoiselessFrame:
     @cached_property
     def _slopes(self) -> FrameSlopes | None:
         """Slopes of the LEDs' images with the variance of the frame's pixels."""
-        recipe, slopes, exposure_s = self.exposure.recipe, self.exposure.view.slopes, self.exposure.exposure_s
+        recipe, slopes, exposure_s = self.recipe, self.view.slopes, self.exposure_s
         if slopes is None:
             return None
         added_dn = self.added_dn or 0.0
@@ -153,7 +167,7 @@ class NoiselessFrame:
     def _bounds_with(
         self, recipe: Recipe, slopes: FrameSlopes, tilts_deg: tuple[float, float]
     ) -> tuple[Flat9 | None, Flat9 | None]:
-        view = self.exposure.view
+        view = self.view
         exact = slopes.exact_bound_m2(tilts_deg)
         hybrid = exact
         if recipe.belief is not None:
