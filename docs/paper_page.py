@@ -200,8 +200,8 @@ CLAIMS = (
 )
 
 
-VERDICT = 6
-"""Column of the verdict in a claim's row."""
+VERDICT, FULL_VERDICT = 6, 8
+"""Columns of the verdicts in a claim's row."""
 
 
 class Figure(float):
@@ -224,10 +224,10 @@ def claim_row(claim: Claim, figures: Mapping[str, float] | None, full: Mapping[s
     """Cells of a claim: item, text, paper, ours, ratio, threshold, verdict; ours and verdict at the paper's size."""
     sign = ">=" if claim.at_least else "<="
     threshold = f"{sign} {claim.holds:g} ({claim.in_part:g})"
-    (ours, ratio, verdict), (of_full, _, full_verdict) = (_judged(claim, one) for one in (figures, full))
+    ours, ratio, verdict = _judged(claim, figures)
+    of_full, _, full_verdict = ("", "", "") if full is None else _judged(claim, full)
     paper = _number(claim.paper, claim.unit)
-    cells = [claim.item, claim.text, paper, ours, ratio, threshold, verdict]
-    return [*cells, "" if full is None else f"{of_full}: {full_verdict}"]
+    return [claim.item, claim.text, paper, ours, ratio, threshold, verdict, of_full, full_verdict]
 
 
 def _judged(claim: Claim, figures: Mapping[str, float] | None) -> tuple[str, str, str]:
@@ -352,7 +352,7 @@ def pages() -> dict[str, str]:
     claims = [claim_row(claim, figures[claim.item], full[claim.item]) for claim in CLAIMS]
     sections = [section(item) for item in ITEMS.values()]
     verdicts = [row[VERDICT] for row in claims]
-    full_verdicts = [row[VERDICT + 1].rpartition(": ")[2] for row in claims]
+    full_verdicts = [row[FULL_VERDICT] for row in claims]
     differ = [one for one, other in zip(full_verdicts, verdicts, strict=True) if one and one != other]
     context = {
         "claims": claims,
