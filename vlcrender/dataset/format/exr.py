@@ -44,8 +44,10 @@ def exr_bytes(images: Sequence[RegionImage], sensor: Roi, attributes: Mapping[st
 def _parts(
     images: Sequence[RegionImage], sensor: Roi, attributes: Mapping[str, Any], names: Sequence[str]
 ) -> list[OpenEXR.Part]:
+    full = [roi for roi, _ in images] == [sensor]
     header = {
-        "compression": OpenEXR.PIZ_COMPRESSION,
+        # With ZIP regions are written in a quarter of the time, and read in less than half; full frames are not.
+        "compression": OpenEXR.PIZ_COMPRESSION if full else OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,
         "displayWindow": _box(sensor),
         **attributes,

@@ -34,7 +34,7 @@ from vlcrender.sensor.gyroscope import Gyroscope
 
 FORMAT_VERSION: Final = 4
 """`version` of dataset.json."""
-DATA_VERSION = 5
+DATA_VERSION = 6
 """`data_version` of the provenance: raised whenever the same recipe gives other bits."""
 
 Seven = tuple[Sigma, Sigma, Sigma, Sigma, Sigma, Sigma, Sigma]

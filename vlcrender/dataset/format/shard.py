@@ -107,22 +107,24 @@ def _parts_of(data: bytes) -> Iterator[_Part]:
         )
 
 
-LINES_OF_A_CHUNK = 32
-"""Of PIZ compression."""
+LINES_OF_A_CHUNK = {3: 16, 4: 32}
+"""By the number of a compression: ZIP, PIZ."""
 
 
 def _header(data: bytes, place: int) -> tuple[int, int]:
     """End of the attributes of a header that starts at `place`, and its number of chunks."""
-    chunks = 0
+    lines, lines_of_a_chunk = 0, 1
     while data[place]:
         name_end = data.index(b"\0", place)
         type_end = data.index(b"\0", name_end + 1)
         (size,) = struct.unpack_from("<i", data, type_end + 1)
         if data[place:name_end] == b"dataWindow":
             _, top, _, bottom = struct.unpack_from("<4i", data, type_end + 5)
-            chunks = -(-(bottom - top + 1) // LINES_OF_A_CHUNK)
+            lines = bottom - top + 1
+        elif data[place:name_end] == b"compression":
+            lines_of_a_chunk = LINES_OF_A_CHUNK[data[type_end + 5]]
         place = type_end + 5 + size
-    return place, chunks
+    return place, -(-lines // lines_of_a_chunk)
 
 
 def _joined(parts: Sequence[_Part]) -> bytes:
