@@ -119,6 +119,16 @@ def test_a_fish_eye_is_opencv_s_without_coefficients_up_to_90_deg() -> None:
     np.testing.assert_allclose(found, expected[:, 0], atol=1e-12)
 
 
+def test_distortion_and_its_derivatives_are_opencv_s() -> None:
+    lens, points = Distortion(k1=-0.3, k2=0.2, k3=0.1, p1=0.003, p2=-0.002), POINTS - (3.5, 3.6, 2.0)
+    image, jacobian = Perspective(lens).project(points)
+    coefficients, zero = np.array([lens.k1, lens.k2, lens.p1, lens.p2, lens.k3]), np.zeros(3)
+    expected, slopes, *_ = cv2.projectPoints(points, zero, zero, np.eye(3), coefficients)
+    np.testing.assert_allclose(image, expected[:, 0], atol=1e-14)
+    # OpenCV's columns 3 to 5 are by the translation, which shifts the points.
+    np.testing.assert_allclose(jacobian, slopes[:, 3:6].reshape(-1, 2, 3), atol=1e-14)
+
+
 def test_a_fish_eye_images_directions_beyond_90_deg() -> None:
     """120 deg off the axis along -y: the image is at (0, -2 pi / 3)."""
     ray = np.array([[0.0, -np.sin(np.radians(120)), np.cos(np.radians(120))]])

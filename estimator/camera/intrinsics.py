@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.compiled import compiled
 from estimator.io.camera import INTRINSICS, Camera, Distortion
 
 Floats = NDArray[np.float64]
@@ -38,16 +39,23 @@ def intrinsic_slopes_px(p_cam: Floats, image: Floats, camera: Camera) -> Floats:
     `p_cam` (n, 3) are the points in camera axes, `image` (n, 2) their normalized image coordinates. An equidistant lens
     has no k1, p1, p2: their slopes are 0.
     """
-    K = camera.matrix()
+    return _slopes(p_cam, image, camera.matrix(), camera.projection == "perspective")
+
+
+@compiled
+def _slopes(p_cam: Floats, image: Floats, K: Floats, is_perspective: bool) -> Floats:
+    """See `intrinsic_slopes_px`."""
     slopes = np.zeros((len(p_cam), 2, CAMERA_PARAMETERS))
-    slopes[:, 0, 0], slopes[:, 1, 0] = K[0, 0] * image[:, 0], K[1, 1] * image[:, 1]
-    slopes[:, 0, 1], slopes[:, 1, 1] = slopes[:, 0, 0] / 2, -slopes[:, 1, 0] / 2
-    slopes[:, 0, 2] = slopes[:, 1, 3] = 1.0
-    if camera.projection == "perspective":
-        with np.errstate(all="ignore"):
-            a, b = p_cam[:, 0] / p_cam[:, 2], p_cam[:, 1] / p_cam[:, 2]
-        r2 = a * a + b * b
-        along_x = np.stack([a * r2, 2 * a * b, r2 + 2 * a * a], axis=1)
-        along_y = np.stack([b * r2, r2 + 2 * b * b, 2 * a * b], axis=1)
-        slopes[:, :, 4:] = K[:2, :2] @ np.stack([along_x, along_y], axis=1)
+    for i in range(len(p_cam)):
+        u, v = K[0, 0] * image[i, 0], K[1, 1] * image[i, 1]
+        slopes[i, 0, 0], slopes[i, 1, 0] = u, v
+        slopes[i, 0, 1], slopes[i, 1, 1] = u / 2, -v / 2
+        slopes[i, 0, 2] = slopes[i, 1, 3] = 1.0
+        if is_perspective:
+            a, b = p_cam[i, 0] / p_cam[i, 2], p_cam[i, 1] / p_cam[i, 2]
+            r2 = a * a + b * b
+            along_x, along_y = (a * r2, 2 * a * b, r2 + 2 * a * a), (b * r2, r2 + 2 * b * b, 2 * a * b)
+            for row in range(2):
+                for k in range(3):
+                    slopes[i, row, 4 + k] = K[row, 0] * along_x[k] + K[row, 1] * along_y[k]
     return slopes

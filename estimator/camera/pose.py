@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.compiled import compact, compiled
 from estimator.io.camera import Camera
 
 Floats = NDArray[np.float64]
@@ -66,4 +67,15 @@ class Pose:
 
     def in_camera(self, points_m: Floats) -> Floats:
         """World points (n, 3) in camera axes, (n, 3), metres."""
-        return np.asarray((points_m - self.position_m) @ self.R_cam_world.T)
+        return _in_camera(compact(points_m), compact(self.position_m), compact(self.R_cam_world))
+
+
+@compiled
+def _in_camera(points_m: Floats, position_m: Floats, R_cam_world: Floats) -> Floats:
+    """See `Pose.in_camera`."""
+    p_cam = np.empty_like(points_m)
+    for i in range(len(points_m)):
+        x, y, z = points_m[i, 0] - position_m[0], points_m[i, 1] - position_m[1], points_m[i, 2] - position_m[2]
+        for k in range(3):
+            p_cam[i, k] = R_cam_world[k, 0] * x + R_cam_world[k, 1] * y + R_cam_world[k, 2] * z
+    return p_cam

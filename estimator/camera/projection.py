@@ -4,6 +4,7 @@ Normalized image coordinates (x, y) are in units of the image distance, from the
 maps them to pixels.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -11,10 +12,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.camera.pose import POSE_PARAMETERS, Pose, rotation
+from estimator.camera.pose import Pose
+from estimator.compiled import compact, compiled
 from estimator.io.camera import Camera, Distortion
 
 Floats = NDArray[np.float64]
+Row = tuple[float, float, float]
 
 # A point closer than this to the image-plane directions of a perspective lens has no image: 89.9 deg off the axis.
 MIN_DEPTH_SHARE = 1e-3
@@ -47,7 +50,7 @@ class Projection(Protocol):
 
 @dataclass(frozen=True)
 class Perspective:
-    """Pinhole with optional Brown-Conrady distortion, which OpenCV computes.
+    """Pinhole with optional Brown-Conrady distortion, which OpenCV undoes.
 
     Valid: directions less than 89.9 deg off the axis, up to where the distortion folds the image.
     """
@@ -61,20 +64,10 @@ class Perspective:
 
     def project(self, p_cam: Floats) -> tuple[Floats, Floats]:
         """See `Projection.project`."""
-        x, y, z = p_cam.T
-        with np.errstate(all="ignore"):
-            valid = z > MIN_DEPTH_SHARE * np.linalg.norm(p_cam, axis=1)
-            z = np.where(valid, z, np.nan)
-            plane = np.stack([x / z, y / z], axis=1)
-            jacobian = np.zeros((len(p_cam), 2, 3))
-            jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1 / z
-            jacobian[:, :, 2] = -plane / z[:, None]
-            if self.distortion is None or len(p_cam) == 0:
-                return plane, jacobian
-            image, slope = _distorted(plane, self.distortion)
-            # Beyond the fold the image is reversed, or its radius shrinks.
-            folded = (np.linalg.det(slope) <= 0) | (np.einsum("ni,nij,nj->n", plane, slope, plane) < 0)
-            return np.where(folded[:, None], np.nan, image), slope @ jacobian
+        plane, jacobian = _pinhole(compact(p_cam))
+        if self.distortion is None:
+            return plane, jacobian
+        return _distorted(plane, jacobian, _coefficients(self.distortion))
 
     def unproject(self, image: Floats) -> Floats:
         """See `Projection.unproject`."""
@@ -113,20 +106,7 @@ class Equidistant:
 
     def project(self, p_cam: Floats) -> tuple[Floats, Floats]:
         """See `Projection.project`."""
-        x, y, z = p_cam.T
-        with np.errstate(all="ignore"):
-            rho = np.maximum(np.hypot(x, y), 1e-12 * np.abs(z))
-            scale = np.arctan2(rho, z) / rho
-            distance2 = rho * rho + z * z
-            # (d scale / d rho) / rho, from d theta / d rho = z / distance2; and d theta / dz = -rho / distance2.
-            scale_slope = (z / distance2 - scale) / (rho * rho)
-            across = p_cam[:, :2]
-            jacobian = np.empty((len(p_cam), 2, 3))
-            jacobian[:, :, :2] = across[:, :, None] * across[:, None, :] * scale_slope[:, None, None]
-            jacobian[:, 0, 0] += scale
-            jacobian[:, 1, 1] += scale
-            jacobian[:, :, 2] = -across / distance2[:, None]
-            return across * scale[:, None], jacobian
+        return _equidistant(compact(p_cam))
 
     def unproject(self, image: Floats) -> Floats:
         """See `Projection.unproject`."""
@@ -150,12 +130,64 @@ def _coefficients(distortion: Distortion) -> Floats:
     return np.array([distortion.k1, distortion.k2, distortion.p1, distortion.p2, distortion.k3])
 
 
-def _distorted(plane: Floats, distortion: Distortion) -> tuple[Floats, Floats]:
-    """Distorted image (n, 2) of pinhole coordinates (n, 2), and its Jacobian (n, 2, 2)."""
-    at_depth_1 = np.column_stack([plane, np.ones(len(plane))])
-    image, jacobian = cv2.projectPoints(at_depth_1, np.zeros(3), np.zeros(3), np.eye(3), _coefficients(distortion))[:2]
-    # Columns 3 and 4 are by the translation along x and y, which at depth 1 shifts the pinhole coordinates.
-    return image.reshape(-1, 2), jacobian[:, 3:5].reshape(-1, 2, 2)
+@compiled
+def _pinhole(p_cam: Floats) -> tuple[Floats, Floats]:
+    """Image (n, 2) of points (n, 3) by a pinhole, and its Jacobian (n, 2, 3); NaN beside and behind the camera."""
+    plane, jacobian = np.empty((len(p_cam), 2)), np.zeros((len(p_cam), 2, 3))
+    for i in range(len(p_cam)):
+        x, y, z = p_cam[i, 0], p_cam[i, 1], p_cam[i, 2]
+        if not z > MIN_DEPTH_SHARE * math.sqrt(x * x + y * y + z * z):
+            z = np.nan
+        by_depth = 1 / z
+        plane[i, 0], plane[i, 1] = x * by_depth, y * by_depth
+        jacobian[i, 0, 0] = jacobian[i, 1, 1] = by_depth
+        jacobian[i, 0, 2], jacobian[i, 1, 2] = -plane[i, 0] * by_depth, -plane[i, 1] * by_depth
+    return plane, jacobian
+
+
+@compiled
+def _distorted(plane: Floats, jacobian: Floats, coefficients: Floats) -> tuple[Floats, Floats]:
+    """Distorted image (n, 2) of pinhole coordinates (n, 2), NaN where it is folded, and its Jacobian (n, 2, 3).
+
+    `jacobian` (n, 2, 3) is that of the pinhole coordinates.
+    """
+    image, distorted = np.empty_like(plane), np.empty_like(jacobian)
+    k1, k2, p1, p2, k3 = coefficients
+    for i in range(len(plane)):
+        a, b = plane[i, 0], plane[i, 1]
+        r2 = a * a + b * b
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        u = a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a * a)
+        v = b * radial + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b
+        # By a the radial factor changes by 2 a `slope`, by b by 2 b `slope`.
+        slope = k1 + r2 * (2 * k2 + r2 * 3 * k3)
+        u_a = radial + 2 * (a * a * slope + p1 * b + 3 * p2 * a)
+        v_b = radial + 2 * (b * b * slope + 3 * p1 * b + p2 * a)
+        across = 2 * (a * b * slope + p1 * a + p2 * b)
+        # Beyond the fold the image is reversed, or its radius shrinks.
+        folded = (u_a * v_b <= across * across) | (a * a * u_a + 2 * a * b * across + b * b * v_b < 0)
+        image[i, 0], image[i, 1] = np.nan if folded else u, np.nan if folded else v
+        for k in range(3):
+            distorted[i, 0, k] = u_a * jacobian[i, 0, k] + across * jacobian[i, 1, k]
+            distorted[i, 1, k] = across * jacobian[i, 0, k] + v_b * jacobian[i, 1, k]
+    return image, distorted
+
+
+@compiled
+def _equidistant(p_cam: Floats) -> tuple[Floats, Floats]:
+    """Image (n, 2) of points (n, 3) by a fish-eye, and its Jacobian (n, 2, 3)."""
+    image, jacobian = np.empty((len(p_cam), 2)), np.empty((len(p_cam), 2, 3))
+    for i in range(len(p_cam)):
+        x, y, z = p_cam[i, 0], p_cam[i, 1], p_cam[i, 2]
+        rho = max(math.sqrt(x * x + y * y), 1e-12 * abs(z))
+        scale, distance2 = math.atan2(rho, z) / rho, rho * rho + z * z
+        # (d scale / d rho) / rho, from d theta / d rho = z / distance2; and d theta / dz = -rho / distance2.
+        slope = (z / distance2 - scale) / (rho * rho)
+        image[i, 0], image[i, 1] = x * scale, y * scale
+        jacobian[i, 0, 0], jacobian[i, 1, 1] = scale + x * x * slope, scale + y * y * slope
+        jacobian[i, 0, 1] = jacobian[i, 1, 0] = x * y * slope
+        jacobian[i, 0, 2], jacobian[i, 1, 2] = -x / distance2, -y / distance2
+    return image, jacobian
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,20 +208,51 @@ def project(points_m: Floats, pose: Pose, camera: Camera) -> ProjectedPoints:
     """Images of world points (n, 3), and their derivatives by the POSE_PARAMETERS."""
     p_cam = pose.in_camera(points_m)
     image, jacobian = projection_of(camera).project(p_cam)
-    K = camera.matrix()
-    to_pixels = np.empty_like(jacobian)
-    to_pixels[:, 0] = K[0, 0] * jacobian[:, 0] + K[0, 1] * jacobian[:, 1]
-    to_pixels[:, 1] = K[1, 0] * jacobian[:, 0] + K[1, 1] * jacobian[:, 1]
-    slopes = np.empty((len(points_m), 2, POSE_PARAMETERS))
-    slopes[:, :, :3] = (to_pixels.reshape(-1, 3) @ -pose.R_cam_world).reshape(-1, 2, 3)
-    # A turn a of the camera's axes moves a point p in them by a x p, and its image by J (a x p) = (p x J) a.
-    turned = np.empty_like(to_pixels)
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        turned[:, :, i] = p_cam[:, j, None] * to_pixels[:, :, k] - p_cam[:, k, None] * to_pixels[:, :, j]
-    skews = [slope @ pose.R_cam_world.T for slope in rotation_slopes(pose, camera)]
-    axes = np.array([(skew[2, 1], skew[0, 2], skew[1, 0]) for skew in skews])
-    slopes[:, :, 3:] = (turned.reshape(-1, 3) @ axes.T).reshape(-1, 2, 3)
-    return ProjectedPoints(camera.to_pixels(image), slopes, p_cam)
+    R_cam_world, axes = compact(pose.R_cam_world), rotation_axes(pose, camera)
+    pixels, slopes = _posed(compact(p_cam), image, jacobian, camera.matrix(), R_cam_world, axes)
+    return ProjectedPoints(pixels, slopes, p_cam)
+
+
+@compiled
+def _posed(
+    p_cam: Floats, image: Floats, jacobian: Floats, K: Floats, R_cam_world: Floats, axes: Floats
+) -> tuple[Floats, Floats]:
+    """Pixels (n, 2) of points, and their derivatives (n, 2, 6) by the POSE_PARAMETERS.
+
+    `image` (n, 2) and `jacobian` (n, 2, 3) are those of the points `p_cam` (n, 3) in camera axes; by the angles of the
+    pose the world turns about the `axes` (3, 3), one a row, of the camera.
+    """
+    pixels, slopes = np.empty((len(p_cam), 2)), np.empty((len(p_cam), 2, 6))
+    # As numbers they stay in registers: elements of arrays would be read again after each result written.
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = _rows(R_cam_world)
+    lines, about = _rows(K), _rows(axes)
+    for i in range(len(p_cam)):
+        px, py, pz = p_cam[i, 0], p_cam[i, 1], p_cam[i, 2]
+        for row in range(2):
+            by_x, by_y, origin = lines[row]
+            pixels[i, row] = by_x * image[i, 0] + by_y * image[i, 1] + origin
+            x = by_x * jacobian[i, 0, 0] + by_y * jacobian[i, 1, 0]
+            y = by_x * jacobian[i, 0, 1] + by_y * jacobian[i, 1, 1]
+            z = by_x * jacobian[i, 0, 2] + by_y * jacobian[i, 1, 2]
+            slopes[i, row, 0] = -(x * xx + y * yx + z * zx)
+            slopes[i, row, 1] = -(x * xy + y * yy + z * zy)
+            slopes[i, row, 2] = -(x * xz + y * yz + z * zz)
+            # A turn a of the world moves a point p by a x p, and its image by J (a x p) = (p x J) a.
+            turned_x, turned_y, turned_z = py * z - pz * y, pz * x - px * z, px * y - py * x
+            for k in range(3):
+                ax, ay, az = about[k]
+                slopes[i, row, 3 + k] = turned_x * ax + turned_y * ay + turned_z * az
+    return pixels, slopes
+
+
+@compiled
+def _rows(matrix: Floats) -> tuple[Row, Row, Row]:
+    """Rows of a matrix (3, 3)."""
+    return (
+        (matrix[0, 0], matrix[0, 1], matrix[0, 2]),
+        (matrix[1, 0], matrix[1, 1], matrix[1, 2]),
+        (matrix[2, 0], matrix[2, 1], matrix[2, 2]),
+    )
 
 
 def images_px(points_m: Floats, pose: Pose, camera: Camera) -> tuple[Floats, Floats]:
@@ -213,16 +276,29 @@ def relative_illumination(pixels: Floats, camera: Camera) -> Floats:
         return np.asarray(np.maximum(rays[:, 2], 0.0) / area)
 
 
-def rotation_slopes(pose: Pose, camera: Camera) -> tuple[Floats, Floats, Floats]:
-    """Derivatives of `R_cam_world = R_cam_rig Rx Ry Rz` by tilt_x, tilt_y and yaw, each (3, 3)."""
-    about_x = np.array([[0.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-    about_y = np.array([[0.0, 0, -1], [0, 0, 0], [1, 0, 0]])
-    about_z = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 0]])
+def rotation_axes(pose: Pose, camera: Camera) -> Floats:
+    """Axes, in those of the camera, that the world turns about with the rig's tilt_x, tilt_y, yaw, (3, 3), one a row.
+
+    The rotation is `R_cam_world = R_cam_rig Rx Ry Rz`.
+    """
     R_cam_rig = camera.R_cam_rig_array()
-    R_rig_world = R_cam_rig.T @ pose.R_cam_world
-    Rx = rotation(pose.rig_angles(camera)[0], 0.0)
-    return (
-        R_cam_rig @ about_x @ R_rig_world,
-        R_cam_rig @ Rx @ about_y @ Rx.T @ R_rig_world,
-        pose.R_cam_world @ about_z,
+    return _axes(R_cam_rig, float(pose.rig_angles(camera)[0]), compact(pose.R_cam_world))
+
+
+@compiled
+def _axes(R_cam_rig: Floats, tilt_x: float, R_cam_world: Floats) -> Floats:
+    """See `rotation_axes`."""
+    axes, sine, cosine = np.empty((3, 3)), math.sin(tilt_x), math.cos(tilt_x)
+    for k in range(3):
+        axes[0, k] = -R_cam_rig[k, 0]
+        axes[1, k] = sine * R_cam_rig[k, 2] - cosine * R_cam_rig[k, 1]
+        axes[2, k] = -R_cam_world[k, 2]
+    return axes
+
+
+def rotation_slopes(pose: Pose, camera: Camera) -> tuple[Floats, Floats, Floats]:
+    """Derivatives of `R_cam_world` by the rig's tilt_x, tilt_y and yaw, each (3, 3)."""
+    about_x, about_y, about_z = (
+        np.cross(axis, pose.R_cam_world, axisb=0, axisc=0) for axis in rotation_axes(pose, camera)
     )
+    return about_x, about_y, about_z

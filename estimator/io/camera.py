@@ -15,7 +15,7 @@ Floats = NDArray[np.float64]
 
 def normalized(pixels: Floats, K: Floats) -> Floats:
     """Normalized image coordinates (n, 2), `K^-1 [u, v, 1]`, in units of the image distance, of pixels (n, 2)."""
-    return np.asarray((np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(K).T)[:, :2])
+    return np.asarray((pixels - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T)
 
 
 def to_pixels(image: Floats, K: Floats) -> Floats:

@@ -101,7 +101,7 @@ def _with_returned(
 def _settled(model: Observations, found: Fit, inliers: NDArray[np.bool_]) -> tuple[Observations, Fit]:
     """The size of errors with which chi-square is its degrees of freedom, and the fit with it."""
     for _ in range(MOMENT_ROUNDS):
-        freedom = max(degrees_of_freedom(model.only(inliers)), 1)
+        freedom = max(degrees_of_freedom(model, inliers), 1)
         model = _with_errors(model, found.chi2 / freedom)
         found = fit(model.only(inliers), found.pose)
     return model, found
@@ -143,9 +143,10 @@ def uses_gravity(observations: Observations) -> bool:
     return bool(np.isfinite(observations.tilt_sigma_rad).all())
 
 
-def degrees_of_freedom(observations: Observations) -> int:
-    """Degrees of freedom: two numbers a spot and two of gravity, less six of the pose."""
-    return 2 * len(observations.leds_m) + (2 if uses_gravity(observations) else 0) - 6
+def degrees_of_freedom(observations: Observations, inliers: NDArray[np.bool_] | None = None) -> int:
+    """Degrees of freedom: two numbers a spot, of all or of inliers (n,), and two of gravity, less six of the pose."""
+    count = len(observations.leds_m) if inliers is None else int(inliers.sum())
+    return 2 * count + (2 if uses_gravity(observations) else 0) - 6
 
 
 def distances_px(observations: Observations, pose: Pose, velocity: Floats | None) -> Floats:

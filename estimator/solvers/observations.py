@@ -20,6 +20,7 @@ the undistorted centroid is then not the centroid of the undistorted image. `cor
 difference once a pose determines the size of the images.
 """
 
+import math
 import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -34,6 +35,7 @@ from estimator.camera.motion import seen_in_motion
 from estimator.camera.pose import Pose
 from estimator.camera.projection import projection_of
 from estimator.camera.undistort import has_pinhole_image, pinhole_image
+from estimator.compiled import compact, compiled
 from estimator.io.camera import Camera
 from estimator.io.device import DeviceFrame
 from estimator.solvers.shutter_motion import ShutterMotion, image_slopes, motion_prior
@@ -49,8 +51,6 @@ MIN_CENTROID_SIGMA_PX = 1e-4
 _ALONG, _SHARES = np.sqrt(1.8) * np.array([-1.0, 0.0, 1.0]), np.array([5.0, 8.0, 5.0]) / 18
 FACE_NODES = np.stack(np.meshgrid(_ALONG, _ALONG, indexing="ij"), axis=-1).reshape(-1, 2)
 FACE_WEIGHTS = np.outer(_SHARES, _SHARES).ravel()
-_OF_NODES = np.column_stack([FACE_NODES, np.ones(len(FACE_NODES))])
-_NODES_2 = (FACE_NODES**2).sum(axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,23 +215,39 @@ def light_centres_m(leds_m: Floats, lift_m2: Floats, camera_m: Floats) -> Floats
 
     `lift_m2` (n,) is 4 s^2 of each, `camera_m` (3,) or (n, 3) the projection centre; all in world metres.
     """
-    offset = leds_m - camera_m
-    s = np.sqrt(lift_m2 / 4)[:, None]
-    distance2 = (2 * s * offset[:, :2]) @ FACE_NODES.T
-    distance2 += s**2 * _NODES_2 + np.einsum("ni,ni->n", offset, offset)[:, None]
-    distance2 *= distance2
-    # The means of the nodes times their weights, and the weights' sum.
-    sums = (FACE_WEIGHTS / distance2) @ _OF_NODES
-    points = leds_m.copy()
-    points[:, :2] += s * sums[:, :2] / sums[:, 2:]
-    return points
+    return _light_centres(compact(leds_m), compact(lift_m2), compact(camera_m).reshape(-1, 3))
 
 
+@compiled
+def _light_centres(leds_m: Floats, lift_m2: Floats, cameras_m: Floats) -> Floats:
+    """See `light_centres_m`; `cameras_m` are (n, 3), or (1, 3) for all."""
+    points_m = leds_m.copy()
+    for i in range(len(leds_m)):
+        s = math.sqrt(lift_m2[i] / 4)
+        of = min(i, len(cameras_m) - 1)
+        x, y, z = leds_m[i, 0] - cameras_m[of, 0], leds_m[i, 1] - cameras_m[of, 1], leds_m[i, 2] - cameras_m[of, 2]
+        total = along_x = along_y = 0.0
+        for k in range(len(FACE_WEIGHTS)):
+            at_x, at_y = s * FACE_NODES[k, 0], s * FACE_NODES[k, 1]
+            distance2 = (x + at_x) ** 2 + (y + at_y) ** 2 + z * z
+            weight = FACE_WEIGHTS[k] / (distance2 * distance2)
+            total += weight
+            along_x += weight * at_x
+            along_y += weight * at_y
+        points_m[i, 0] += along_x / total
+        points_m[i, 1] += along_y / total
+    return points_m
+
+
+@compiled
 def _in_plane(p_cam: Floats) -> Floats:
     """Points (n, 3) in camera axes in the pinhole's image plane, (n, 2)."""
-    # An LED behind the camera has no image; here it only has to be far off, and finite.
-    depth = np.where(np.abs(p_cam[:, 2]) < 1e-9, 1e-9, p_cam[:, 2])
-    return np.asarray(p_cam[:, :2] / depth[:, None])
+    image = np.empty((len(p_cam), 2))
+    for i in range(len(p_cam)):
+        # An LED behind the camera has no image; here it only has to be far off, and finite.
+        depth = p_cam[i, 2] if abs(p_cam[i, 2]) >= 1e-9 else 1e-9
+        image[i, 0], image[i, 1] = p_cam[i, 0] / depth, p_cam[i, 1] / depth
+    return image
 
 
 def pose_vector(observations: Observations, pose: Pose) -> Floats:
@@ -246,9 +262,35 @@ def pose_slopes(observations: Observations, pose: Pose) -> tuple[Floats, Floats]
     The parameters are a rotation vector and a translation of the LEDs about their mean. Motion is left out.
     """
     x = pose_vector(observations, pose)
-    model = np.ascontiguousarray(observations.leds_m - observations.leds_m.mean(axis=0))
-    of_image = cv2.projectPoints(model, x[:3], x[3:], np.eye(3), None)[1][:, :6].reshape(-1, 2, 6)
-    return of_image, position_slopes(x)
+    R_cam_world, by_vector = cv2.Rodrigues(x[:3])
+    model = observations.leds_m - observations.leds_m.mean(axis=0)
+    return spot_slopes(compact(model), R_cam_world, by_vector.reshape(3, 3, 3), x[3:]), position_slopes(x)
+
+
+@compiled
+def spot_slopes(model_m: Floats, R_cam_world: Floats, by_vector: Floats, shift_m: Floats) -> Floats:
+    """Derivatives (n, 2, 6) of the images of points R m + t in the pinhole's image plane by rotation vector and t.
+
+    `model_m` (n, 3) are the m, `by_vector` (3, 3, 3) those of R = `R_cam_world` by the vector, `shift_m` is t.
+    """
+    slopes = np.zeros((len(model_m), 2, 6))
+    for i in range(len(model_m)):
+        p = np.empty(3)
+        for row in range(3):
+            p[row] = shift_m[row]
+            for k in range(3):
+                p[row] += R_cam_world[row, k] * model_m[i, k]
+        a, b, by_depth = p[0] / p[2], p[1] / p[2], 1 / p[2]
+        for parameter in range(3):
+            for row in range(3):
+                p[row] = 0.0
+                for k in range(3):
+                    p[row] += by_vector[parameter, row, k] * model_m[i, k]
+            slopes[i, 0, parameter] = (p[0] - a * p[2]) * by_depth
+            slopes[i, 1, parameter] = (p[1] - b * p[2]) * by_depth
+        slopes[i, 0, 3] = slopes[i, 1, 4] = by_depth
+        slopes[i, 0, 5], slopes[i, 1, 5] = -a * by_depth, -b * by_depth
+    return slopes
 
 
 def moving_slopes(observations: Observations, pose: Pose, velocity: Floats, x: Floats) -> Floats:
@@ -295,5 +337,7 @@ def corrected_for_eccentricity(observations: Observations, pose: Pose) -> Observ
 def position_slopes(x: Floats) -> Floats:
     """Derivatives (3, 6) of `centre - R^T t` by the rotation vector and t."""
     R_cam_world, by_vector = cv2.Rodrigues(x[:3])
-    by_rotation = np.column_stack([-by_vector[k].reshape(3, 3).T @ x[3:] for k in range(3)])
-    return np.hstack([by_rotation, -R_cam_world.T])
+    slopes = np.empty((3, 6))
+    slopes[:, :3] = -(x[3:] @ by_vector.reshape(3, 3, 3)).T
+    slopes[:, 3:] = -R_cam_world.T
+    return slopes

@@ -19,10 +19,11 @@ from scipy.optimize import least_squares
 
 from estimator.camera.motion import MOTION_PARAMETERS
 from estimator.camera.pose import POSE_PARAMETERS, Pose
+from estimator.compiled import compact, compiled
 from estimator.errors import EstimationFailure
 from estimator.solvers import second_order
 from estimator.solvers.least_squares import Function, least_squares_minimum
-from estimator.solvers.observations import Observations, moving_slopes, position_slopes
+from estimator.solvers.observations import Observations, moving_slopes, position_slopes, spot_slopes
 
 Floats = NDArray[np.float64]
 Loss = Literal["linear", "soft_l1"]
@@ -88,7 +89,7 @@ class Fit:
         movements (3, k) of the position by the changes that do.
         """
         of_priors = np.zeros((len(self.slopes) - 2 * len(of_spots), of_spots.shape[2]))
-        white = np.vstack([_whitened(self.whitening, of_spots), of_priors])
+        white = _whitened(self.whitening, of_spots, of_priors)
         steps = -np.linalg.lstsq(self.slopes, white, rcond=None)[0]
         return np.asarray(white + self.slopes @ steps), np.asarray(self.position_slopes @ steps)
 
@@ -170,12 +171,27 @@ def _inverse_root(covariance: Floats) -> Floats:
         raise EstimationFailure("position", "the covariance of the spots is not positive definite") from None
 
 
-def _whitened(whitening: Floats, of_spots: Floats) -> Floats:
-    """Residuals (n, 2) or slopes (n, 2, k) of spots, whitened, (2n,) or (2n, k)."""
-    flat = 2 * len(of_spots), *of_spots.shape[2:]
-    if whitening.ndim == 2:
-        return np.asarray(whitening @ of_spots.reshape(flat))
-    return np.asarray(whitening @ of_spots.reshape(len(of_spots), 2, -1)).reshape(flat)
+def _whitened(whitening: Floats, of_spots: Floats, of_priors: Floats) -> Floats:
+    """Residuals or slopes (n, 2, k) of spots, whitened, above those of priors (m, k), whitened before: (2n + m, k)."""
+    if whitening.ndim == 3:
+        return _whitened_each(compact(whitening), compact(of_spots), compact(of_priors))
+    return np.concatenate([whitening @ of_spots.reshape(2 * len(of_spots), -1), of_priors])
+
+
+@compiled
+def _whitened_each(whitening: Floats, of_spots: Floats, of_priors: Floats) -> Floats:
+    """See `_whitened`, with a `whitening` (n, 2, 2) of each spot."""
+    count, columns = len(of_spots), of_spots.shape[2]
+    white = np.empty((2 * count + len(of_priors), columns))
+    for i in range(count):
+        for row in range(2):
+            for k in range(columns):
+                of_x, of_y = whitening[i, row, 0] * of_spots[i, 0, k], whitening[i, row, 1] * of_spots[i, 1, k]
+                white[2 * i + row, k] = of_x + of_y
+    for row in range(len(of_priors)):
+        for k in range(columns):
+            white[2 * count + row, k] = of_priors[row, k]
+    return white
 
 
 class _Search:
@@ -184,7 +200,7 @@ class _Search:
     def __init__(self, observations: Observations, whitening: Floats) -> None:
         self.observations, self.whitening = observations, whitening
         self.centre = observations.leds_m.mean(axis=0)
-        self.model = np.ascontiguousarray(observations.leds_m - self.centre)
+        self.model = compact(observations.leds_m - self.centre)
 
     def pose_of(self, x: Floats) -> Pose:
         """The pose of parameters."""
@@ -196,25 +212,26 @@ class _Search:
         observations = self.observations
         pose, velocity = self.pose_of(x), x[POSE_PARAMETERS:]
         offset = observations.images(pose, velocity)[0] - observations.image
-        parts = [_whitened(self.whitening, offset), _tilt_residual(pose, observations)]
+        of_priors = _tilt_residual(pose, observations)
         if observations.motion is not None:
-            parts.append(observations.motion.residuals(velocity))
-        return np.concatenate(parts)
+            of_priors = np.concatenate([of_priors, observations.motion.residuals(velocity)])
+        return _whitened(self.whitening, offset[:, :, None], of_priors[:, None])[:, 0]
 
     def jacobian(self, x: Floats) -> Floats:
         """Derivatives of the residuals."""
         observations, motion = self.observations, self.observations.motion
         # The eccentricity changes these by s^2 / d^2: some millionths for an LED of 1 cm, a hundredth for one of 60 cm.
+        R_cam_world, by_vector = cv2.Rodrigues(x[:3])
+        by_vector = by_vector.reshape(3, 3, 3)
+        of_tilts = _tilt_jacobian(R_cam_world, by_vector, observations)
         if motion is None:
-            of_image = cv2.projectPoints(self.model, x[:3], x[3:], np.eye(3), None)[1][:, :6].reshape(-1, 2, 6)
-            slopes = np.empty((2 * len(self.model) + 2, POSE_PARAMETERS))
-            slopes[:-2], slopes[-2:] = _whitened(self.whitening, of_image), _tilt_jacobian(x, observations)
-            return slopes
+            of_image = spot_slopes(self.model, R_cam_world, by_vector, x[3:])
+            return _whitened(self.whitening, of_image, of_tilts)
         of_image = moving_slopes(observations, self.pose_of(x), x[POSE_PARAMETERS:], x)
         of_priors = np.zeros((2 + MOTION_PARAMETERS, POSE_PARAMETERS + MOTION_PARAMETERS))
-        of_priors[:2, :POSE_PARAMETERS] = _tilt_jacobian(x, observations)
+        of_priors[:2, :POSE_PARAMETERS] = of_tilts
         of_priors[2:, POSE_PARAMETERS:] = np.diag(1 / motion.prior.sigmas)
-        return np.vstack([_whitened(self.whitening, of_image), of_priors])
+        return _whitened(self.whitening, of_image, of_priors)
 
     def minimum(self, start: Pose, loss: Loss, tolerance: float) -> tuple[Floats, Floats, float]:
         """Parameters at the minimum, the residuals there, and their sum; raises EstimationFailure."""
@@ -290,19 +307,22 @@ def _robustly(residuals: Function, x0: Floats, jacobian: Function) -> tuple[Floa
 def _tilt_residual(pose: Pose, observations: Observations) -> Floats:
     """Tilts of a pose minus the accelerometer's, in standard deviations, (2,)."""
     x, y, z = pose.R_cam_world[:, 2].tolist()
-    off = np.array([math.atan2(y, z), -math.asin(min(max(x, -1.0), 1.0))]) - observations.tilt_rad
-    # Wrapped to -pi ... pi.
-    return np.asarray((off + np.pi) % (2 * np.pi) - np.pi) / observations.tilt_sigma_rad
+    tilts = math.atan2(y, z), -math.asin(min(max(x, -1.0), 1.0))
+    read, sigmas = observations.tilt_rad.tolist(), observations.tilt_sigma_rad.tolist()
+    off = [math.remainder(tilt - one, 2 * math.pi) for tilt, one in zip(tilts, read, strict=True)]
+    return np.array([one / sigma for one, sigma in zip(off, sigmas, strict=True)])
 
 
-def _tilt_jacobian(x: Floats, observations: Observations) -> Floats:
-    """Derivatives of `_tilt_residual` by the six parameters, (2, 6)."""
-    R_cam_world, by_vector = cv2.Rodrigues(x[:3])
-    up_y, up_z = R_cam_world[1:, 2].tolist()
-    by_x, by_y, by_z = by_vector.T[2::3]
+def _tilt_jacobian(R_cam_world: Floats, by_vector: Floats, observations: Observations) -> Floats:
+    """Derivatives of `_tilt_residual` by the six parameters, (2, 6).
+
+    `by_vector` (3, 3, 3) are those of `R_cam_world` by the first three, its rotation vector.
+    """
+    slopes, (sigma_x, sigma_y) = np.zeros((2, POSE_PARAMETERS)), observations.tilt_sigma_rad.tolist()
+    _, up_y, up_z = R_cam_world[:, 2].tolist()
     # tilt_x is undefined where the camera's x axis is vertical.
     across2 = max(up_y**2 + up_z**2, 1e-12)
-    slopes = np.zeros((2, 6))
-    slopes[0, :3] = (up_z * by_y - up_y * by_z) / across2
-    slopes[1, :3] = -by_x / np.sqrt(across2)
-    return slopes / observations.tilt_sigma_rad[:, None]
+    for k, (by_x, by_y, by_z) in enumerate(by_vector[:, :, 2].tolist()):
+        slopes[0, k] = (up_z * by_y - up_y * by_z) / across2 / sigma_x
+        slopes[1, k] = -by_x / math.sqrt(across2) / sigma_y
+    return slopes

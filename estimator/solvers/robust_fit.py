@@ -222,7 +222,7 @@ def _explanations(
 
 def _plausible(agreed: Consensus, observations: Observations) -> bool:
     """Whether chi-square of inliers and gravity is as the errors say, and the spots do not contradict the camera."""
-    best, freedom = agreed.best, max(degrees_of_freedom(observations.only(agreed.inliers)), 1)
+    best, freedom = agreed.best, max(degrees_of_freedom(observations, agreed.inliers), 1)
     if best.tilt_chi2 > chi2_limit(OUTLIER_PROBABILITY, 2) or best.chi2 > chi2_limit(OUTLIER_PROBABILITY, freedom):
         return False
     return not _contradicts_camera(agreed, observations)

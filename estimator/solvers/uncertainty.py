@@ -133,7 +133,8 @@ def uncertainty(
     )
 
 
-def _of_camera(camera: Camera) -> tuple[list[Parameter], list[float], list[int]]:
+@lru_cache(maxsize=16)
+def _of_camera(camera: Camera) -> tuple[tuple[Parameter, ...], tuple[float, ...], tuple[int, ...]]:
     """Parameters of the intrinsics that are stated, their standard deviations, and their indices in INTRINSICS."""
     parameters: list[Parameter] = []
     sigmas: list[float] = []
@@ -148,7 +149,7 @@ def _of_camera(camera: Camera) -> tuple[list[Parameter], list[float], list[int]]
                 parameters.append(Parameter(group, INTRINSICS[index]))
                 sigmas.append(float(of_group[index]))
                 intrinsics.append(index)
-    return parameters, sigmas, intrinsics
+    return tuple(parameters), tuple(sigmas), tuple(intrinsics)
 
 
 @lru_cache(maxsize=16)
