@@ -21,7 +21,8 @@ from estimator.spots.denoise import (
     unbiased_inverse,
     variance_stabilised,
 )
-from estimator.spots.led_light import Light
+from estimator.spots.led_light import Light, LightSums
+from estimator.spots.spot_pixels import light_sums
 
 
 def test_each_pixel_becomes_the_mean_of_its_120_neighbours() -> None:
@@ -98,18 +99,19 @@ def test_the_covariance_of_a_centroid_of_box_means_by_each_raw_pixel() -> None:
     """
     rng, shape = np.random.default_rng(8), (9, 12)
     support, variance_e2 = rng.random(shape) < 0.6, rng.uniform(1.0, 9.0, shape)
-    u_px, v_px = np.arange(20.0, 32.0)[None, :] + 0.5, np.arange(30.0, 39.0)[:, None] + 0.5
-    signal_e = np.where(support, 100.0, 0.0)
-    light = Light(np.s_[30:39, 20:32], u_px, v_px, signal_e, support, signal_e, lambda: variance_e2, signal_e)
-    centre, expected = np.array([25.7, 34.2]), np.zeros((2, 2))
+    above_e = np.full(shape, 100.0)
+    sums = LightSums(*light_sums(above_e, support, variance_e2, 20, 30))
+    light = Light(20, 30, support, above_e, variance_e2, np.inf, np.empty(0), sums)
+    rows, columns = np.nonzero(support)
+    centre, expected = np.array([20.5 + columns.mean(), 30.5 + rows.mean()]), np.zeros((2, 2))
     for row in range(9):
         for column in range(12):
             of_pixel = np.zeros(2)
             for i in range(max(row - 2, 0), min(row + 3, 9)):
                 for j in range(max(column - 2, 0), min(column + 3, 12)):
-                    of_pixel += support[i, j] * (np.array([20.5 + j, 30.5 + i]) - centre) / 25 / signal_e.sum()
+                    of_pixel += support[i, j] * (np.array([20.5 + j, 30.5 + i]) - centre) / 25 / above_e[support].sum()
             expected += variance_e2[row, column] * np.outer(of_pixel, of_pixel)
-    np.testing.assert_allclose(light.covariance_px2(centre, 2), expected, rtol=1e-10)
+    np.testing.assert_allclose(light.covariance_px2(2), expected, rtol=1e-10)
 
 
 def test_the_box_mean_counts_the_pixel_too() -> None:

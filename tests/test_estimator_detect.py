@@ -6,11 +6,11 @@ import pytest
 from estimator_synthetic import Array, View, grid, poisson, render, view_of
 
 from estimator.errors import EstimationFailure
-from estimator.spots import led_light
 from estimator.spots.denoise import NEIGHBOURHOOD_RADIUS_PX, neighbourhood_mean
 from estimator.spots.detect import Spot, detect
 from estimator.spots.led_light import Ellipse, Readout, light_of
 from estimator.spots.sampling import LensBlur
+from estimator.spots.spot_pixels import distance2, inside_ellipse, median, padded
 
 SMALL = (400, 300, 1500.0)
 # A tenth of the full frame's width with the full frame's pixels.
@@ -280,17 +280,31 @@ def test_without_covariances_all_else_is_the_same() -> None:
     assert {**vars(spot), "covariance_px2": None} == {**vars(whole), "covariance_px2": None}
 
 
-@pytest.mark.parametrize("denoised", [False, True])
-def test_masks_padded_by_distances_are_those_padded_by_dilation(
-    denoised: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    v, u = np.mgrid[:500, :600] + 0.5
-    image = 40 + 3960.0 * (np.hypot(u - 160.3, 1.2 * (v - 150.2)) < 70)
-    (dilated,) = spots_of(image, denoised)
-    monkeypatch.setattr(led_light, "MAX_KERNEL_PX", 0.0)
-    (by_distances,) = spots_of(image, denoised)
-    assert (dilated.u_px, dilated.v_px) == (by_distances.u_px, by_distances.v_px)
-    np.testing.assert_array_equal(dilated.covariance_px2, by_distances.covariance_px2)
+@pytest.mark.parametrize("radius_px", [0.0, 0.9, 2.0, 3.7, 5.0, 12.5, 30.0, 200.0])
+def test_a_mask_is_padded_by_the_pixels_at_most_a_radius_from_it(radius_px: float) -> None:
+    """Against the distance of each pixel from each of the mask, squared: whole numbers. The mask touches a border."""
+    rng = np.random.default_rng(5)
+    for shape in [(1, 1), (1, 30), (30, 1), (25, 40)]:
+        mask = np.zeros(shape, dtype=bool)
+        mask.ravel()[rng.integers(0, mask.size, 3)] = True
+        at, pixels = np.argwhere(mask), np.argwhere(np.ones(shape, dtype=bool))
+        nearest2 = ((pixels[:, None] - at) ** 2).sum(axis=2).min(axis=1).reshape(shape)
+        near, nearby, _ = padded(mask, radius_px, radius_px + 3.0, 0.0)
+        np.testing.assert_array_equal(near, nearest2 <= radius_px**2)
+        np.testing.assert_array_equal(nearby, nearest2 <= (radius_px + 3.0) ** 2)
+        none, _, outside = padded(~mask, 0.0, 0.0, radius_px)
+        np.testing.assert_array_equal(none, ~mask)
+        np.testing.assert_array_equal(outside, near)
+
+
+def test_the_median_is_numpys() -> None:
+    """Of odd and even numbers of values, with none, some and all of them equal, in any order and in order."""
+    rng = np.random.default_rng(6)
+    for count in [1, 2, 3, 4, 5, 10, 101, 300, 1000, 4001]:
+        for most in [1, 2, 30, 10**9]:
+            values = rng.integers(0, most, count).astype(np.float64)
+            assert median(values) == median(np.sort(values)) == np.median(values)
+    assert np.isnan(median(np.full(3, np.nan)))
 
 
 @pytest.mark.parametrize("blur_px", [3, 12, 24])
@@ -414,28 +428,57 @@ def test_a_ring_of_two_surfaces_has_a_background() -> None:
     assert abs(spot.u_px - 30.0) < 14 * 14 * 4950 * 3.5 / 42e6
 
 
-def test_a_pixel_is_as_far_from_an_ellipse_alone_as_among_others() -> None:
+def test_a_point_is_as_far_from_an_ellipse_as_its_axes_say() -> None:
     """Of a turned ellipse, whose ends are at 1; sums of a dozen products in another order differ by 1e-14."""
     c, s = np.cos(0.7), np.sin(0.7)
-    axes = np.array([[c, -s], [s, c]])
-    ellipse = Ellipse(np.array([30.2, 28.6]), axes, np.array([9.0, 4.0]), np.zeros(2), np.full(2, 60.0), 50, 1.0)
-    for k in (0, 1):
-        assert ellipse.distance2_at(*(ellipse.centre_px + axes[:, k] * (9.0, 4.0)[k]).tolist()) == pytest.approx(1.0)
-    u_px, v_px = np.arange(20.5, 40.5)[None], np.arange(18.5, 38.5)[:, None]
-    one_by_one = [[ellipse.distance2_at(u, v) for u in u_px[0].tolist()] for v in v_px[:, 0].tolist()]
-    np.testing.assert_allclose(one_by_one, ellipse.distance2(u_px, v_px, 0.0), atol=1e-12)
+    axes, centre, semi_axes = np.array([[c, -s], [s, c]]), np.array([30.2, 28.6]), np.array([9.0, 4.0])
+    ellipse = Ellipse((30.2, 28.6), (c, s), (9.0, 4.0), (0.0, 0.0), (60.0, 60.0), 50, 1.0)
+    for padding_px in (0.0, 2.5):
+        form = ellipse.form(padding_px)
+        for k in (0, 1):
+            end = centre + axes[:, k] * (semi_axes[k] + padding_px)
+            assert distance2(form, *end.tolist()) == pytest.approx(1.0)
+        inside = inside_ellipse(form, 18, 15, 25, 26)
+        for column, row in np.ndindex(25, 26):
+            point = np.array([18.5 + column, 15.5 + row])
+            expected = ((((point - centre) @ axes) / (semi_axes + padding_px)) ** 2).sum()
+            assert distance2(form, *point.tolist()) == pytest.approx(expected, abs=1e-12)
+            assert inside[row, column] == (expected <= 1)
 
 
 @pytest.mark.parametrize("background_e", [0.0, 40.0])
 @pytest.mark.parametrize("amplitude_e", [0.5, 3.0, 30.0, 3000.0])
-def test_the_largest_variance_decides_as_all_variances_do(background_e: float, amplitude_e: float) -> None:
-    """Backgrounds with a structure have an excess, which `max_variance_e2` has to cover as well."""
+def test_the_background_and_its_excess_variance_are_those_of_the_ring(background_e: float, amplitude_e: float) -> None:
+    """By NumPy's means, medians and variances; backgrounds with a structure have an excess."""
     rng = np.random.default_rng(int(amplitude_e))
-    ellipse = Ellipse(np.array([30.0, 30.0]), np.eye(2), np.array([4.0, 4.0]), np.zeros(2), np.full(2, 60.0), 50, 1.0)
+    ellipse = Ellipse((30.0, 30.0), (1.0, 0.0), (4.2, 4.2), (0.0, 0.0), (60.0, 60.0), 50, 1.0)
     v, u = np.mgrid[:60, :60] + 0.5
-    mean = background_e * (1 + 0.5 * (u % 4 < 2)) + amplitude_e * (np.hypot(u - 30, v - 30) < 4)
+    off_px = np.hypot(u - 30, v - 30)
+    mean = background_e * (1 + 0.5 * (u % 4 < 2)) + amplitude_e * (off_px < 4)
     image = (rng.poisson(mean) + rng.normal(0, 2.0, mean.shape)).astype(np.float32)
     light = light_of(Readout(0, 0, image, image, np.zeros(image.shape, bool), 4.0, 0.01), ellipse, [], 0)
-    assert light.variance_e2.max() <= light.max_variance_e2
-    for limit in (0.1, 1.0, 0.99 * light.signal_to_noise, 1.01 * light.signal_to_noise, 1000.0):
-        assert light.is_fainter(limit) == (light.signal_to_noise <= limit)
+
+    electrons = image.astype(np.float64)
+    variance_e2 = np.maximum(electrons, 0) + 4.0 + (0.01 * np.maximum(electrons, 0)) ** 2
+    support, ring = off_px <= 6.2, (off_px > 6.2) & (off_px <= 9.2)
+    gate_e = 3 * np.sqrt(np.median(variance_e2[ring]) + 1)
+    even = ring & (abs(electrons - np.median(electrons[ring])) <= gate_e)
+    above_e = electrons - electrons[even].mean()
+    excess_e2 = electrons[even].var(ddof=1) - variance_e2[even].mean()
+    if excess_e2 <= 4 * np.sqrt(2 / even.sum()) * variance_e2[even].mean():
+        excess_e2 = 0.0
+    assert (excess_e2 > 0) == (background_e > 0)
+    variance_e2[support & (above_e <= gate_e)] += excess_e2
+    here = np.s_[light.top : light.top + light.support.shape[0], light.left : light.left + light.support.shape[1]]
+    np.testing.assert_array_equal(light.support, support[here])
+    np.testing.assert_allclose(light.signal_e, np.where(support, above_e, 0.0)[here], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(light.variance_e2, variance_e2[here], rtol=1e-9)
+    noise_e2 = variance_e2[support].sum()
+    assert light.sums.signal_to_noise == pytest.approx(above_e[support].sum() / np.sqrt(noise_e2), rel=1e-9)
+    offsets = np.stack([u[support] - light.sums.u, v[support] - light.sums.v])
+    covariance_px2 = (variance_e2[support] * offsets) @ offsets.T / light.sums.flux**2
+    np.testing.assert_allclose(light.covariance_px2(0), covariance_px2, rtol=1e-8, atol=1e-9 * covariance_px2.max())
+    for sigma, offset in zip(light.sums.moment_sigmas_px2(), offsets, strict=True):
+        moment = (above_e[support] * offset**2).sum() / light.sums.flux
+        expected = np.sqrt((variance_e2[support] * (offset**2 - moment) ** 2).sum()) / abs(light.sums.flux)
+        assert abs(sigma) == pytest.approx(expected, rel=1e-6)

@@ -70,13 +70,13 @@ def test_an_led_image_between_the_margins_of_others_has_its_background_subtracte
     """Eight others 7 px away, whose margins hold all pixels of the ring: what is beyond their images is background."""
 
     def face(u_px: float, v_px: float) -> Ellipse:
-        centre = np.array([u_px, v_px])
-        return Ellipse(centre, np.eye(2), np.full(2, 3.0), centre - 3.0, centre + 3.0, 25, 1.0)
+        low_px, high_px = (u_px - 3.0, v_px - 3.0), (u_px + 3.0, v_px + 3.0)
+        return Ellipse((u_px, v_px), (1.0, 0.0), (3.0, 3.0), low_px, high_px, 25, 1.0)
 
     others = [face(30.0 + du, 30.0 + dv) for du in (-7, 0, 7) for dv in (-7, 0, 7) if du or dv]
     image = (4_000.0 + disc(30.0, 30.0, 1.15, 400_000.0)).astype(np.float32)
     light = light_of(Readout(0, 0, image, image, np.zeros(image.shape, bool)), face(30.0, 30.0), others, 0)
-    assert light.flux_e == pytest.approx(float(disc(30.0, 30.0, 1.15, 400_000.0).sum()), rel=1e-6)
+    assert light.sums.flux == pytest.approx(float(disc(30.0, 30.0, 1.15, 400_000.0).sum()), rel=1e-6)
 
 
 def test_noise_that_is_not_stated_hides_which_pixels_are_lit() -> None:
@@ -85,6 +85,6 @@ def test_noise_that_is_not_stated_hides_which_pixels_are_lit() -> None:
     """
     noise_e = np.random.default_rng(3).normal(0.0, 1_000.0, (60, 60))
     image = (100.0 + disc(30.2, 30.4, 5.5, 4_000.0) + noise_e).astype(np.float32)
-    face = Ellipse(np.array([30.2, 30.4]), np.eye(2), np.full(2, 5.5), np.full(2, 24.0), np.full(2, 36.0), 95, 1.0)
+    face = Ellipse((30.2, 30.4), (1.0, 0.0), (5.5, 5.5), (24.0, 24.0), (36.0, 36.0), 95, 1.0)
     light = light_of(Readout(0, 0, image, image, np.zeros(image.shape, bool)), face, [], 0)
     assert light.lit(0) == [light]

@@ -27,7 +27,7 @@ from estimator.camera.motion import MOTION_PARAMETERS
 from estimator.io.device import DeviceFrame
 from estimator.pixels.led_model import IMAGE_PARAMETERS, LOCAL_PARAMETERS, PROFILE_PARAMETERS, RenderedLeds
 from estimator.pixels.led_pixels import LedPixels
-from estimator.spots.led_light import MAX_ROUNDING_SHARE
+from estimator.spots.spot_pixels import MAX_ROUNDING_SHARE
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

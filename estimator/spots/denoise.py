@@ -10,10 +10,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.compiled import compiled
+
 Image = NDArray[np.float32]
 
 NEIGHBOURHOOD_PX = 11
-PIXELS_AT_ONCE = 50_000
 NEIGHBOURHOOD_RADIUS_PX = NEIGHBOURHOOD_PX // 2
 NEIGHBOURS = NEIGHBOURHOOD_PX**2 - 1
 BILATERAL_PX = 5
@@ -40,17 +41,10 @@ def neighbourhood_mean(image: Image) -> Image:
     (Eq. 14), the adjusted intensity c - mu_S is the mean of the c_k, and c itself cancels. sigma_S is not used.
     Near the image's border the mean is over the neighbours inside the image.
     """
-    height_px, width_px = image.shape
     # Zeros outside the image do not change the sum, and the count omits them.
     size = (NEIGHBOURHOOD_PX, NEIGHBOURHOOD_PX)
     result = cv2.boxFilter(image, cv2.CV_32F, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
-    result -= image
-    rows, columns = _counts(height_px), _counts(width_px)
-    band = max(1, PIXELS_AT_ONCE // max(width_px, 1))
-    for start in range(0, height_px, band):
-        # By bands: an image of all counts would take as much memory as the image itself.
-        rows_here = slice(start, start + band)
-        result[rows_here] /= np.maximum(rows[rows_here, None] * columns - 1, 1)
+    _turn_into_means(result, np.ascontiguousarray(image))
     return np.asarray(result, dtype=np.float32)
 
 
@@ -66,11 +60,9 @@ def algorithm_1(image: Image) -> Image:
     lambda_1: the mean of the Poisson variable that models the pixel in Eq. 12, hence its value without noise (Eq. 11).
     With c - mu_S in its place the result is `neighbourhood_mean`, and lines 10 to 12 are not needed.
     """
-    mu = image - neighbourhood_mean(image)
-    radius = NEIGHBOURHOOD_RADIUS_PX
-    padded = cv2.copyMakeBorder(image, 0, radius, 0, radius, cv2.BORDER_REPLICATE)
-    sigma = mu - (image - padded[radius:, radius:]) ** 2 / np.float32(NEIGHBOURS)
-    return np.asarray((sigma**2 + mu) / 2, dtype=np.float32)
+    result = neighbourhood_mean(image)
+    _turn_into_adjusted(result, np.ascontiguousarray(image))
+    return result
 
 
 def box_mean(image: Image) -> Image:
@@ -125,9 +117,38 @@ DENOISERS: dict[str, Denoiser] = {
 }
 
 
-def _counts(length_px: int) -> NDArray[np.float32]:
-    """Number of the 11 pixels around each position along a line of `length_px` that lie on the line."""
-    index = np.arange(length_px)
-    first = np.maximum(index - NEIGHBOURHOOD_RADIUS_PX, 0)
-    last = np.minimum(index + NEIGHBOURHOOD_RADIUS_PX, length_px - 1)
-    return (last - first + 1).astype(np.float32)
+@compiled
+def _turn_into_means(sums: Image, image: Image) -> None:
+    """Turn sums over pixels and their neighbours inside the image into the neighbours' means."""
+    height, width = image.shape
+    columns = np.empty(width, dtype=np.float32)
+    for column in range(width):
+        columns[column] = _count(column, width)
+    for row in range(height):
+        rows, line, line_sums = np.float32(_count(row, height)), image[row], sums[row]
+        for column in range(width):
+            others = rows * columns[column] - np.float32(1)
+            line_sums[column] = (line_sums[column] - line[column]) / (others if others > 1 else np.float32(1))
+
+
+@compiled
+def _count(at: int, length_px: int) -> int:
+    """Number of the 11 pixels around a place on a line of `length_px` that lie on the line."""
+    return min(at + NEIGHBOURHOOD_RADIUS_PX, length_px - 1) - max(at - NEIGHBOURHOOD_RADIUS_PX, 0) + 1
+
+
+@compiled
+def _turn_into_adjusted(means: Image, image: Image) -> None:
+    """Turn the means of pixels' neighbours into the adjusted intensities of Algorithm 1, by its lines 9 to 12."""
+    height, width = image.shape
+    last = np.empty(width, dtype=np.float32)
+    for row in range(height):
+        line, line_means = image[row], means[row]
+        # The last neighbour of each pixel; for pixels beyond the image, those at its border.
+        below = image[min(row + NEIGHBOURHOOD_RADIUS_PX, height - 1)]
+        for column in range(width):
+            last[column] = below[min(column + NEIGHBOURHOOD_RADIUS_PX, width - 1)]
+        for column in range(width):
+            mu, off = line[column] - line_means[column], line[column] - last[column]
+            sigma = mu - off * off / np.float32(NEIGHBOURS)
+            line_means[column] = (sigma * sigma + mu) / np.float32(2)

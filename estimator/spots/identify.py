@@ -52,24 +52,28 @@ def identify(
     if not decoded:
         raise EstimationFailure("identify", "no identity was decoded")
     spots_px = np.array([(spot.u_px, spot.v_px) for spot in spots]).reshape(-1, 2)
+    radius_px = np.sqrt(np.array([spot.area_px for spot in spots]) / np.pi)
+    cut_off = np.array([spot.touches_border for spot in spots])
     decoded_px = np.array([(identity.u_px, identity.v_px) for identity in decoded])
-    distance_px = np.linalg.norm(decoded_px[:, None] - spots_px[None], axis=2)
-    nearest = np.argmin(distance_px, axis=1)
+    distance_px = np.hypot(decoded_px[:, :1] - spots_px[:, 0], decoded_px[:, 1:] - spots_px[:, 1])
+    nearest, every = np.argmin(distance_px, axis=1), np.arange(len(decoded))
     # The centroid of a cut LED image may be off by its radius.
-    off_px = [np.sqrt(spot.area_px / np.pi) if cut_too and spot.touches_border else 0.0 for spot in spots]
-    inside = distance_px.min(axis=1) <= (gate_px + np.array(off_px))[nearest]
+    off_px = np.where(cut_off & cut_too, radius_px, 0.0)
+    nearest_px = distance_px[every, nearest]
+    inside = nearest_px <= (gate_px + off_px)[nearest]
     identities_of_spot = np.bincount(nearest[inside], minlength=len(spots))
-    half_length_px = MERGED_RADII * np.sqrt([spot.area_px / np.pi for spot in spots])
-    identities_of_spot += (distance_px[~inside] < half_length_px).sum(axis=0)
+    identities_of_spot += (distance_px[~inside] < MERGED_RADII * radius_px).sum(axis=0)
+    distance_px[every, nearest] = np.inf
+    clear = (distance_px.min(axis=1) >= CLEARANCE * nearest_px) & (identities_of_spot[nearest] == 1)
     correspondences = []
     beyond, unclear, cut = 0, 0, 0
-    for row, identity in enumerate(decoded):
-        spot = spots[nearest[row]]
-        second_px = np.delete(distance_px[row], nearest[row]).min(initial=np.inf)
-        clear = second_px >= CLEARANCE * distance_px[row].min() and identities_of_spot[nearest[row]] == 1
-        if not inside[row]:
+    for identity, place, is_inside, is_clear in zip(
+        decoded, nearest.tolist(), inside.tolist(), clear.tolist(), strict=True
+    ):
+        spot = spots[place]
+        if not is_inside:
             beyond += 1
-        elif not clear:
+        elif not is_clear:
             unclear += 1
         elif spot.touches_border and not cut_too:
             cut += 1

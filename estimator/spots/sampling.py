@@ -13,6 +13,7 @@ U'(k) = -4 pi a J2(x) / x with x = 2 pi k a, and its true second moment is a^2 /
 is up to 0.02 px for a = 1 px and falls as a^-1.5. A lens that blurs the image lowers U(k).
 """
 
+import math
 from dataclasses import dataclass
 from functools import cache
 
@@ -20,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import j0, j1
 
+from estimator.compiled import compiled
 from estimator.io.camera import Camera
 
 Floats = NDArray[np.float64]
@@ -124,15 +126,22 @@ def sampling_error(centroid_px: Floats, moments_px2: Floats, moment_sigmas_px2: 
     """
     true_px, half_px, solved = _solve(centroid_px, moments_px2)
     step_px = 1e-3
-    by_half = (_moments(true_px, half_px + step_px) - _moments(true_px, half_px - step_px)) / (2 * step_px)
-    by_centre = (_moments(true_px + step_px, half_px) - _moments(true_px - step_px, half_px)) / (2 * step_px)
-    error_by_half = (_error(true_px, half_px + step_px)[0] - _error(true_px, half_px - step_px)[0]) / (2 * step_px)
+    smaller, here, larger = (_sampled(true_px, half_px + step) for step in (-step_px, 0.0, step_px))
+    before, after = _sampled(true_px - step_px, half_px), _sampled(true_px + step_px, half_px)
+    by_half, by_centre, error_by_half = (
+        (more - less) / (2 * step_px)
+        for more, less in (
+            (larger.moment_px2, smaller.moment_px2),
+            (after.moment_px2, before.moment_px2),
+            (larger.error_px, smaller.error_px),
+        )
+    )
     # The sampled centroid is given: the true one changes with the half extent.
-    by_half -= by_centre * error_by_half / np.maximum(_error(true_px, half_px)[1], MIN_SLOPE)
+    by_half -= by_centre * error_by_half / np.maximum(here.slope, MIN_SLOPE)
     model_px2 = SHAPE_UNCERTAINTY * half_px**2 / 2
     sigma_px = np.hypot(moment_sigmas_px2, model_px2) / np.maximum(np.abs(by_half), 1e-6)
     shrinking = np.exp(-((2 * np.pi * HARMONICS * sigma_px[:, None]) ** 2) / 2)
-    error_px, slope = _error(true_px, half_px, shrinking)
+    likely = _sampled(true_px, half_px, shrinking)
     # The envelope of J1 is sqrt(2 / (pi x)). The mean of sin^2 over positions is 1/2.
     x = 2 * np.pi * HARMONICS * half_px[:, None]
     envelope2 = np.minimum(8 / (np.pi * x**3), 1.0)
@@ -143,16 +152,16 @@ def sampling_error(centroid_px: Floats, moments_px2: Floats, moment_sigmas_px2: 
     two_columns = third_px2 <= 0
     # An image of more than two pixels has light in a third column.
     by_noise = (half_px < 1) & (third_px2 <= THIRD_COLUMN_SIGMA * moment_sigmas_px2)
-    usable = solved & (slope > MIN_SLOPE) & ~two_columns & ~by_noise
+    usable = solved & (likely.slope > MIN_SLOPE) & ~two_columns & ~by_noise
     shares, expected_px, spread_px2 = _of_two_columns()
     return SamplingError(
-        error_px=np.select([usable, two_columns], [error_px, np.interp(share, shares, expected_px)]),
+        error_px=np.select([usable, two_columns], [likely.error_px, np.interp(share, shares, expected_px)]),
         variance_px2=np.select(
             [usable, two_columns],
             [rest, np.interp(share, shares, spread_px2)],
             sampling_variance_px2(half_px, square=False),
         ),
-        slope=np.where(usable, slope, 1.0),
+        slope=np.where(usable, likely.slope, 1.0),
     )
 
 
@@ -161,9 +170,9 @@ def _solve(centroid_px: Floats, moments_px2: Floats) -> tuple[Floats, Floats, ND
     true_px = centroid_px
     half_px = 2 * np.sqrt(np.maximum(moments_px2 - PIXEL_VARIANCE, MIN_HALF_EXTENT_PX**2 / 4))
     for _ in range(MAX_ROUNDS):
-        error_px, slope = _error(true_px, half_px)
-        step_px = (centroid_px - true_px - error_px) / np.maximum(slope, MIN_SLOPE)
-        excess_px2 = _moments(true_px, half_px) - half_px**2 / 4
+        here = _sampled(true_px, half_px)
+        step_px = (centroid_px - true_px - here.error_px) / np.maximum(here.slope, MIN_SLOPE)
+        excess_px2 = here.moment_px2 - half_px**2 / 4
         found_px = 2 * np.sqrt(np.maximum(moments_px2 - excess_px2, MIN_HALF_EXTENT_PX**2 / 4))
         change_px = np.abs(found_px - half_px)
         # Half of the change: near the smallest sizes the whole one would swing about the solution.
@@ -174,22 +183,41 @@ def _solve(centroid_px: Floats, moments_px2: Floats) -> tuple[Floats, Floats, ND
     return true_px, half_px, np.asarray(solved)
 
 
-def _error(true_px: Floats, half_px: Floats, weights: Floats | float = 1.0) -> tuple[Floats, Floats]:
-    """Sampling errors (n,) of ellipses at true centroids (n,), and slopes (n,) of the sampled centroids by the true.
-
-    `weights` (n, k) multiply the harmonics.
+@dataclass(frozen=True, eq=False)
+class _Sampled:
+    """What pixels make of ellipses, all (n,): the errors of their centroids, the slopes of these by the true ones, and
+    the second moments about the sampled centroids.
     """
-    x, phase = 2 * np.pi * HARMONICS * half_px[:, None], 2 * np.pi * HARMONICS * true_px[:, None]
-    spectrum = weights * 2 * j1(x) / x
-    error_px = (spectrum * np.sin(phase) / (np.pi * HARMONICS)).sum(axis=1)
-    return np.asarray(error_px), np.asarray(1 + 2 * (spectrum * np.cos(phase)).sum(axis=1))
+
+    error_px: Floats
+    slope: Floats
+    moment_px2: Floats
 
 
-def _moments(true_px: Floats, half_px: Floats) -> Floats:
-    """Second moments (n,), px^2, by pixels about the sampled centroid, of ellipses at true centroids (n,)."""
-    x, phase = 2 * np.pi * HARMONICS * half_px[:, None], 2 * np.pi * HARMONICS * true_px[:, None]
-    of_first = j1(x)
-    # J2(x) = 2 J1(x) / x - J0(x), many times faster than the general function; x is 4 at least.
-    spectrum, slopes = 2 * of_first / x, -4 * np.pi * half_px[:, None] * (2 * of_first / x - j0(x)) / x
-    excess = (np.cos(phase) * (spectrum / HARMONICS**2 - slopes / HARMONICS)).sum(axis=1) / np.pi**2
-    return np.asarray(half_px**2 / 4 + PIXEL_VARIANCE + excess - _error(true_px, half_px)[0] ** 2)
+def _sampled(true_px: Floats, half_px: Floats, weights: Floats | None = None) -> _Sampled:
+    """Ellipses at true centroids (n,) with half extents (n,) as sampled; `weights` (n, k) are the harmonics'."""
+    x = 2 * np.pi * HARMONICS * half_px[:, None]
+    return _Sampled(*_sums(true_px, half_px, j0(x), j1(x), np.ones_like(x) if weights is None else weights))
+
+
+@compiled
+def _sums(
+    true_px: Floats, half_px: Floats, of_zeroth: Floats, of_first: Floats, weights: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """The arrays of `_Sampled`, by the Bessel functions J0 and J1 of 2 pi k a, (n, k)."""
+    count, harmonics = of_first.shape
+    error_px, slope, moment_px2 = np.empty(count), np.empty(count), np.empty(count)
+    for i in range(count):
+        error, turned, excess = 0.0, 0.0, 0.0
+        for number in range(harmonics):
+            k = number + 1.0
+            x, phase, first = 2 * np.pi * k * half_px[i], 2 * np.pi * k * true_px[i], of_first[i, number]
+            spectrum = weights[i, number] * 2 * first / x
+            # J2(x) = 2 J1(x) / x - J0(x), many times faster than the general function; x is 4 at least.
+            by_k = weights[i, number] * -4 * np.pi * half_px[i] * (2 * first / x - of_zeroth[i, number]) / x
+            error += spectrum * math.sin(phase) / (np.pi * k)
+            turned += spectrum * math.cos(phase)
+            excess += math.cos(phase) * (spectrum / k - by_k) / k
+        error_px[i], slope[i] = error, 1 + 2 * turned
+        moment_px2[i] = half_px[i] ** 2 / 4 + PIXEL_VARIANCE + excess / np.pi**2 - error**2
+    return error_px, slope, moment_px2

@@ -25,7 +25,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.spots.detect import MAX_BLOB_OF_FRAME, Spot, brightest_of, levels_of
+from estimator.spots.detect import MAX_BLOB_OF_FRAME, Spot, boxes_near, brightest_of, levels_of
 from estimator.spots.ellipse_fit import fit_ellipse
 from estimator.spots.glow import glow
 from estimator.spots.led_light import Readout
@@ -154,7 +154,9 @@ def find_lamps(
     size = (SMOOTHING_PX, 1) if along == "rows" else (1, SMOOTHING_PX)
     smooth = [cv2.blur(one.image_e, size, borderType=cv2.BORDER_REPLICATE) for one in readouts]
     whole = len(smooth) == 1 and smooth[0].size == sensor_px
-    background_e, threshold_e = levels_of(smooth, whole, brightest_of(readouts, smooth, decoded_px, near_px))
+    background_e, threshold_e = levels_of(
+        smooth, whole, brightest_of(smooth, boxes_near(readouts, decoded_px, near_px))
+    )
     lamps: list[tuple[int, Lamp]] = []
     for readout, image in zip(readouts, smooth, strict=True):
         mask = (image > threshold_e).view(np.uint8)
