@@ -43,7 +43,7 @@ def frames(focal: float, pp_px: float = 0.0, stated: CameraUncertainty | None = 
 
 
 def errors_of_camera(frame: DeviceFrame) -> CameraErrors:
-    gravity, priors = gravity_of(frame), Priors.of(frame, tuple(frame.leds.values()))
+    gravity, priors = gravity_of(frame), Priors.of(frame)
     found = most_likely(frame, POSE)
     pixels, result, of_leds = found.pixels, found.last, priors.only(found.pixels.index)
     state = result.nuisances.state(result.pose, frame.camera, of_leds)
@@ -126,7 +126,7 @@ def test_gravity_keeps_a_tilt_from_making_up_for_the_focal_length() -> None:
     about the tilt: 2e4 - 1.5e4^2 / 3e4 = 12500 is left of the focal length's, and a gradient of 25 says 0.002.
     """
     frame = frame_of(VIEW, LEDS_M, np.zeros((700, 900), dtype=np.uint32))
-    priors = Priors.of(frame, tuple(frame.leds.values()))
+    priors = Priors.of(frame)
     gravity = Gravity(POSE.rig_angles(frame.camera)[:2], np.full(2, 0.01))
     used = np.ones(len(LEDS_M), dtype=bool)
     result = SimpleNamespace(pose=POSE, nuisances=Nuisances.zero(priors), used=used)

@@ -63,7 +63,7 @@ def test_the_start_accounts_for_the_eccentricity_of_large_faces() -> None:
     frame = replace(frame, leds={key: led.model_copy(update={"radius_m": 0.15}) for key, led in frame.leds.items()})
     frame = with_exact_camera(frame)
     away = Pose(np.array(view.position_m) + [0.05, -0.05, 0.05], view.R_cam_world)
-    priors = Priors.of(frame, tuple(frame.leds.values()))
+    priors = Priors.of(frame)
     start = start_at_spots(frame, gravity_of(frame), priors, find_correspondences(frame), away, NO_COMPONENTS)
     assert np.abs(start.pose.position_m - view.position_m).max() < 0.2e-3
 
@@ -76,7 +76,7 @@ def test_a_gradient_of_luminance_moves_a_spot_as_a_shift_of_its_led_does() -> No
     radius_m = 0.01
     covariances = []
     for columns, sigma in ((PROFILE, 0.05), (slice(0, 3), 0.05 * radius_m / 4)):
-        priors = Priors.of(frame, tuple(frame.leds.values()))
+        priors = Priors.of(frame)
         priors.leds[:, columns][:, :2] = sigma
         truth = Pose(np.array(DIM_VIEW.position_m), DIM_VIEW.R_cam_world)
         start = start_at_spots(frame, gravity_of(frame), priors, find_correspondences(frame), truth, NO_COMPONENTS)

@@ -233,12 +233,12 @@ def test_slopes_by_camera_and_face_are_what_differences_give(
 
 
 @pytest.mark.parametrize("changes", [{}, {"focus_distance_m": 1.5, "f_number": 10.0}])
-def test_a_shift_of_the_image_is_one_of_the_principal_point(changes: dict[str, object]) -> None:
-    """Derivatives that an image has beside those asked for: those of a rendering by these parameters, to rounding."""
+def test_an_image_has_derivatives_by_other_parameters_than_it_was_rendered_with(changes: dict[str, object]) -> None:
+    """They are those of a rendering by these parameters."""
     lens, one = camera(**changes), led("disc")
     model = images(lens, one, here(lens))
     cells, at = np.arange(model.rois.cells()), state(here(lens), lens)
-    found = model.render(at, np.array([0, 5, SIZE_PARAMETER])).by_shift_and_size()
+    found = model.render(at, np.array([0, 5, SIZE_PARAMETER])).by(np.array([*PRINCIPAL_POINT, SIZE_PARAMETER]))
     expected = model.render(at, np.array([*PRINCIPAL_POINT, SIZE_PARAMETER]))
     assert found.parameters.tolist() == expected.parameters.tolist()
     largest = np.abs(expected.slopes(cells)).max()

@@ -53,7 +53,7 @@ SURE = np.eye(6) * 1e-12
 
 def most_likely(frame: DeviceFrame, start: Pose, gravity: Gravity | None = None) -> Maximum:
     """The maximum from a pose that is nearly certain, with an exact map."""
-    priors = Priors.of(frame, tuple(frame.leds.values()))
+    priors = Priors.of(frame)
     begin = Start(start, Nuisances.zero(priors), SURE, np.zeros(len(frame.leds), dtype=bool))
     return maximize(frame, gravity or gravity_of(frame), priors, begin)
 
@@ -281,7 +281,7 @@ def test_the_covariance_is_that_of_small_changes_of_the_answer(monkeypatch: pyte
     start, gravity = Pose(np.array(view.position_m), view.R_cam_world), gravity_of(frame)
     state = ImageState.as_told(start, frame.camera, 2)
     view_of_leds = leds_in_view(frame, state, SURE, np.zeros(2), np.zeros(2, dtype=bool))
-    pixels = gather_led_pixels(frame, view_of_leds, search.image_parameters(Priors.of(frame, tuple(leds.values()))))
+    pixels = gather_led_pixels(frame, view_of_leds, search.image_parameters(Priors.of(frame)))
     monkeypatch.setattr(search, "CONVERGED_STEP2", 1e-10)
 
     def answer_m(electrons: Floats, gravity: Gravity = gravity) -> Floats:

@@ -222,7 +222,7 @@ def test_the_areas_of_spots_tell_sizes() -> None:
     """
     view = view_of(TARGET, 3.0, 25.0, -15.0, 30.0, size=(1600, 1200, 6000.0))
     frame, errors = with_wrong_sizes(8, view, render(view, TWELVE, 0.01, 4000.0, samples=12))
-    priors = Priors.of(frame, tuple(frame.leds.values()))
+    priors = Priors.of(frame)
     spots = find_correspondences(frame)
     pose = Pose(np.array(view.position_m), view.R_cam_world)
     start = start_at_spots(frame, gravity_of(frame), priors, spots, pose, NO_COMPONENTS)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from estimator.pixels.polygon_raster import MAX_EDGE_PX, Outlines, RoiStack, cover
+from estimator.pixels.polygon_raster import MAX_EDGE_PX, Outlines, RoiStack, cover, rim_slopes
 
 Floats = NDArray[np.float64]
 
@@ -21,10 +21,9 @@ def circle(u: float, v: float, radius: float) -> Floats:
     return np.array([u, v]) + radius * np.sqrt(step / np.sin(step)) * np.column_stack([np.cos(angles), np.sin(angles)])
 
 
-def outlines(points: Floats, slopes: Floats | None = None) -> Outlines:
+def outlines(points: Floats) -> Outlines:
     count = len(points)
-    free = np.zeros((2, 0, count)) if slopes is None else slopes.transpose(1, 2, 0)
-    return Outlines(points, np.roll(np.arange(count), -1), np.zeros(count, dtype=np.int64), free)
+    return Outlines(points, np.roll(np.arange(count), -1), np.zeros(count, dtype=np.int64))
 
 
 def covered(rois: RoiStack, points: Floats) -> Floats:
@@ -73,7 +72,7 @@ def test_regions_do_not_affect_each_other() -> None:
     points = np.concatenate([first, second])
     following = np.concatenate([np.roll(np.arange(len(p)), -1) + s for p, s in ((first, 0), (second, len(first)))])
     belongs = np.repeat([0, 1], [len(first), len(second)])
-    both, _ = cover(rois, Outlines(points, following, belongs, np.zeros((2, 0, len(points)))))
+    both, _ = cover(rois, Outlines(points, following, belongs))
     np.testing.assert_allclose(rois.roi(both, 0), covered(roi(0, 2, 20, 15), first), atol=1e-12)
     np.testing.assert_allclose(rois.roi(both, 1), covered(roi(2, 30, 15, 12), second), atol=1e-12)
 
@@ -99,10 +98,13 @@ def test_slopes_are_what_moving_the_outline_gives() -> None:
     padded = points - np.array([13.37, 12.81])
     moves = np.stack([np.tile([1.0, 0.0], (len(points), 1)), np.tile([0.0, 1.0], (len(points), 1)), padded], axis=2)
     rois = roi(0, 0, 26, 26)
-    _, pieces = cover(rois, outlines(points, moves))
-    cells = rois.cell(pieces.roi, pieces.row, pieces.column)
+    outline = outlines(points)
+    place = np.full(rois.cells(), -1)
+    rim = rim_slopes(outline, cover(rois, outline)[1], moves, np.ones(rois.cells()), place)
+    assert (place == -1).all()
     for parameter in range(3):
-        found = np.bincount(cells, pieces.slopes[parameter], rois.cells())
+        found = np.zeros(rois.cells())
+        found[rim.cells] = rim.slopes[:, parameter]
         step = 1e-5 * moves[:, :, parameter]
         ahead, behind = (cover(rois, outlines(points + sign * step))[0] for sign in (1, -1))
         # Growing, an edge's ends move by 1 % of a pixel differently: within an edge the middle stands for it.

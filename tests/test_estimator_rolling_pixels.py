@@ -170,7 +170,7 @@ def gain_of(code: Array, start_chips: float) -> Gain:
 
 def found_with_gains(frame: DeviceFrame, view: View) -> Maximum:
     """The maximum from a pose half a millimetre off."""
-    priors = Priors.of(frame, tuple(frame.leds.values()))
+    priors = Priors.of(frame)
     start = Pose(np.array(view.position_m) + [5e-4, -5e-4, 5e-4], view.R_cam_world)
     unlocated = np.zeros(len(frame.leds), dtype=bool)
     return maximize(

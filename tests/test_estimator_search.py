@@ -56,7 +56,7 @@ def test_a_step_is_by_amplitudes_and_background_at_its_own_pose(
     """
     frame = drawn(4000.0, 3)
     pose = true_pose(frame)
-    pixels, priors = gathered(frame, pose), Priors.of(frame, tuple(frame.leds.values()))
+    pixels, priors = gathered(frame, pose), Priors.of(frame)
     used, steps = np.ones(len(pixels.leds), dtype=bool), list[tuple[RenderedLeds, PhotometricFit]]()
 
     def noted(
@@ -82,7 +82,7 @@ def test_the_hold_on_the_start_is_gone_at_the_maximum() -> None:
     """
     frame = drawn(4000.0, 3)
     pose = true_pose(frame)
-    pixels, priors = gathered(frame, pose), Priors.of(frame, tuple(frame.leds.values()))
+    pixels, priors = gathered(frame, pose), Priors.of(frame)
     used, zero = np.ones(len(pixels.leds), dtype=bool), Nuisances.zero(priors)
 
     def searched(information: Array, damping: float) -> ScoringResult:
@@ -105,7 +105,7 @@ def test_a_background_makes_the_size_of_a_small_image_uncertain() -> None:
     image = poisson(render(view, SIX, 0.01, 4000.0, samples=8), 1)
     frame = frame_of(view, SIX, image.astype(np.uint32))
     pose = Pose(np.array(view.position_m), view.R_cam_world)
-    pixels, priors = gathered(frame, pose), Priors.of(frame, tuple(frame.leds.values()))
+    pixels, priors = gathered(frame, pose), Priors.of(frame)
     made = Search(frame, pixels, gravity_of(frame), priors, np.eye(6), 0.0)
     photometry = fit_photometry(pixels, pixels.rendered, np.ones(6, dtype=bool), Noise.of(frame))
     radius_px = 5 * np.sqrt(np.pi / 2)  # to the vertices of a square of the same area, which stand for the rim
@@ -127,7 +127,7 @@ def test_readings_near_saturation_do_not_go_round(monkeypatch: pytest.MonkeyPatc
     frame = frame_of(view, SIX, np.clip(image, 0, black_dn + 2600.0).astype(np.uint32))
     sensor = {"noise": "full", "read_noise_e": noise_e, "black_level_dn": black_dn, "full_well_e": 2600.0}
     frame = replace(frame, sensor=frame.sensor.model_copy(update=sensor))
-    pose, priors = true_pose(frame), Priors.of(frame, tuple(frame.leds.values()))
+    pose, priors = true_pose(frame), Priors.of(frame)
     steps = 0
 
     def counted(

@@ -1,7 +1,9 @@
 """The map of LEDs as devices know it: discs, squares, luminaires, the datum (datasets/FORMAT.md)."""
 
 from abc import abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -188,10 +190,49 @@ AnyLed = Annotated[DiscLed | SquareLed, Field(discriminator="shape")]
 """An entry of `led_map`, told apart by `shape`."""
 
 
-def leds_by_id(leds: Iterable[AnyLed]) -> dict[int, AnyLed]:
+@dataclass(frozen=True, eq=False)
+class LedArrays:
+    """What the n LEDs of a map are, in its order.
+
+    `positions_m` (n, 3), world metres; `half_widths_m` (n,), NaN where the map does not say the size; `sigmas` (n, 6)
+    as `Led.sigmas` has them; `luminaires` (n,) ids, -1 for none. `have_sizes` says whether all have one.
+    """
+
+    positions_m: Floats
+    half_widths_m: Floats
+    sigmas: Floats
+    luminaires: NDArray[np.int64]
+    have_sizes: bool
+
+
+class LedMap(dict[int, AnyLed]):
+    """LEDs by id, not changed once `arrays` is read."""
+
+    @cached_property
+    def arrays(self) -> LedArrays:
+        """All LEDs as arrays."""
+        return _arrays(tuple(self.values()))
+
+
+def led_arrays(leds: Mapping[int, Led]) -> LedArrays:
+    """LEDs of a map as arrays, in its order; made once for a `LedMap`."""
+    return leds.arrays if isinstance(leds, LedMap) else _arrays(tuple(leds.values()))
+
+
+def _arrays(leds: Sequence[Led]) -> LedArrays:
+    return LedArrays(
+        positions_m=np.array([led.position_m for led in leds]).reshape(-1, 3),
+        half_widths_m=np.array([led.half_width_m for led in leds]),
+        sigmas=np.array([led.sigmas() for led in leds]).reshape(-1, 6),
+        luminaires=np.array([-1 if led.luminaire is None else led.luminaire for led in leds], dtype=np.int64),
+        have_sizes=all(led.has_size for led in leds),
+    )
+
+
+def leds_by_id(leds: Iterable[AnyLed]) -> LedMap:
     """LEDs by id; raises ValueError for an id that occurs twice."""
     entries = list(leds)
-    mapped = {led.id: led for led in entries}
+    mapped = LedMap((led.id, led) for led in entries)
     if len(mapped) != len(entries):
         raise ValueError("LED ids have to be unique")
     return mapped

@@ -37,6 +37,7 @@ from numpy.typing import NDArray
 from estimator.camera.pose import POSE_PARAMETERS, Pose
 from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame
+from estimator.io.led_map import led_arrays
 from estimator.methods.camera_statement import Judged, over_frames
 from estimator.methods.gravity_fit import agreement_of, ambiguous
 from estimator.methods.up2p import upright_pose
@@ -140,7 +141,7 @@ def judged(frame: DeviceFrame) -> Judged:
     """
     if frame.sensor.gain_e_per_dn is None:
         raise EstimationFailure("fit", "the sensor states no gain, so that the noise of its pixels is not known")
-    if not all(led.has_size for led in frame.leds.values()):
+    if not led_arrays(frame.leds).have_sizes:
         raise EstimationFailure("fit", "the map does not say how large its LEDs are")
     frame = with_known_gains(frame)
     correspondences = find_correspondences(frame)
@@ -166,7 +167,7 @@ def judged(frame: DeviceFrame) -> Judged:
     gravity = gravity_of(frame).scaled(scale) if use_gravity else NO_GRAVITY
     positions = set(map(tuple, observations.leds_m[inliers].tolist()))
     spots = [one for one in correspondences if one.led.position_m in positions]
-    stated = Priors.of(frame, tuple(frame.leds.values())).scaled(scale)
+    stated = Priors.of(frame).scaled(scale)
     found, is_assumed = _maximize_honestly(frame, gravity, stated, spots, pose, exact)
     covariance_m2 = found.covariance[:3, :3] * student_ratio
     if isinstance(found, Maximum):
@@ -256,12 +257,12 @@ def _revealed(
     # A shift of the principal point is one of the image.
     shift, size = list(PRINCIPAL_POINT), [SIZE_PARAMETER]
     profile, photometry = result.nuisances.profile(), result.photometry
-    if result.last_px < MAX_LAST_PX and not checks_camera:
-        rendered = result.rendered.by_shift_and_size()
+    columns = np.array(shift + size)
+    if checks_camera:
+        columns = np.concatenate([np.arange(SIZE_PARAMETER + 1), MOTION_COLUMNS[: len(priors.motion)]])
+    if result.last_px < MAX_LAST_PX:
+        rendered = result.rendered.by(columns)
     else:
-        columns = np.array(shift + size)
-        if checks_camera:
-            columns = np.concatenate([np.arange(SIZE_PARAMETER + 1), MOTION_COLUMNS[: len(priors.motion)]])
         rendered = pixels.model.render(result.nuisances.state(result.pose, frame.camera, of_leds), columns)
         photometry = fit_photometry(
             pixels, rendered, result.used, Noise.of(frame, pixels.excess_e2), photometry, profile
@@ -365,7 +366,8 @@ def _shape_sigma_px(frame: DeviceFrame, priors: Priors, start: Start) -> float:
     located = np.flatnonzero(start.located)
     if len(located) == 0:
         return 0.0
-    leds = [one for one, is_located in zip(frame.leds.values(), start.located, strict=True) if is_located]
+    every_led = tuple(frame.leds.values())
+    leds = [every_led[k] for k in located]
     rims_m = np.stack([rim(led, RIM_POINTS) for led in leds])
     state = start.nuisances.state(start.pose, frame.camera, priors).of(located)
     centres_m = np.array([led.position_m for led in leds]) + state.shifts_m

@@ -13,7 +13,7 @@ thousand electrons is 1e-2.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,9 +23,10 @@ from estimator.camera.motion import MOTION_PARAMETERS
 from estimator.camera.pose import POSE_PARAMETERS, Pose
 from estimator.camera.projection import ProjectedPoints, project, projection_of, relative_illumination
 from estimator.camera.rolling_projection import project_rolling
+from estimator.compiled import compiled
 from estimator.io.camera import Camera
 from estimator.io.led_map import Led
-from estimator.pixels.polygon_raster import MAX_EDGE_PX, EdgePieces, Outlines, RoiStack, cover
+from estimator.pixels.polygon_raster import MAX_EDGE_PX, EdgePieces, Outlines, RimSlopes, RoiStack, cover, rim_slopes
 from estimator.pixels.psf import LensBlur
 from estimator.pixels.region_blur import RegionBlur
 
@@ -41,8 +42,10 @@ EDGE_MARGIN = 1.25
 # have moved by a pixel, and a step is as long at most.
 SHARP_MARGIN_PX = 4
 # Chebyshev nodes across and down a region at which the lens's fall-off is computed; it is interpolated between them by
-# a polynomial. Over a region of 0.5 rad, cos^4 is then exact to 1e-6 of the light (tested).
+# a polynomial. Over a region of 0.5 rad, cos^4 is then exact to 1e-6 of the light (tested), and so it is by half as
+# many nodes where all regions are smaller.
 FALL_OFF_NODES = 10
+FEW_FALL_OFF_NODES, SMALL_RAD = 5, 0.1
 
 
 FACE_PARAMETERS = 3
@@ -189,30 +192,31 @@ def fall_off(rois: RoiStack, centres_px: Floats, camera: Camera, factors: Ints |
     `factors` (n,) are the pixels of the regions per pixel of the sensor along each axis, 1 if None. A pixel outside the
     lens's valid range gets no light.
     """
-    k = np.arange(FALL_OFF_NODES)
-    nodes = np.cos(np.pi * (k + 0.5) / FALL_OFF_NODES)
     steps = np.ones(len(rois.rows), dtype=np.int64) if factors is None else factors
+    largest_px = float((np.maximum(rois.heights, rois.widths) / steps).max())
+    count = FEW_FALL_OFF_NODES if largest_px * camera.pixel_angle_rad < SMALL_RAD else FALL_OFF_NODES
+    nodes = np.cos(np.pi * (np.arange(count) + 0.5) / count)
     low = np.stack([rois.columns, rois.rows], axis=1) / steps[:, None]
     size = np.stack([rois.widths, rois.heights], axis=1) / steps[:, None]
     at = low[:, None] + size[:, None] * (1 + nodes[:, None]) / 2  # (n, nodes, 2)
-    shape = (len(low), FALL_OFF_NODES, FALL_OFF_NODES)
+    shape = (len(low), count, count)
     u, v = np.broadcast_to(at[:, None, :, 0], shape), np.broadcast_to(at[:, :, None, 1], shape)
     values = relative_illumination(np.column_stack([u.ravel(), v.ravel()]), camera).reshape(shape)
     values = np.nan_to_num(values / relative_illumination(centres_px, camera)[:, None, None])
     cells = np.zeros(rois.cells())
     for roi, value in enumerate(values):
-        columns, rows = (_interpolation(int(size)) for size in (rois.widths[roi], rois.heights[roi]))
+        columns, rows = (_interpolation(int(size), count) for size in (rois.widths[roi], rois.heights[roi]))
         rois.roi(cells, roi)[:] = rows @ value @ columns.T
     return cells
 
 
 @lru_cache(maxsize=512)
-def _interpolation(pixels: int) -> Floats:
-    """Lagrange's polynomials of the FALL_OFF_NODES at the centres of pixels along a line, (pixels, nodes)."""
-    k = np.arange(FALL_OFF_NODES)
+def _interpolation(pixels: int, nodes: int) -> Floats:
+    """Lagrange's polynomials of Chebyshev nodes at the centres of pixels along a line, (pixels, nodes)."""
+    k = np.arange(nodes)
     # Barycentric weights of Chebyshev's first-kind nodes.
-    barycentric = (-1.0) ** k * np.sin(np.pi * (k + 0.5) / FALL_OFF_NODES)
-    offset = ((2 * np.arange(pixels) + 1) / pixels - 1)[:, None] - np.cos(np.pi * (k + 0.5) / FALL_OFF_NODES)
+    barycentric = (-1.0) ** k * np.sin(np.pi * (k + 0.5) / nodes)
+    offset = ((2 * np.arange(pixels) + 1) / pixels - 1)[:, None] - np.cos(np.pi * (k + 0.5) / nodes)
     on_node = np.abs(offset) < 1e-14
     weights = barycentric / np.where(on_node, 1.0, offset)
     weights = np.where(on_node.any(axis=1, keepdims=True), on_node, weights)
@@ -229,47 +233,63 @@ class RenderedLeds:
 
     light: Floats
     parameters: Ints
-    _rois: RoiStack
+    _model: "LedImageModel"
+    _camera: Camera
+    _rims: ProjectedPoints
+    _offsets_m: Floats
+    _outlines: Outlines
     _pieces: EdgePieces
-    _lens: LensBlur
-    _slope_blur: RegionBlur | None
 
-    def by_shift_and_size(self) -> "RenderedLeds":
-        """The same images, with derivatives by the principal point, which shifts them, and by the size alone."""
-        pieces = self._pieces
-        shifts = pieces.shifts * self._lens.factors[pieces.roi]
-        of_size = pieces.slopes[self.parameters == SIZE_PARAMETER]
-        return replace(
-            self,
-            parameters=np.array([*PRINCIPAL_POINT, SIZE_PARAMETER]),
-            _pieces=replace(pieces, slopes=np.concatenate([shifts, of_size])),
-        )
+    def by(self, parameters: Ints) -> "RenderedLeds":
+        """The same images, with derivatives by other parameters."""
+        return replace(self, parameters=parameters)
 
     def slopes(self, cells: Ints) -> Floats:
-        """Derivatives of the light in n cells by the p parameters of the model, (n, p)."""
-        pieces, lens, blur = self._pieces, self._lens, self._slope_blur
-        if blur is None:
-            index = np.full(self._rois.cells(), len(cells))
-            index[cells] = np.arange(len(cells))
-            at = index[self._rois.cell(pieces.roi, pieces.row, pieces.column)]
-            sums = np.empty((len(pieces.slopes), len(cells)))
-            for parameter, slope in enumerate(pieces.slopes):
-                sums[parameter] = np.bincount(at, slope, len(cells) + 1)[:-1]
-            return sums.T
-        coarsening = (lens.factors // lens.slope_factors)[pieces.roi]
-        at = blur.fine.cell(pieces.roi, pieces.row // coarsening, pieces.column // coarsening)
-        slopes = np.empty((len(cells), len(pieces.slopes)))
-        for parameter, slope in enumerate(pieces.slopes):
-            sharp = np.bincount(at, slope / coarsening**2, blur.fine.cells())
-            slopes[:, parameter] = blur(np.asarray(sharp, dtype=np.float64))[cells]
+        """Derivatives of the light in n cells by the p parameters, (n, p)."""
+        place, of_places = self.places_of_slopes(cells)
+        slopes = np.zeros((len(cells), len(self.parameters)))
+        slopes[place >= 0] = of_places[place[place >= 0]]
         return slopes
+
+    def places_of_slopes(self, cells: Ints) -> tuple[Ints, Floats]:
+        """Derivatives (m, p), and the place (n,) of each of n cells among them, -1 for a cell that has none."""
+        sharp, blur = self._sharp_slopes, self._model.slope_blur
+        if blur is None:
+            place = self._model.place
+            place[sharp.cells] = np.arange(len(sharp.cells))
+            places = place[cells]
+            place[sharp.cells] = -1
+            return places, sharp.slopes
+        lens = self._model.lens
+        coarsening = (lens.factors // lens.slope_factors)[sharp.roi]
+        row, column = self._model.fine.pixels(sharp.roi, sharp.cells)
+        at = blur.fine.cell(sharp.roi, row // coarsening, column // coarsening)
+        slopes = np.empty((len(cells), len(self.parameters)))
+        for parameter, slope in enumerate(sharp.slopes.T):
+            image = np.bincount(at, slope / coarsening**2, blur.fine.cells())
+            slopes[:, parameter] = blur(np.asarray(image, dtype=np.float64))[cells]
+        return np.arange(len(cells)), slopes
+
+    @cached_property
+    def _sharp_slopes(self) -> RimSlopes:
+        """Derivatives of the images without blur, on pixels subdivided by the lens's factors."""
+        model, rims, parameters = self._model, self._rims, self.parameters
+        intrinsic = motion = np.empty((0, 2, 0))
+        if ((parameters >= POSE_PARAMETERS) & (parameters < SIZE_PARAMETER)).any():
+            intrinsic = intrinsic_slopes_px(rims.p_cam, self._camera.normalized(rims.pixels), self._camera)
+        if rims.motion_slopes is not None:
+            motion = rims.motion_slopes
+        factors = model.lens.factors[self._outlines.roi]
+        slopes = _slopes(rims.slopes, self._offsets_m, intrinsic, motion, parameters, factors)
+        return rim_slopes(self._outlines, self._pieces, slopes, model.fine_fall_off, model.place)
 
 
 class LedImageModel:
     """Image model of LEDs, for states near the one that their footprints were computed for.
 
     `rois` holds a region of interest for each LED, in pixels of the sensor; `fall_off` (cells,) the lens's fall-off in
-    them, 1 at the LED images' centres.
+    them, 1 at the LED images' centres. `lens` is the blur; on the subdivided pixels `fine` that it needs the fall-off
+    is `fine_fall_off`, and derivatives are blurred by `slope_blur`. `place` is memory of -1 for each of the fine cells.
     """
 
     def __init__(
@@ -279,17 +299,18 @@ class LedImageModel:
         self.rois = rois
         self.fall_off = fall_off(rois, footprints.centre, camera)
         self._camera = camera
-        self._lens = lens
-        self._blur = self._slope_blur = None
-        self._fine, self._fine_fall_off = rois, self.fall_off
+        self.lens = lens
+        self._blur = self.slope_blur = None
+        self.fine, self.fine_fall_off = rois, self.fall_off
         if lens.kernels:
             first = np.floor(footprints.low).astype(np.int64) - SHARP_MARGIN_PX
             size = np.ceil(footprints.high).astype(np.int64) + SHARP_MARGIN_PX - first
             sharp = RoiStack(first[:, 1], first[:, 0], size[:, 1], size[:, 0])
             self._blur = RegionBlur(sharp, rois, lens.kernels, lens.factors)
-            self._slope_blur = RegionBlur(sharp, rois, lens.slope_kernels, lens.slope_factors)
-            self._fine = self._blur.fine
-            self._fine_fall_off = fall_off(self._fine, footprints.centre, camera, lens.factors)
+            self.slope_blur = RegionBlur(sharp, rois, lens.slope_kernels, lens.slope_factors)
+            self.fine = self._blur.fine
+            self.fine_fall_off = fall_off(self.fine, footprints.centre, camera, lens.factors)
+        self.place = np.full(self.fine.cells(), -1)
         needed = np.maximum(MIN_POINTS, EDGE_MARGIN * footprints.max_edge_px * COARSE_POINTS / MAX_EDGE_PX)
         counts = 4 * np.ceil(needed * lens.factors / 4).astype(np.int64)
         last = np.cumsum(counts)
@@ -304,33 +325,59 @@ class LedImageModel:
 
         `parameters` are those of the IMAGE_PARAMETERS and MOTION_COLUMNS that derivatives are by.
         """
-        lens, factors = self._lens, self._lens.factors[self._led]
-        offsets_m = state.of(self._led).rims_m(self._rims_m[:, None])[:, 0]
-        rims = state.project((self._centres_m + state.shifts_m)[self._led] + offsets_m)
-        slopes = _slopes(rims, offsets_m, state.camera, parameters)
-        outlines = Outlines(rims.pixels * factors[:, None], self._following, self._led, slopes * factors)
-        covered, pieces = cover(self._fine, outlines)
-        light = covered * self._fine_fall_off
-        pieces = pieces.times(self._fine_fall_off[self._fine.cell(pieces.roi, pieces.row, pieces.column)])
-        if self._blur is not None:
-            light = self._blur(light)
-        return RenderedLeds(light, parameters, self.rois, pieces, lens, self._slope_blur)
+        centres_m = self._centres_m + state.shifts_m
+        offsets_m, points_m = _rim_points(self._rims_m, self._led, centres_m, state.sizes, state.tilts)
+        rims = state.project(points_m)
+        outlines = Outlines(rims.pixels * self.lens.factors[self._led, None], self._following, self._led)
+        covered, pieces = cover(self.fine, outlines)
+        covered *= self.fine_fall_off
+        light = covered if self._blur is None else self._blur(covered)
+        return RenderedLeds(light, parameters, self, state.camera, rims, offsets_m, outlines, pieces)
 
 
-def _slopes(rims: ProjectedPoints, offsets_m: Floats, camera: Camera, parameters: Ints) -> Floats:
-    """Derivatives (2, p, n) of points of rims by parameters (p,); `offsets_m` (n, 3) are from their LEDs' centres."""
-    # A point of the face moves its image as much as the camera moves it by the opposite way.
-    by_size = -np.einsum("nij,nj->ni", rims.slopes[:, :, :3], offsets_m)[:, :, None]
-    blocks = {0: rims.slopes, SIZE_PARAMETER: by_size}
-    if (parameters > SIZE_PARAMETER).any():
-        blocks[SIZE_PARAMETER + 1] = -rims.slopes[:, :, 2:3] * offsets_m[:, None, :2]
-    if ((parameters >= POSE_PARAMETERS) & (parameters < SIZE_PARAMETER)).any():
-        blocks[POSE_PARAMETERS] = intrinsic_slopes_px(rims.p_cam, camera.normalized(rims.pixels), camera)
-    if rims.motion_slopes is not None:
-        blocks[LOCAL_PARAMETERS] = rims.motion_slopes
-    slopes = np.zeros((2, len(parameters), len(offsets_m)))
-    for first, block in blocks.items():
-        for column, parameter in enumerate(parameters.tolist()):
-            if first <= parameter < first + block.shape[2]:
-                slopes[:, column] = block[:, :, parameter - first].T
+@compiled
+def _rim_points(level_m: Floats, led: Ints, centres_m: Floats, sizes: Floats, tilts: Floats) -> tuple[Floats, Floats]:
+    """Points of rims from their LEDs' centres, and in the world, both (m, 3), from those of level faces by the map.
+
+    Point i is of LED led[i] of n, whose centres (n, 3), sizes (n,) and tilts (n, 2) are those of an `ImageState`.
+    """
+    offsets_m, points_m = np.empty_like(level_m), np.empty_like(level_m)
+    for i in range(len(level_m)):
+        k = led[i]
+        for axis in range(3):
+            offsets_m[i, axis] = level_m[i, axis] * sizes[k]
+        offsets_m[i, 2] += offsets_m[i, 0] * tilts[k, 0] + offsets_m[i, 1] * tilts[k, 1]
+        for axis in range(3):
+            points_m[i, axis] = centres_m[k, axis] + offsets_m[i, axis]
+    return offsets_m, points_m
+
+
+@compiled
+def _slopes(
+    pose: Floats, offsets_m: Floats, intrinsic: Floats, motion: Floats, parameters: Ints, factors: Ints
+) -> Floats:
+    """Derivatives (n, 2, p) of points of rims by parameters (p,), in pixels finer by `factors` (n,).
+
+    By the pose they are `pose` (n, 2, 6), by the intrinsics `intrinsic` (n, 2, 7), by the camera's motion `motion`
+    (n, 2, 6), where they are wanted. `offsets_m` (n, 3) are the points from their LEDs' centres.
+    """
+    slopes = np.zeros((len(pose), 2, len(parameters)))
+    for i in range(len(pose)):
+        for axis in range(2):
+            for column in range(len(parameters)):
+                parameter = parameters[column]
+                slope = 0.0
+                # A point of the face moves its image as much as the camera moves it by the opposite way.
+                if parameter < pose.shape[2]:
+                    slope = pose[i, axis, parameter]
+                elif parameter < SIZE_PARAMETER:
+                    slope = intrinsic[i, axis, parameter - pose.shape[2]]
+                elif parameter == SIZE_PARAMETER:
+                    for along in range(3):
+                        slope -= pose[i, axis, along] * offsets_m[i, along]
+                elif parameter < IMAGE_PARAMETERS:
+                    slope = -pose[i, axis, 2] * offsets_m[i, parameter - SIZE_PARAMETER - 1]
+                elif parameter >= LOCAL_PARAMETERS:
+                    slope = motion[i, axis, parameter - LOCAL_PARAMETERS]
+                slopes[i, axis, column] = slope * factors[i]
     return slopes

@@ -12,13 +12,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.compiled import compiled
 from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame, LineGains, Part
-from estimator.io.led_map import Led
+from estimator.io.led_map import Led, led_arrays
 from estimator.pixels.led_model import (
     POSE_ALONE,
     ImageState,
@@ -29,21 +29,21 @@ from estimator.pixels.led_model import (
 )
 from estimator.pixels.polygon_raster import RoiStack
 from estimator.pixels.psf import LensBlur
+from estimator.pixels.readings import (
+    EDGE_PX,
+    UNIFORM_TOLERANCE,
+    Faces,
+    Readings,
+    known_shares,
+    read,
+    sorted_pixels,
+)
 from estimator.spots.excess_noise import excess_noise_e2
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-# An image may move by nearly this much before its pixels have to be sorted into edge, inside and background again.
-EDGE_PX = 2
-# Pixels up to NEAR_PX beyond those that an LED lights tell the background of its edge. Those further off may show
-# another surface: the panel that LEDs are mounted on ends, and the ceiling or the panel's side begins.
-NEAR_PX = 1
-# Blocks of the uniform pixels of a face along each axis, each summed for a reading: the light changes little over one.
-BLOCKS = 6
-# A pixel whose share of an LED's light is within this of 0 or 1 is uniform.
-UNIFORM_TOLERANCE = 1e-3
 # An LED is used once the pose determines its image to this, one standard deviation.
 MAX_IMAGE_SIGMA_PX = 0.5
 # Share of the pixels inside an LED image that have to be known: read out and not saturated.
@@ -107,11 +107,26 @@ class LedPixels:
         """Sums over each group, (..., g), of values (..., m)."""
         return np.asarray(np.add.reduceat(values, self.starts[:-1], axis=-1))
 
+    def brightness(self, profile: Floats) -> Floats:
+        """Mean luminance (m,) over the face of the pixels of each reading, 1 at the centre, by profiles (n, 3)."""
+        return _brightness(self.starts, self.led, self.face, profile)
+
     def light(self, rendered: RenderedLeds) -> Floats:
         """Light (m,) of each reading, in that of a pixel at the LED image's centre."""
         light = self.uniform_light.copy()
         light[self.edges] = rendered.light[self.cells]
         return light
+
+
+@compiled
+def _brightness(starts: Ints, led: Ints, face: Floats, profile: Floats) -> Floats:
+    """See `LedPixels.brightness`."""
+    brightness = np.ones(len(face))
+    for g in range(len(led)):
+        for i in range(starts[g], starts[g + 1]):
+            for k in range(face.shape[1]):
+                brightness[i] += face[i, k] * profile[led[g], k]
+    return brightness
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,19 +151,6 @@ class ReadingGains:
                 gain[readings] = gains(lines)
                 by_phase[readings] = (gains(lines + PHASE_STEP) - gains(lines - PHASE_STEP)) / (2 * PHASE_STEP)
         return gain, by_phase
-
-
-@dataclass(frozen=True, eq=False)
-class _Readings:
-    """Readings of one group; see `LedPixels`. `lines` are those of the readings of an LED that sends, else None."""
-
-    cells: Ints
-    pixel_counts: Floats
-    electrons: Floats
-    background: Floats
-    face: Floats
-    uniform_light: Floats
-    lines: Ints | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,145 +180,68 @@ def gather_led_pixels(frame: DeviceFrame, view: LedsInView, parameters: Ints = P
     rois = _rois(frame, footprints, EDGE_PX + lens.radius_px)
     model = LedImageModel(leds, footprints, frame.camera, lens, rois)
     rendered = model.render(state, parameters)
-    with np.errstate(all="ignore"):
-        share_of_cells = np.nan_to_num(rendered.light / model.fall_off)
-    shares = [rois.roi(share_of_cells, k) for k in range(len(leds))]
-    masks = [_edge_and_lit(share) for share in shares]
-    readings = _readings(frame, rois)
-    saturated = np.array([_mostly_saturated(share, known) for share, (_, known) in zip(shares, readings, strict=True)])
-    groups: list[_Readings] = []
-    led_of_group: list[int] = []
-    for k in range(len(leds)):
-        electrons, known = readings[k]
-        if saturated[k] and not saturated.all():
-            continue
-        for other in rois.meeting(rois, k):
-            if other == k:
-                continue
-            own_slices, other_slices = rois.intersection(k, rois, other)
-            known[own_slices] &= ~masks[other].lit[other_slices]
-        rows = np.arange(rois.rows[k], rois.rows[k] + rois.heights[k])[:, None]
-        columns = np.arange(rois.columns[k], rois.columns[k] + rois.widths[k])
-        (au, av), (bu, bv) = footprints.to_face[k].tolist()
-        u, v = footprints.centre[k].tolist()
-        du, dv = columns + 0.5 - u, rows + 0.5 - v
-        lines = _lines(frame, leds[k], rows, columns)
-        position = _FacePixels(au * du + av * dv, bu * du + bv * dv, rois.roi(model.fall_off, k))
-        edge, inside = known & masks[k].edge & masks[k].near, known & ~masks[k].edge & (shares[k] > 0.5)
-        for of_colour in _colours(frame, rows, columns):
-            of_edge = edge & of_colour
-            row, column = np.nonzero(of_edge)
-            if len(row) == 0:
-                continue
-            cells = rois.cell(np.full(len(row), k), row + rois.rows[k], column + rois.columns[k])
-            groups.append(_group(position, electrons, cells, of_edge, inside & of_colour, lines))
-            led_of_group.append(k)
-    if not groups:
+    pixels = sorted_pixels(rois, rendered.light, model.fall_off)
+    electrons, known = _readings(frame, rois)
+    known_share = known_shares(pixels.share, known, rois.heights, rois.widths, rois.starts)
+    saturated = ~(known_share > MIN_KNOWN_SHARE)
+    left_out = saturated & ~saturated.all()
+    for k, other in rois.meeting(rois):
+        if other != k and not left_out[k]:
+            own, its = rois.intersection(k, rois, other)
+            rois.roi(known, k)[own] &= ~rois.roi(pixels.lit, other)[its]
+    lines = _lines(frame, leds, rois)
+    edge, inside = known & pixels.edge & pixels.near, known & ~pixels.edge & (pixels.share > 0.5)
+    faces = Faces(footprints.centre, footprints.to_face, model.fall_off)
+    for k in np.flatnonzero(left_out).tolist():
+        rois.roi(edge, k)[:] = rois.roi(inside, k)[:] = False
+    readings = read(rois, faces, electrons, edge, inside, lines, 1 if frame.sensor.mosaic == "none" else 4)
+    if len(readings.led) == 0:
         raise EstimationFailure("fit", "no pixel of the LEDs in view is usable: all are saturated or overlap others")
+    wholly = known & (pixels.share > 1 - UNIFORM_TOLERANCE)
     inside_steady = (
-        (electrons, known & (share > 1 - UNIFORM_TOLERANCE))
-        for led, share, (electrons, known) in zip(leds, shares, readings, strict=True)
-        if led.id not in frame.gains
+        (rois.roi(electrons, k), rois.roi(wholly, k)) for k, led in enumerate(leds) if led.id not in frame.gains
     )
-    counts = np.array([len(group.electrons) for group in groups])
-    starts = np.concatenate([[0], np.cumsum(counts)])
-    edges = np.concatenate([first + np.arange(len(g.cells)) for first, g in zip(starts.tolist(), groups, strict=False)])
-
-    def joined(name: str) -> Floats:
-        return np.concatenate([getattr(group, name) for group in groups])
-
     return LedPixels(
         leds=leds,
         index=view.index,
         model=model,
         state=state,
         rendered=rendered,
-        edges=edges,
-        cells=np.concatenate([group.cells for group in groups]),
-        pixel_counts=joined("pixel_counts"),
-        electrons=joined("electrons"),
-        background=joined("background"),
-        face=joined("face"),
-        uniform_light=joined("uniform_light"),
-        starts=starts,
-        led=np.array(led_of_group),
+        edges=readings.edges,
+        cells=readings.cells,
+        pixel_counts=readings.pixel_counts,
+        electrons=readings.electrons,
+        background=readings.background,
+        face=readings.face,
+        uniform_light=readings.uniform_light,
+        starts=readings.starts,
+        led=readings.led,
         radius_px=(footprints.high - footprints.low).max(axis=1) / 2,
         max_move_px=EDGE_PX - 1,
         more=view.more,
         excess_e2=excess_noise_e2(inside_steady, frame.sensor),
-        gains=_gains(frame, [leds[k] for k in led_of_group], groups, starts),
+        gains=_gains(frame, leds, readings),
     )
 
 
-def _lines(frame: DeviceFrame, led: Led, rows: Ints, columns: Ints) -> Ints | None:
-    """Lines of a region's pixels, (rows, columns), of an LED that sends; None for a steady one."""
-    if led.id not in frame.gains:
+def _lines(frame: DeviceFrame, leds: Sequence[Led], rois: RoiStack) -> Ints:
+    """Lines of the cells of regions, (cells,); -1 for those of LEDs that do not send, (0,) where none does."""
+    if not frame.gains:
+        return np.zeros(0, dtype=np.int64)
+    lines = np.full(rois.cells(), -1)
+    for k, led in enumerate(leds):
+        if led.id in frame.gains:
+            v, u = np.mgrid[: rois.heights[k], : rois.widths[k]] + 0.5
+            rois.roi(lines, k)[:] = np.floor(frame.camera.line_of(u + rois.columns[k], v + rois.rows[k]))
+    return lines
+
+
+def _gains(frame: DeviceFrame, leds: Sequence[Led], readings: Readings) -> ReadingGains | None:
+    """Gains of the readings of groups, whose LEDs are among `leds`; None where all are steady."""
+    of_group = tuple(frame.gains.get(leds[k].id) for k in readings.led)
+    if all(gains is None for gains in of_group):
         return None
-    u, v = np.broadcast_arrays(columns + 0.5, rows + 0.5)
-    return np.floor(frame.camera.line_of(u, v)).astype(np.int64)
-
-
-def _gains(frame: DeviceFrame, leds: Sequence[Led], groups: Sequence[_Readings], starts: Ints) -> ReadingGains | None:
-    """Gains of the readings of groups, whose LEDs are `leds`; None where all are steady."""
-    if all(group.lines is None for group in groups):
-        return None
-    lines = [np.zeros(len(group.electrons)) if group.lines is None else group.lines for group in groups]
-    return ReadingGains(tuple(frame.gains.get(led.id) for led in leds), np.concatenate(lines).astype(float), starts)
-
-
-@dataclass(frozen=True, eq=False)
-class _FacePixels:
-    """A region's pixels, (rows, columns): coordinates `a`, `b` on the face, and the lens's fall-off."""
-
-    a: Floats
-    b: Floats
-    fall_off: Floats
-
-
-def _group(
-    pixels: _FacePixels,
-    electrons: Floats,
-    cells: Ints,
-    edge: Mask,
-    inside: Mask,
-    lines: Ints | None,
-) -> _Readings:
-    """Readings of the edge pixels and of blocks of the pixels inside the face, both given by masks (rows, columns).
-
-    `lines` (rows, columns) are those of the pixels where the LED sends.
-    """
-    a, b, fall_off = pixels.a[edge], pixels.b[edge], pixels.fall_off[edge]
-    r2 = a * a + b * b
-    background = np.stack([fall_off * basis for basis in (np.ones(len(a)), a, b, r2)], axis=1)
-    face = np.stack([a, b, r2 - 0.5], axis=1)
-    count = np.ones(len(a))
-    light = np.zeros(len(a))
-    a, b, fall_off = (values[inside] for values in vars(pixels).values())
-    r2 = a * a + b * b
-    tile = np.clip((a + 1) * (BLOCKS / 2), 0, BLOCKS - 1).astype(np.int64) * BLOCKS
-    tile += np.clip((b + 1) * (BLOCKS / 2), 0, BLOCKS - 1).astype(np.int64)
-    first_line = 0
-    if lines is not None and len(tile):
-        lines_inside = lines[inside]
-        first_line = int(lines_inside.min())
-        tile += BLOCKS**2 * (lines_inside - first_line)
-    pixels_in = np.bincount(tile)
-    blocks = np.flatnonzero(pixels_in)
-
-    def summed(values: Floats) -> Floats:
-        return np.asarray(np.bincount(tile, values)[blocks], dtype=np.float64)
-
-    sums = np.stack([summed(fall_off * basis) for basis in (np.ones(len(a)), a, b, r2)], axis=1)
-    mean = sums[:, 1:] / sums[:, :1]
-    return _Readings(
-        cells=cells,
-        pixel_counts=np.concatenate([count, pixels_in[blocks]]),
-        electrons=np.concatenate([electrons[edge], summed(electrons[inside])]),
-        background=np.concatenate([background, sums]),
-        face=np.concatenate([face, mean - [0.0, 0.0, 0.5]]),
-        uniform_light=np.concatenate([light, sums[:, 0]]),
-        lines=None if lines is None else np.concatenate([lines[edge], first_line + blocks // BLOCKS**2]),
-    )
+    return ReadingGains(of_group, readings.lines.astype(float), readings.starts)
 
 
 def leds_in_view(
@@ -330,17 +255,16 @@ def leds_in_view(
     left.
     """
     low, high = _read_out(frame)
-    leds = tuple(frame.leds.values())
-    centres_m = np.array([led.position_m for led in leds]) + state.shifts_m
+    leds, arrays = tuple(frame.leds.values()), led_arrays(frame.leds)
+    centres_m = arrays.positions_m + state.shifts_m
     centres = state.project(centres_m)
-    half_widths_m = np.array([led.half_width_m for led in leds])
     with np.errstate(invalid="ignore"):
         # The image moves with the camera as much as a point of the face moves it from its centre.
         scale = np.linalg.norm(centres.slopes[:, :, :3], axis=(1, 2))
-        extent_px = (MAX_EXTENT * half_widths_m * scale)[:, None]
+        extent_px = (MAX_EXTENT * arrays.half_widths_m * scale)[:, None]
         near = ((centres.pixels > low - extent_px) & (centres.pixels < high + extent_px)).all(axis=1)
     unknown = frame.unknown_gains
-    candidates = np.flatnonzero(near & [led.id not in unknown for led in leds])
+    candidates = np.array([k for k in np.flatnonzero(near).tolist() if leds[k].id not in unknown], dtype=np.int64)
     if len(candidates) == 0:
         raise EstimationFailure("fit", NO_GAINS if near.any() else NONE_IN_VIEW)
     footprints = led_footprints([leds[k] for k in candidates], state.of(candidates))
@@ -380,52 +304,14 @@ def _rois(frame: DeviceFrame, footprints: LedFootprints, margin_px: int) -> RoiS
     return RoiStack(first[:, 1], first[:, 0], end[:, 1] - first[:, 1], end[:, 0] - first[:, 0])
 
 
-@dataclass(frozen=True, eq=False)
-class _Masks:
-    """Pixels of a region: `edge` may be partly lit by the LED while its image moves by EDGE_PX, `lit` may be lit at
-    all, `near` are at most NEAR_PX beyond the pixels that it lights.
-    """
-
-    edge: Mask
-    lit: Mask
-    near: Mask
-
-
-def _edge_and_lit(share: Floats) -> _Masks:
-    """Masks of a region by the LED's share of each pixel's light, (rows, columns)."""
-    lit = share > UNIFORM_TOLERANCE
-    partly_lit = lit & (share < 1 - UNIFORM_TOLERANCE)
-    edge, near_lit, near = (
-        cv2.dilate(mask.view(np.uint8), np.ones((2 * px + 1, 2 * px + 1), dtype=np.uint8)).view(bool)
-        for mask, px in ((partly_lit, EDGE_PX), (lit, EDGE_PX), (lit, NEAR_PX))
-    )
-    return _Masks(edge, near_lit, near)
-
-
-def _readings(frame: DeviceFrame, rois: RoiStack) -> list[tuple[Floats, Mask]]:
-    """Electrons in each region, (rows, columns), and which of them are known: read out and not saturated."""
-    shapes = zip(rois.heights.tolist(), rois.widths.tolist(), strict=True)
-    readings = [(np.zeros(shape), np.zeros(shape, dtype=bool)) for shape in shapes]
+def _readings(frame: DeviceFrame, rois: RoiStack) -> tuple[NDArray[np.float32], Mask]:
+    """Electrons in the cells of regions, (cells,), and which of them are known: read out and not saturated."""
+    image_dn, read_out = np.zeros(rois.cells(), dtype=np.uint32), np.zeros(rois.cells(), dtype=bool)
     first = np.array([(part.row, part.column) for part in frame.parts])
     parts = RoiStack(*first.T, *np.array([part.image_dn.shape for part in frame.parts]).T)
-    for k, (electrons, known) in enumerate(readings):
-        for number in parts.meeting(rois, k):
-            part = frame.parts[number]
-            source, target = parts.intersection(number, rois, k)
-            piece = Part(0, 0, part.image_dn[source])
-            electrons[target] = frame.electrons(piece)
-            known[target] = ~frame.clipped(piece)
-    return readings
-
-
-def _mostly_saturated(share: Floats, known: Mask) -> bool:
-    """Whether an LED image has pixels inside, and less than MIN_KNOWN_SHARE of them are known."""
-    inside = share > 1 - UNIFORM_TOLERANCE
-    return bool(inside.any() and not known[inside].mean() > MIN_KNOWN_SHARE)
-
-
-def _colours(frame: DeviceFrame, rows: Ints, columns: Ints) -> list[Mask]:
-    """Masks of a region's pixels by site of the 2 x 2 mosaic; one mask of all pixels without a mosaic."""
-    if frame.sensor.mosaic == "none":
-        return [np.ones((1, 1), dtype=bool)]
-    return [(rows % 2 == site // 2) & (columns % 2 == site % 2) for site in range(4)]
+    for number, k in parts.meeting(rois):
+        source, target = parts.intersection(number, rois, k)
+        rois.roi(image_dn, k)[target] = frame.parts[number].image_dn[source]
+        rois.roi(read_out, k)[target] = True
+    cells = Part(0, 0, image_dn)
+    return frame.electrons(cells), read_out & ~frame.clipped(cells)

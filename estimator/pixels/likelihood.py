@@ -17,13 +17,14 @@ With `sensor.noise` "full" the variance is shot noise plus the data sheet's dark
 "none" shot noise is assumed.
 """
 
+import math
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimator.camera.motion import MOTION_PARAMETERS
+from estimator.compiled import compiled, compiled_sums
 from estimator.io.device import DeviceFrame
 from estimator.pixels.led_model import IMAGE_PARAMETERS, LOCAL_PARAMETERS, PROFILE_PARAMETERS, RenderedLeds
 from estimator.pixels.led_pixels import LedPixels
@@ -87,6 +88,8 @@ class Noise:
         Pixels of an even background are then rounded alike, while `variance` has independent rounding errors. `off_e`
         are the readings, of `n` pixels each, less what is expected.
         """
+        if not self.rounding_e2 > MAX_ROUNDING_SHARE * variance.min():
+            return variance
         alike = np.flatnonzero(unlit & (self.rounding_e2 > MAX_ROUNDING_SHARE * variance))
         if not len(alike):
             return variance
@@ -138,28 +141,28 @@ def fit_photometry(
     `used` (n,) are the LEDs to use; `profile` (n, 3) are the coefficients of a, b and a^2 + b^2 - 1/2 of each LED's
     luminance, 0 if None. Readings that the previous fit did not use may enter if `may_enter`, and else may only leave.
     """
-    n, y, group = pixels.pixel_counts, pixels.electrons, pixels.group
+    n, y, group, starts = pixels.pixel_counts, pixels.electrons, pixels.group, pixels.starts
     light = pixels.light(rendered)
     if profile is not None:
-        light = light * (1 + np.einsum("mi,mi->m", pixels.face, profile[pixels.led][group]))
+        light = light * pixels.brightness(profile)
     unlit = light < MAX_UNLIT_SHARE * pixels.background[:, 0]
-    floor_e = _floor_e(pixels, unlit)
+    floors_e = _floors_e(starts, y, n, unlit)
     phase = gain = None
     if pixels.gains is not None:
         phase = np.zeros(len(pixels.led)) if before is None or before.phase is None else before.phase
-    of_used_led = used[pixels.led][group]
-    weight = of_used_led / n if before is None else before.weight
-    level = np.maximum.reduceat(y / n, pixels.starts[:-1]) if before is None else before.level
+    used_groups = used[pixels.led]
+    weight = used_groups[group] / n if before is None else before.weight
+    level = np.maximum.reduceat(y / n, starts[:-1]) if before is None else before.level
     count = COEFFICIENTS if phase is None else COEFFICIENTS + 1
-    # One coefficient after another in memory: (c + 1, m), the readings last.
-    columns = np.empty((count + 1, len(y)))
-    columns[:AMPLITUDE], columns[AMPLITUDE], columns[-1] = pixels.background.T, light, y
+    # One coefficient after another in memory: (c, m), the readings last.
+    basis = np.empty((count, len(y)))
+    basis[:AMPLITUDE], basis[AMPLITUDE] = pixels.background.T, light
     # Without variances of a previous fit, iterate: the first weights are a guess.
     for _ in range(3 if before is None else 1):
         if pixels.gains is not None and phase is not None:
             gain, by_phase = pixels.gains.at(phase)
-            columns[AMPLITUDE], columns[AMPLITUDE + 1] = light * gain, light * by_phase
-        normal, right = _normal_equations(pixels.starts, columns, weight)
+            basis[AMPLITUDE], basis[AMPLITUDE + 1] = light * gain, light * by_phase
+        normal, right = _normal_equations(starts, basis, y, weight)
         determined = (normal[:, 0, 0] > 0) & (normal[:, AMPLITUDE, AMPLITUDE] > 0)
         prior = np.maximum(np.outer(level, BACKGROUND_SIGMAS), MIN_VARIANCE_E2) ** -2.0
         slopes = range(1, AMPLITUDE)
@@ -171,20 +174,17 @@ def fit_photometry(
             normal[:, -1, -1] += of_phase
             right[:, -1] -= of_phase * bright * phase
         normal[~determined] = np.eye(count)
+        scaled, scale = _of_equal_size(normal)
         # Of matrices with a diagonal of ones: no larger than the determinant of background and amplitude alone.
-        determined &= np.linalg.det(_of_equal_size(normal)[0]) > MIN_DETERMINANT
-        normal[~determined] = np.eye(count)
-        covariance = _inverse(normal) * determined[:, None, None]
+        determined &= np.linalg.det(scaled) > MIN_DETERMINANT
+        scaled[~determined] = np.eye(count)
+        covariance = np.linalg.inv(scaled) * scale[:, :, None] * scale[:, None] * determined[:, None, None]
         coefficients = np.einsum("gij,gj->gi", covariance, right)
-        expected = (columns[:-1] * np.repeat(coefficients.T, np.diff(pixels.starts), axis=1)).sum(axis=0)
-        per_pixel = np.maximum(expected / n, floor_e)
-        variance = per_pixel + noise.dark_e2 + noise.prnu2 * per_pixel**2
-        variance = np.maximum(noise.reduced_where_alike(variance, y - expected, n, unlit, group), MIN_VARIANCE_E2)
-        unsaturated = per_pixel + SATURATION_MARGIN_SIGMA * np.sqrt(variance) < noise.saturation_e
-        usable = of_used_led & unsaturated & determined[group]
+        expected, per_pixel, variance = _expected(starts, basis, n, coefficients, floors_e, noise.dark_e2, noise.prnu2)
+        variance = noise.reduced_where_alike(variance, y - expected, n, unlit, group)
+        weight = _weights(starts, n, per_pixel, variance, used_groups & determined, noise.saturation_e)
         if before is not None and not may_enter:
-            usable &= before.weight > 0
-        weight = np.where(usable, 1 / (variance * n), 0.0)
+            weight[before.weight == 0] = 0.0
         if phase is not None:
             bright = coefficients[:, AMPLITUDE]
             change = np.divide(coefficients[:, -1], bright, out=np.zeros_like(bright), where=bright > 0)
@@ -193,10 +193,9 @@ def fit_photometry(
     amplitude = coefficients[:, AMPLITUDE]
     sigma = np.sqrt(covariance[:, AMPLITUDE, AMPLITUDE])
     signal_to_noise = np.divide(amplitude, sigma, out=np.zeros_like(sigma), where=sigma > 0)
-    weighed = weight > 0
-    deviance = _mean_deviance(y[weighed], expected[weighed], n[weighed] * noise.dark_e2)
+    deviance = _mean_deviance(y, expected, n * noise.dark_e2, weight > 0)
     return PhotometricFit(
-        columns[:-1].T,
+        basis.T,
         amplitude,
         coefficients[:, 0],
         signal_to_noise,
@@ -210,32 +209,87 @@ def fit_photometry(
     )
 
 
-def _floor_e(pixels: LedPixels, unlit: Mask) -> Floats:
-    """Half of the mean of the unlit pixels of each reading's group, (m,): no expectation is lower.
+@compiled
+def _floors_e(starts: Ints, electrons: Floats, pixel_counts: Floats, unlit: Mask) -> Floats:
+    """Half of the mean of the unlit pixels of each of g groups, (g,): no expectation is lower.
 
     The background of a few counts, extrapolated, may come out at 0 or less: its pixels would have no noise. Half a
     count more (Jeffreys 1946), so that no counts at all do not either.
     """
-    counts = pixels.sum_by_group(np.where(unlit, pixels.electrons, 0.0))
-    sizes = pixels.sum_by_group(np.where(unlit, pixels.pixel_counts, 0.0))
-    return np.asarray(((np.maximum(counts, 0.0) + 0.5) / np.maximum(sizes, 1.0))[pixels.group] / 2)
+    floors_e = np.empty(len(starts) - 1)
+    for g in range(len(floors_e)):
+        total, size = 0.0, 0.0
+        for i in range(starts[g], starts[g + 1]):
+            if unlit[i]:
+                total += electrons[i]
+                size += pixel_counts[i]
+        floors_e[g] = (max(total, 0.0) + 0.5) / max(size, 1.0) / 2
+    return floors_e
 
 
-def _normal_equations(starts: Ints, columns: Floats, weight: Floats) -> tuple[Floats, Floats]:
+@compiled_sums
+def _normal_equations(starts: Ints, basis: Floats, electrons: Floats, weight: Floats) -> tuple[Floats, Floats]:
     """Normal equations (g, c, c) and right-hand sides (g, c) of readings (m,), weighted (m,).
 
-    `columns` (c + 1, m) are the derivatives by the c coefficients, then the readings.
+    `basis` (c, m) are the derivatives by the c coefficients.
     """
-    weighted = columns * weight
-    bounds = pairwise(starts.tolist())
-    products = np.stack([weighted[:, first:end] @ columns[:, first:end].T for first, end in bounds])
-    return products[:, :-1, :-1], products[:, :-1, -1]
+    groups, count = len(starts) - 1, len(basis)
+    normal, right = np.empty((groups, count, count)), np.empty((groups, count))
+    for g in range(groups):
+        readings = slice(starts[g], starts[g + 1])
+        weights, values = weight[readings], electrons[readings]
+        for a in range(count):
+            first, total = basis[a, readings], 0.0
+            for i in range(len(weights)):
+                total += weights[i] * first[i] * values[i]
+            right[g, a] = total
+            for b in range(a + 1):
+                second, total = basis[b, readings], 0.0
+                for i in range(len(weights)):
+                    total += weights[i] * first[i] * second[i]
+                normal[g, a, b] = normal[g, b, a] = total
+    return normal, right
 
 
-def _inverse(matrices: Floats) -> Floats:
-    """Inverses of positive definite matrices (n, k, k)."""
-    scaled, scale = _of_equal_size(matrices)
-    return np.asarray(np.linalg.inv(scaled) * scale[:, :, None] * scale[:, None])
+@compiled
+def _expected(
+    starts: Ints,
+    basis: Floats,
+    pixel_counts: Floats,
+    coefficients: Floats,
+    floors_e: Floats,
+    dark_e2: float,
+    prnu2: float,
+) -> tuple[Floats, Floats, Floats]:
+    """Expected electrons (m,), those that a pixel has noise of, (m,), and a pixel's variance, (m,).
+
+    `basis` (c, m) are the derivatives by the `coefficients` (g, c). No pixel has less noise than of `floors_e` (g,).
+    """
+    readings = len(pixel_counts)
+    expected, per_pixel, variance = np.zeros(readings), np.empty(readings), np.empty(readings)
+    for g in range(len(starts) - 1):
+        for a in range(len(basis)):
+            for i in range(starts[g], starts[g + 1]):
+                expected[i] += coefficients[g, a] * basis[a, i]
+        for i in range(starts[g], starts[g + 1]):
+            lit = max(expected[i] / pixel_counts[i], floors_e[g])
+            per_pixel[i], variance[i] = lit, lit + dark_e2 + prnu2 * lit * lit
+    return expected, per_pixel, variance
+
+
+@compiled
+def _weights(
+    starts: Ints, pixel_counts: Floats, per_pixel: Floats, variance: Floats, usable: Mask, saturation_e: float
+) -> Floats:
+    """1 / variance (m,) of readings; 0 for pixels near saturation, and in groups that are not `usable` (g,)."""
+    weight = np.zeros(len(variance))
+    for g in range(len(starts) - 1):
+        if usable[g]:
+            for i in range(starts[g], starts[g + 1]):
+                of_pixel = max(variance[i], MIN_VARIANCE_E2)
+                if per_pixel[i] + SATURATION_MARGIN_SIGMA * math.sqrt(of_pixel) < saturation_e:
+                    weight[i] = 1 / (of_pixel * pixel_counts[i])
+    return weight
 
 
 def _of_equal_size(matrices: Floats) -> tuple[Floats, Floats]:
@@ -244,12 +298,14 @@ def _of_equal_size(matrices: Floats) -> tuple[Floats, Floats]:
     return np.asarray(matrices * scale[:, :, None] * scale[:, None]), np.asarray(scale)
 
 
-def _mean_deviance(electrons: Floats, expected: Floats, dark_e2: Floats) -> float:
-    """Mean deviance of Poisson variables; a Gaussian variance s^2 is approximated by s^2 extra Poisson electrons."""
-    if len(electrons) == 0:
-        return 0.0
+def _mean_deviance(electrons: Floats, expected: Floats, dark_e2: Floats, weighed: Mask) -> float:
+    """Mean deviance of the Poisson variables (m,) that are `weighed` (m,), 0 without any.
+
+    A Gaussian variance s^2 is approximated by s^2 extra Poisson electrons.
+    """
     observed, mean = np.maximum(electrons + dark_e2, 1e-9), np.maximum(expected + dark_e2, MIN_VARIANCE_E2)
-    return float(2 * (observed * np.log(observed / mean) - (observed - mean)).mean())
+    deviance = 2 * (observed * np.log(observed / mean) - (observed - mean))
+    return float(deviance.sum(where=weighed) / max(np.count_nonzero(weighed), 1))
 
 
 def score(
@@ -262,39 +318,91 @@ def score(
     Amplitudes and backgrounds are eliminated. Parameters that `rendered` has no derivatives by have no information; so
     has the profile if `profile` (n, 3) is None.
     """
-    slopes = rendered.slopes(pixels.cells).T
-    edges, light = pixels.edges, None
-    if photometry.gain is not None:
-        slopes *= photometry.gain[edges]
+    at_edges, slopes = rendered.places_of_slopes(pixels.cells)
+    place = np.full(len(pixels.electrons), -1)
+    place[pixels.edges] = at_edges
+    columns, shape = rendered.parameters, np.empty((0, len(place)))
+    factor = np.ones(len(place)) if photometry.gain is None else photometry.gain
     if profile is not None:
-        slopes *= (1 + np.einsum("mi,mi->m", pixels.face, profile[pixels.led][pixels.group]))[edges]
-        light = pixels.light(rendered) if photometry.gain is None else pixels.light(rendered) * photometry.gain
-    residual = photometry.weight * (pixels.electrons - photometry.expected)
-    columns = rendered.parameters
-    in_motion = bool((columns >= LOCAL_PARAMETERS).any())
-    if profile is not None:
+        light = pixels.light(rendered) * factor
+        shape = np.ascontiguousarray((pixels.face * light[:, None]).T)
+        factor = factor * pixels.brightness(profile)
         columns = np.concatenate([columns, IMAGE_PARAMETERS + np.arange(PROFILE_PARAMETERS)])
+    in_motion = bool((columns >= LOCAL_PARAMETERS).any())
     all_of_them = LOCAL_PARAMETERS + (MOTION_PARAMETERS if in_motion else 0)
     information = np.zeros((len(pixels.leds), all_of_them, all_of_them))
     gradient = np.zeros((len(pixels.leds), all_of_them))
-    first_edge = np.searchsorted(edges, pixels.starts).tolist()
-    bounds = zip(pairwise(pixels.starts.tolist()), pairwise(first_edge), strict=True)
-    for g, ((start, end), (first, last)) in enumerate(bounds):
-        # The edge pixels are the first readings of a group, and the image's shape does not change the others.
-        design = slopes[:, first:last]
-        if light is None:
-            end = start + last - first
-        else:
-            of_shape, design = design, np.zeros((len(columns), end - start))
-            design[: len(slopes), : last - first] = of_shape
-            design[len(slopes) :] = (pixels.face[start:end] * light[start:end, None]).T
-        weighted = design * photometry.weight[start:end]
-        mixed = weighted @ photometry.basis[start:end]
-        amplitude, led = photometry.amplitude[g], pixels.led[g]
-        own = weighted @ design.T - mixed @ photometry.covariance[g] @ mixed.T
-        information[led][np.ix_(columns, columns)] += amplitude**2 * own
-        gradient[led][columns] += amplitude * (design @ residual[start:end])
+    off_e = pixels.electrons - photometry.expected
+    fit = np.ascontiguousarray(photometry.basis.T), off_e, photometry.weight
+    # By the parameters, by the coefficients, and the gradient: (g, p, p + c + 1).
+    products, count = _products(pixels.starts, slopes, place, factor, shape, *fit), len(columns)
+    own, mixed = products[:, :, :count], products[:, :, count:-1]
+    # Less what a change of amplitude and background makes up for.
+    own = own - mixed @ photometry.covariance @ mixed.transpose(0, 2, 1)
+    amplitude = photometry.amplitude[:, None, None]
+    # The groups of an LED follow each other.
+    first = np.flatnonzero(np.diff(pixels.led, prepend=-1))
+    leds = pixels.led[first]
+    information[np.ix_(leds, columns, columns)] = np.add.reduceat(amplitude**2 * own, first, axis=0)
+    gradient[np.ix_(leds, columns)] = np.add.reduceat(amplitude[:, 0] * products[:, :, -1], first, axis=0)
     return information, gradient
+
+
+@compiled_sums
+def _products(
+    starts: Ints,
+    slopes: Floats,
+    place: Ints,
+    factor: Floats,
+    shape: Floats,
+    basis: Floats,
+    off_e: Floats,
+    weight: Floats,
+) -> Floats:
+    """Sums (g, p, p + c + 1) over the readings of each group, of weighted products of the derivatives by p parameters.
+
+    The products are with these, with the derivatives by c coefficients, `basis` (c, m), and with what a reading is off,
+    `off_e` (m,). A reading that changes as images move has derivatives at its `place` (m,) in `slopes` (s, q), times
+    its `factor` (m,); one that does not has the place -1. By the face's profile it has those of `shape` (r, m), (0, m)
+    for none: p = q + r.
+    """
+    of_image, of_shape = slopes.shape[1], len(shape)
+    count, width = of_image + of_shape, of_image + of_shape + len(basis) + 1
+    products = np.zeros((len(starts) - 1, count, width))
+    for g in range(len(starts) - 1):
+        # Those that move first, then the others, which the profile alone changes.
+        for moving in (True, False):
+            start = 0 if moving else of_image
+            if start == count:
+                continue
+            used = 0
+            for i in range(starts[g], starts[g + 1]):
+                used += weight[i] > 0 and (place[i] >= 0) == moving
+            # Times the square root of the weight; a derivative after another in memory.
+            design, n = np.empty((width, used)), 0
+            for i in range(starts[g], starts[g + 1]):
+                if not (weight[i] > 0 and (place[i] >= 0) == moving):
+                    continue
+                root = math.sqrt(weight[i])
+                for a in range(start, of_image):
+                    design[a, n] = root * factor[i] * slopes[place[i], a]
+                for a in range(of_shape):
+                    design[of_image + a, n] = root * shape[a, i]
+                for a in range(len(basis)):
+                    design[count + a, n] = root * basis[a, i]
+                design[width - 1, n] = root * off_e[i]
+                n += 1
+            for a in range(start, count):
+                first = design[a]
+                for b in range(a, width):
+                    second, total = design[b], 0.0
+                    for i in range(used):
+                        total += first[i] * second[i]
+                    products[g, a, b] += total
+        for a in range(count):
+            for b in range(a):
+                products[g, a, b] = products[g, b, a]
+    return products
 
 
 def excess_chi2(pixels: LedPixels, rendered: RenderedLeds, photometry: PhotometricFit) -> Floats:

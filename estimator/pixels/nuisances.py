@@ -20,7 +20,7 @@ from estimator.camera.pose import POSE_PARAMETERS, Pose
 from estimator.errors import EstimationFailure
 from estimator.io.camera import Camera
 from estimator.io.device import DeviceFrame
-from estimator.io.led_map import Led
+from estimator.io.led_map import led_arrays
 from estimator.pixels.led_model import FACE_PARAMETERS, LOCAL_PARAMETERS, PROFILE_PARAMETERS, ImageState
 from estimator.solvers.shutter_motion import motion_prior
 
@@ -35,8 +35,6 @@ LUMINAIRE_PARAMETERS = 6
 """A luminaire's: shift along x, y and z, rotation about x, y and z."""
 DATUM_PARAMETERS = 4
 """The map's: shift along x, y and z, scale."""
-COMMON_PARAMETERS = DATUM_PARAMETERS + CAMERA_PARAMETERS + POSE_PARAMETERS
-"""Those of the map's datum, the camera and the pose. The camera's motion, if any, follows them."""
 
 # A map that errs does not say how level the LEDs hang: standard deviation of a face's tangents, next to no knowledge.
 # Luminaires hang by some 0.1 to 1 deg, and real rims are not perfectly round. Taken as level, a face would tell the
@@ -68,38 +66,34 @@ class Priors:
     velocity: Floats = field(default_factory=lambda: np.zeros(0))
 
     @staticmethod
-    def of(frame: DeviceFrame, leds: tuple[Led, ...]) -> "Priors":
-        """What a frame's device states about itself and these LEDs; what it does not state is taken as known."""
-        uncertainty, datum = frame.camera.uncertainty, frame.map_datum
+    def of(frame: DeviceFrame) -> "Priors":
+        """What a frame's device states about itself and the LEDs of its map; what it does not state is known."""
+        uncertainty, datum, leds = frame.camera.uncertainty, frame.map_datum, led_arrays(frame.leds)
         camera = np.zeros(CAMERA_PARAMETERS)
         if uncertainty is not None:
             camera = np.hypot(uncertainty.device_sigmas(), uncertainty.shot_sigmas())
-        hung = {led.luminaire for led in leds}
+        hung = set(leds.luminaires.tolist())
         ids = [key for key in frame.luminaires if key in hung]
+        luminaire = np.full(len(leds.luminaires), -1)
+        for number, key in enumerate(ids):
+            luminaire[leds.luminaires == key] = number
         stated = [frame.luminaires[one] for one in ids]
-        rows = [one.sigmas() for one in stated]
-        index = {one: k for k, one in enumerate(ids)}
-        own = np.zeros((len(leds), LED_PARAMETERS))
-        for k, led in enumerate(leds):
-            if led.states_errors:
-                sigmas = led.sigmas()
-                own[k, :3] = sigmas[:3]
-                own[k, SIZE] = sigmas[3] / led.half_width_m
-                own[k, PROFILE][:2] = sigmas[4:]
-        motion = motion_prior(frame)
-        of_luminaire = np.array(rows).reshape(-1, LUMINAIRE_PARAMETERS)
+        of_luminaire = np.array([one.sigmas() for one in stated]).reshape(-1, LUMINAIRE_PARAMETERS)
+        own = np.zeros((len(leds.sigmas), LED_PARAMETERS))
+        own[:, :3] = leds.sigmas[:, :3]
+        np.divide(leds.sigmas[:, 3], leds.half_widths_m, out=own[:, SIZE], where=leds.sigmas[:, 3] > 0)
+        own[:, PROFILE][:, :2] = leds.sigmas[:, 4:]
         if own[:, :3].any() or of_luminaire.any():
             own[:, TILTS] = FREE_TILT
+        motion = motion_prior(frame)
         return Priors(
             camera=camera,
             datum=np.zeros(DATUM_PARAMETERS) if datum is None else datum.sigmas(),
             luminaires=of_luminaire,
             leds=own,
-            positions_m=np.array([led.position_m for led in leds]).reshape(-1, 3),
+            positions_m=leds.positions_m,
             centres_m=np.array([one.position_m for one in stated]).reshape(-1, 3),
-            luminaire=np.array(
-                [-1 if led.luminaire is None else index.get(led.luminaire, -1) for led in leds], dtype=np.int64
-            ),
+            luminaire=luminaire,
             motion=np.zeros(0) if motion is None else motion.sigmas,
             velocity=np.zeros(0) if motion is None else motion.velocity,
         )
@@ -252,9 +246,10 @@ class Nuisances:
 
     def shifts_m(self, priors: Priors) -> Floats:
         """Shifts (n, 3) of the LEDs from their positions by the map, world metres."""
-        shifts = self.leds[:, :3] + priors.datum_slopes() @ self.datum
+        shifts = self.leds[:, :3] + self.datum[:3] + self.datum[3] * priors.positions_m
         has = priors.luminaire >= 0
-        shifts[has] += np.einsum("nij,nj->ni", priors.arms()[has], self.luminaires[priors.luminaire[has]])
+        if has.any():
+            shifts[has] += np.einsum("nij,nj->ni", priors.arms()[has], self.luminaires[priors.luminaire[has]])
         return np.asarray(shifts)
 
     def state(self, pose: Pose, camera: Camera, priors: Priors) -> ImageState:
@@ -317,14 +312,21 @@ def _triangle(matrix: Floats) -> Floats:
 
 
 def square_root(information: Floats, gradient: Floats) -> tuple[Floats, Floats]:
-    """Rows (n, p, p) and right-hand sides (n, p) of least squares with the information (n, p, p), gradient (n, p)."""
+    """Rows (n, r, p) and right-hand sides (n, r) of least squares with the information (n, p, p), gradient (n, p).
+
+    There are as many rows as parameters of which any of the n has information.
+    """
     diagonal = np.diagonal(information, axis1=1, axis2=2)
+    informed = np.flatnonzero((diagonal > 0).any(axis=0))
+    diagonal = diagonal[:, informed]
     scale = np.divide(1.0, np.sqrt(np.maximum(diagonal, 0.0)), out=np.zeros_like(diagonal), where=diagonal > 0)
-    values, vectors = np.linalg.eigh(np.clip(information * scale[:, :, None] * scale[:, None], -1.0, 1.0))
+    scaled = information[:, informed[:, None], informed] * scale[:, :, None] * scale[:, None]
+    values, vectors = np.linalg.eigh(np.clip(scaled, -1.0, 1.0))
     kept = values > MIN_INFORMATION_SHARE * values[:, -1:]
     root = np.sqrt(np.where(kept, values, 0.0))
-    rows = (vectors * root[:, None]).transpose(0, 2, 1) * np.sqrt(np.maximum(diagonal, 0.0))[:, None]
-    right = np.einsum("nij,ni->nj", vectors, gradient * scale)
+    rows = np.zeros((*values.shape, information.shape[2]))
+    rows[:, :, informed] = (vectors * root[:, None]).transpose(0, 2, 1) * np.sqrt(np.maximum(diagonal, 0.0))[:, None]
+    right = np.einsum("nij,ni->nj", vectors, gradient[:, informed] * scale)
     return rows, np.divide(right, root, out=np.zeros_like(right), where=kept)
 
 
@@ -348,29 +350,35 @@ def solve(
     of_camera = slice(POSE_PARAMETERS, POSE_PARAMETERS + CAMERA_PARAMETERS)
     shifted = -rows[:, :, :3]  # by a shift of the LED
     of_led = slice(POSE_PARAMETERS + CAMERA_PARAMETERS, LOCAL_PARAMETERS)
-    own = np.concatenate([shifted, rows[:, :, of_led]], axis=2) * priors.leds[:, None]
-    common_count = COMMON_PARAMETERS + len(priors.motion)
+    # What is known exactly is no unknown.
+    uncertain = np.flatnonzero(priors.leds.any(axis=0))
+    own = np.concatenate([shifted, rows[:, :, of_led]], axis=2)[:, :, uncertain] * priors.leds[:, None, uncertain]
+    uncertain_datum, uncertain_camera = np.flatnonzero(priors.datum), np.flatnonzero(priors.camera)
     common = np.concatenate(
         [
-            shifted @ (priors.datum_slopes() * priors.datum),
-            rows[:, :, of_camera] * priors.camera,
+            (shifted @ (priors.datum_slopes() * priors.datum))[:, :, uncertain_datum],
+            (rows[:, :, of_camera] * priors.camera)[:, :, uncertain_camera],
             rows[:, :, :POSE_PARAMETERS],
             rows[:, :, LOCAL_PARAMETERS:] * priors.motion,
         ],
         axis=2,
     )
-    arms = priors.arms()
+    own_count, common_count = len(uncertain), common.shape[2]
     has = priors.luminaire >= 0
-    arms[has] *= priors.luminaires[priors.luminaire[has]][:, None]
-    of_luminaire = shifted @ arms
+    luminaire_count = LUMINAIRE_PARAMETERS if has.any() else 0
+    of_luminaire = shifted[:, :, :0]
+    if luminaire_count > 0:
+        arms = priors.arms()
+        arms[has] *= priors.luminaires[priors.luminaire[has]][:, None]
+        of_luminaire = shifted @ arms
     system = np.concatenate([own, of_luminaire, common, right[:, :, None]], axis=2)
-    prior_rows = np.zeros((n, LED_PARAMETERS, system.shape[2]))
-    prior_rows[:, :, :LED_PARAMETERS] = np.eye(LED_PARAMETERS)
-    prior_rows[:, :, -1] = -z.leds
+    prior_rows = np.zeros((n, own_count, system.shape[2]))
+    prior_rows[:, :, :own_count] = np.eye(own_count)
+    prior_rows[:, :, -1] = -z.leds[:, uncertain]
     triangles = _triangle(np.concatenate([prior_rows, system], axis=1))
-    led_rows, rest = triangles[:, :LED_PARAMETERS], triangles[:, LED_PARAMETERS:, LED_PARAMETERS:]
+    led_rows, rest = triangles[:, :own_count], triangles[:, own_count:, own_count:]
 
-    remaining = [rest[priors.luminaire < 0][:, :, LUMINAIRE_PARAMETERS:].reshape(-1, common_count + 1)]
+    remaining = [rest[~has][:, :, luminaire_count:].reshape(-1, common_count + 1)]
     luminaire_rows = {}
     for k in np.unique(priors.luminaire[has]).tolist():
         block = rest[priors.luminaire == k].reshape(-1, rest.shape[2])
@@ -381,13 +389,13 @@ def solve(
         luminaire_rows[k] = triangle[:LUMINAIRE_PARAMETERS]
         remaining.append(triangle[LUMINAIRE_PARAMETERS:, LUMINAIRE_PARAMETERS:])
     prior = np.zeros((common_count, common_count + 1))
-    known = DATUM_PARAMETERS + CAMERA_PARAMETERS
+    known = len(uncertain_datum) + len(uncertain_camera)
     prior[:known, :known] = np.eye(known)
-    prior[:known, -1] = -np.concatenate([z.datum, z.camera])
+    prior[:known, -1] = -np.concatenate([z.datum[uncertain_datum], z.camera[uncertain_camera]])
     tilt = [known + 3, known + 4]
     prior[tilt, tilt] = 1 / gravity.sigma
     prior[tilt, -1] = gravity.residual(angles)
-    of_motion = np.arange(COMMON_PARAMETERS, common_count)
+    of_motion = np.arange(known + POSE_PARAMETERS, common_count)
     prior[of_motion, of_motion] = 1.0
     prior[of_motion, -1] = -z.motion
     # From the unknowns of the view to their units: those of the motion are in standard deviations.
@@ -412,22 +420,26 @@ def solve(
     for k, row in luminaire_rows.items():
         rhs = row[:, -1] - row[:, LUMINAIRE_PARAMETERS:-1] @ x
         of_luminaires[k] = np.linalg.solve(row[:, :LUMINAIRE_PARAMETERS], rhs)
-    lead, on_luminaire = led_rows[:, :, :LED_PARAMETERS], led_rows[:, :, LED_PARAMETERS : -common_count - 1]
+    lead, on_luminaire = led_rows[:, :, :own_count], led_rows[:, :, own_count : -common_count - 1]
     on_common = led_rows[:, :, -common_count - 1 : -1]
     rhs = led_rows[:, :, -1] - on_common @ x
-    rhs[has] -= np.einsum("nij,nj->ni", on_luminaire[has], of_luminaires[priors.luminaire[has]])
-    of_leds = np.linalg.solve(lead, rhs[:, :, None])[:, :, 0]
+    if luminaire_count > 0:
+        rhs[has] -= np.einsum("nij,nj->ni", on_luminaire[has], of_luminaires[priors.luminaire[has]])
+    of_leds, of_datum, of_intrinsics = np.zeros_like(z.leds), np.zeros_like(z.datum), np.zeros_like(z.camera)
+    of_leds[:, uncertain] = np.linalg.solve(lead, rhs[:, :, None])[:, :, 0]
+    of_datum[uncertain_datum], of_intrinsics[uncertain_camera] = np.split(x[:known], [len(uncertain_datum)])
     inverse_lead = np.linalg.inv(lead)
     # Of what is common, the luminaires' uncertainty is left out.
     through = inverse_lead @ on_common @ inverse
-    redundancy = 1 - (inverse_lead**2).sum(axis=2) - (through**2).sum(axis=2)
+    redundancy = np.zeros_like(z.leds)
+    redundancy[:, uncertain] = 1 - (inverse_lead**2).sum(axis=2) - (through**2).sum(axis=2)
     view_step, view_covariance = x[known:] * units, covariance[known:, known:] * np.outer(units, units)
     root = R[known:, known:] * (scale[known:] / units)
     return Solution(
         view_step=view_step,
         step=Nuisances(
-            camera=x[DATUM_PARAMETERS:known] * priors.camera,
-            datum=x[:DATUM_PARAMETERS] * priors.datum,
+            camera=of_intrinsics * priors.camera,
+            datum=of_datum * priors.datum,
             luminaires=of_luminaires * priors.luminaires,
             leds=of_leds * priors.leds,
             motion=view_step[POSE_PARAMETERS:],

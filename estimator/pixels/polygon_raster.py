@@ -6,14 +6,19 @@ pixel adds dv times the share of the pixel to its right, and dv to all pixels fu
 with velocity (a, b), the covered area of the pixel grows by b du - a dv, exactly.
 """
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.compiled import compiled
+
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+T = TypeVar("T", bound=np.generic)
 
 # Shorter than a pixel, so that an edge crosses at most one line between rows and one between columns.
 MAX_EDGE_PX = 0.75
@@ -44,7 +49,7 @@ class RoiStack:
         """Number of cells."""
         return int(self.starts[-1])
 
-    def roi(self, cells: Floats, k: int) -> Floats:
+    def roi(self, cells: NDArray[T], k: int) -> NDArray[T]:
         """View of region k in a flat array of cells, (rows, columns)."""
         start, height, width = int(self.starts[k]), int(self.heights[k]), int(self.widths[k])
         return cells[start : start + height * (width + 1)].reshape(height, width + 1)[:, :width]
@@ -60,12 +65,20 @@ class RoiStack:
             self.starts[roi] + (row - self.rows[roi]) * (self.widths[roi] + 1) + column - self.columns[roi]
         )
 
-    def meeting(self, others: "RoiStack", k: int) -> list[int]:
-        """Regions of this stack that share pixels with region k of another."""
-        top, left = others.rows[k], others.columns[k]
-        overlaps = (self.rows < top + others.heights[k]) & (self.rows + self.heights > top)
-        overlaps &= (self.columns < left + others.widths[k]) & (self.columns + self.widths > left)
-        return list(map(int, np.flatnonzero(overlaps)))
+    def pixels(self, roi: Ints, cell: Ints) -> tuple[Ints, Ints]:
+        """Sensor pixels (row, column) of cells in the given regions, elementwise."""
+        row, column = np.divmod(cell - self.starts[roi], self.widths[roi] + 1)
+        return row + self.rows[roi], column + self.columns[roi]
+
+    def meeting(self, others: "RoiStack") -> list[tuple[int, int]]:
+        """Pairs of a region of this stack and one of another that share pixels."""
+        shared = np.ones((len(self.rows), len(others.rows)), dtype=bool)
+        for first, size, other_first, other_size in (
+            (self.rows, self.heights, others.rows, others.heights),
+            (self.columns, self.widths, others.columns, others.widths),
+        ):
+            shared &= (first[:, None] < other_first + other_size) & (first[:, None] + size[:, None] > other_first)
+        return list(zip(*(index.tolist() for index in np.nonzero(shared)), strict=True))
 
     def intersection(self, k: int, others: "RoiStack", other: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
         """The pixels that region k shares with one of another stack, as (rows, columns) slices of each."""
@@ -87,80 +100,147 @@ class RoiStack:
 class Outlines:
     """Closed polygons: `points` (n, 2) in pixels, all outlines one after another, and `roi` (n,) each point's region.
 
-    `following` (n,) is the index of the next point of the same outline, and `slopes` (2, p, n) are the derivatives of
-    the points' u and v by p parameters. No edge may be longer than MAX_EDGE_PX; each outline runs in the sense from u
-    to v.
+    `following` (n,) is the index of the next point of the same outline. No edge may be longer than MAX_EDGE_PX; each
+    outline runs in the sense from u to v.
     """
 
     points: Floats
     following: Ints
     roi: Ints
-    slopes: Floats
 
 
 @dataclass(frozen=True, eq=False)
 class EdgePieces:
-    """Edges cut at the lines between pixels: m pieces inside their regions, with the pixel (m,) of each.
+    """Edges cut at the lines between pixels: m pieces inside their regions, in the order of the edges.
 
-    `slopes` (p, m) are the derivatives of the pixel's covered share by p parameters, `shifts` (2, m) those by shifts of
-    the outline along u and v.
+    `edge` (m,) is the number of a piece's first point, `cell` (m,) the cell that it is in, `length` (m,) its share of
+    the edge.
     """
 
-    roi: Ints
-    row: Ints
-    column: Ints
-    slopes: Floats
-    shifts: Floats
-
-    def times(self, factor: Floats) -> "EdgePieces":
-        """The pieces with their derivatives multiplied by a factor for each, (m,)."""
-        return EdgePieces(self.roi, self.row, self.column, self.slopes * factor, self.shifts * factor)
+    edge: Ints
+    cell: Ints
+    length: Floats
 
 
 def cover(rois: RoiStack, outlines: Outlines) -> tuple[Floats, EdgePieces]:
-    """Covered share of each cell, (cells,), and its derivatives by pieces."""
-    following = outlines.following
-    u0, v0 = outlines.points.T
-    du, dv = u0[following] - u0, v0[following] - v0
-    # Position along each edge where it crosses a line between columns and one between rows; 1 if it crosses none.
-    crossings = [_crossing(first, step, following) for first, step in ((u0, du), (v0, dv))]
-    one, other = np.minimum(*crossings), np.maximum(*crossings)
-    middle, rest = np.flatnonzero(other > one), np.flatnonzero(other < 1)
-    edge = np.concatenate([np.arange(len(u0)), middle, rest])
-    first = np.concatenate([np.zeros(len(u0)), one[middle], other[rest]])
-    last = np.concatenate([one, other[middle], np.ones(len(rest))])
-    halfway, length = (first + last) / 2, last - first
-    u, v = u0[edge] + du[edge] * halfway, v0[edge] + dv[edge] * halfway
-    rise = dv[edge] * length
-
-    roi = outlines.roi[edge]
-    row, column = np.floor(v).astype(np.int64), np.floor(u).astype(np.int64)
-    inside = (row >= rois.rows[roi]) & (row < (rois.rows + rois.heights)[roi])
-    if not inside.all():
-        edge, roi, row, column = edge[inside], roi[inside], row[inside], column[inside]
-        u, rise, length = u[inside], rise[inside], length[inside]
-    left, right = rois.columns[roi], (rois.columns + rois.widths)[roi]
-    within = (column >= left) & (column < right)
-    # A piece left of a region covers its first pixel, one right of it the additional cell, over the full width.
-    to_the_right = np.where(within, column + 1 - u, 1.0)
-    cell = rois.cell(roi, row, np.clip(column, left, right))
-    increments = np.bincount(cell, -rise * to_the_right, rois.cells() + 1)
-    increments += np.bincount(cell + 1, -rise * (1 - to_the_right), rois.cells() + 1)
-    covered: Floats = np.cumsum(increments[:-1], dtype=np.float64)
-
-    # Velocity at the middle of each edge: over so short an edge it is constant.
-    of_u, of_v = outlines.slopes + np.take(outlines.slopes, following, axis=2)
-    slopes = np.take((of_u * dv - of_v * du) / 2, edge, axis=1) * length
-    shifts = np.stack([rise, -du[edge] * length])
-    if not within.all():
-        roi, row, column = roi[within], row[within], column[within]
-        slopes, shifts = slopes[:, within], shifts[:, within]
-    return covered, EdgePieces(roi, row, column, slopes, shifts)
+    """Covered share of each cell, (cells,), and the pieces of the outlines."""
+    edges = outlines.points, outlines.following, outlines.roi
+    regions = rois.rows, rois.columns, rois.heights, rois.widths, rois.starts
+    covered, edge, cell, length = _cover(*edges, *regions)
+    return covered, EdgePieces(edge, cell, length)
 
 
-def _crossing(start: Floats, step: Floats, following: Ints) -> Floats:
-    """Where along their edges (n,) coordinates cross a whole number, 0 to 1; 1 for those that cross none."""
-    whole = np.floor(start)
-    following_whole = whole[following]
-    at = np.divide(np.maximum(whole, following_whole) - start, step, out=np.ones_like(start), where=step != 0)
-    return np.asarray(np.where(whole != following_whole, at, 1.0))
+@compiled
+def _cover(
+    points: Floats,
+    following: Ints,
+    roi: Ints,
+    rows: Ints,
+    columns: Ints,
+    heights: Ints,
+    widths: Ints,
+    starts: Ints,
+) -> tuple[Floats, Ints, Ints, Floats]:
+    """Covered share (cells,), and the arrays of `EdgePieces`."""
+    covered, count = np.zeros(starts[-1] + 1), 0
+    most = 3 * len(points)
+    edges, cells, lengths = np.empty(most, dtype=np.int64), np.empty(most, dtype=np.int64), np.empty(most)
+    for i in range(len(points)):
+        k, following_i = roi[i], following[i]
+        u, v = points[i, 0], points[i, 1]
+        du, dv = points[following_i, 0] - u, points[following_i, 1] - v
+        at_column, at_row = _crossing(u, u + du, du), _crossing(v, v + dv, dv)
+        cuts = (0.0, min(at_column, at_row), max(at_column, at_row), 1.0)
+        top, bottom, left, right = rows[k], rows[k] + heights[k], columns[k], columns[k] + widths[k]
+        for piece in range(3):
+            length, halfway = cuts[piece + 1] - cuts[piece], (cuts[piece] + cuts[piece + 1]) / 2
+            at_u, at_v = u + du * halfway, v + dv * halfway
+            if not (length > 0 and top <= at_v < bottom):
+                continue
+            # A piece left of a region covers its first pixel, one right of it the additional cell, over the full width.
+            within = left <= at_u < right
+            column = math.floor(at_u) if within else left if at_u < left else right
+            to_the_right = column + 1 - at_u if within else 1.0
+            cell = starts[k] + (math.floor(at_v) - top) * (widths[k] + 1) + column - left
+            rise = dv * length
+            covered[cell] -= rise * to_the_right
+            covered[cell + 1] -= rise * (1 - to_the_right)
+            if within:
+                edges[count], cells[count], lengths[count] = i, cell, length
+                count += 1
+    total = 0.0
+    for cell in range(len(covered)):
+        total += covered[cell]
+        covered[cell] = total
+    return covered[:-1], edges[:count], cells[:count], lengths[:count]
+
+
+@compiled
+def _crossing(first: float, last: float, step: float) -> float:
+    """Where along an edge a coordinate crosses a whole number, 0 to 1; 1 where it crosses none."""
+    low, high = np.floor(first), np.floor(last)
+    return (max(low, high) - first) / step if low != high else 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class RimSlopes:
+    """Derivatives of the light that outlines cover in the m cells that they pass through, `slopes` (m, p).
+
+    `cells` (m,) are these cells, `roi` (m,) their regions.
+    """
+
+    cells: Ints
+    roi: Ints
+    slopes: Floats
+
+
+def rim_slopes(outlines: Outlines, pieces: EdgePieces, motion: Floats, light: Floats, place: Ints) -> RimSlopes:
+    """Derivatives by p parameters, by which the outlines' points have the derivatives `motion` (n, 2, p).
+
+    They are of the share times the `light` (cells,) of a cell. `place` (cells,) is memory of -1 for each cell of the
+    stack, and is so again afterwards.
+    """
+    edges = outlines.points, outlines.following, motion
+    cells, first, slopes = _rim_slopes(*edges, pieces.edge, pieces.cell, pieces.length, light, place)
+    return RimSlopes(cells, outlines.roi[first], slopes)
+
+
+@compiled
+def _rim_slopes(
+    points: Floats,
+    following: Ints,
+    motion: Floats,
+    edge: Ints,
+    cell: Ints,
+    length: Floats,
+    light: Floats,
+    place: Ints,
+) -> tuple[Ints, Ints, Floats]:
+    """Cells (m,), the first edge in each, (m,), and derivatives (m, p)."""
+    parameters, count = motion.shape[2], 0
+    for piece in range(len(cell)):
+        if place[cell[piece]] < 0:
+            place[cell[piece]] = count
+            count += 1
+    cells, first = np.empty(count, dtype=np.int64), np.full(count, -1)
+    slopes, swept = np.zeros((count, parameters)), np.empty(parameters)
+    before = -1
+    for piece in range(len(cell)):
+        number, i = place[cell[piece]], edge[piece]
+        if first[number] < 0:
+            cells[number], first[number] = cell[piece], i
+        if i != before:
+            before, j = i, following[i]
+            # Half the edge, since the velocity at its middle is half the sum of both ends': over so short an edge it is
+            # constant.
+            du, dv = (points[j, 0] - points[i, 0]) / 2, (points[j, 1] - points[i, 1]) / 2
+            for parameter in range(parameters):
+                of_u = motion[i, 0, parameter] + motion[j, 0, parameter]
+                of_v = motion[i, 1, parameter] + motion[j, 1, parameter]
+                swept[parameter] = of_u * dv - of_v * du
+        share = length[piece] * light[cell[piece]]
+        for parameter in range(parameters):
+            slopes[number, parameter] += swept[parameter] * share
+    for number in range(count):
+        place[cells[number]] = -1
+    return cells, first, slopes

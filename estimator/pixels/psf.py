@@ -128,7 +128,7 @@ def _disc(diameter: float) -> Floats:
     one = np.zeros(1, dtype=np.int64)
     rois = RoiStack(one, one, one + size, one + size)
     following = np.roll(np.arange(points), -1)
-    covered, _ = cover(rois, Outlines(rim, following, np.zeros(points, dtype=np.int64), np.zeros((2, 0, points))))
+    covered, _ = cover(rois, Outlines(rim, following, np.zeros(points, dtype=np.int64)))
     return rois.roi(covered, 0) / (np.pi * diameter**2 / 4)
 
 
