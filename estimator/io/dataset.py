@@ -5,7 +5,7 @@ import io
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 import OpenEXR
@@ -360,10 +360,9 @@ def _read_parts(folder: Path, record: FrameRecord, camera: Camera, form: FrameFo
     if len(images) != len(boxes):  # the decoder drops unreadable parts silently
         raise InputError(f"{record.file}: not a readable EXR image ({len(images)} of {len(boxes)} parts)")
     parts = []
-    for box, image in zip(boxes, images, strict=True):
-        rows, columns = (box[1] - box[0] + 1)[::-1].tolist()
-        numbers = numbers_of_exr(image, form, (rows, columns), record.file)
-        parts.append(Part(int(box[0, 1]), int(box[0, 0]), numbers))
+    for (left, top, right, bottom), image in zip(boxes.reshape(-1, 4).tolist(), images, strict=True):
+        numbers = numbers_of_exr(image, form, (bottom - top + 1, right - left + 1), record.file)
+        parts.append(Part(top, left, numbers))
     return tuple(parts)
 
 
@@ -383,31 +382,32 @@ def _file_of(folder: Path, record: FrameRecord) -> bytes:
     return data
 
 
-def _check_headers(record: FrameRecord, headers: list[dict[str, object]], camera: Camera) -> list[NDArray[np.int64]]:
+def _check_headers(record: FrameRecord, headers: list[dict[str, Any]], camera: Camera) -> NDArray[np.int64]:
     """Refuse an image of the wrong kind or size before its pixels are decoded.
 
-    Returns the region of interest of each part, [first, last] pixel (u, v).
+    Returns the regions of interest (n, 2, 2) of the parts, [first, last] pixel (u, v) of each.
     """
     sensor = np.array([[0, 0], [camera.width_px - 1, camera.height_px - 1]], dtype=np.int64)
-    boxes: list[NDArray[np.int64]] = []
     for header in headers:
         if header["type"] != OpenEXR.scanlineimage:
             raise InputError(f"{record.file}: not stored as scan lines")
-        channels = [channel.name for channel in header["channels"]]  # type: ignore[attr-defined]
+        channels = [channel.name for channel in header["channels"]]
         if channels != ["Y"]:
             raise InputError(f"{record.file}: channels {', '.join(channels)}, needed Y alone")
-        display = np.array(header["displayWindow"], dtype=np.int64)
-        if not np.array_equal(display, sensor):
-            width_px, height_px = (display[1] - display[0] + 1).tolist()
-            raise InputError(
-                f"{record.file}: displayWindow {display.tolist()}, {width_px} x {height_px} pixels, "
-                f"but the camera has {camera.width_px} x {camera.height_px}"
-            )
-        box = np.array(header["dataWindow"], dtype=np.int64)
-        if record.capturable and ((box[0] < sensor[0]) | (box[1] > sensor[1])).any():
-            raise InputError(f"{record.file}: dataWindow {box.tolist()} extends beyond the sensor, but is capturable")
-        boxes.append(box)
-    if not record.capturable and all(((box[0] >= sensor[0]) & (box[1] <= sensor[1])).all() for box in boxes):
+    displays, boxes = (
+        np.array([header[name] for header in headers], dtype=np.int64) for name in ("displayWindow", "dataWindow")
+    )
+    if len(other := displays[(displays != sensor).any(axis=(1, 2))]):
+        width_px, height_px = (other[0, 1] - other[0, 0] + 1).tolist()
+        raise InputError(
+            f"{record.file}: displayWindow {other[0].tolist()}, {width_px} x {height_px} pixels, "
+            f"but the camera has {camera.width_px} x {camera.height_px}"
+        )
+    beyond = ((boxes[:, 0] < sensor[0]) | (boxes[:, 1] > sensor[1])).any(axis=1)
+    if record.capturable and beyond.any():
+        box = boxes[beyond][0].tolist()
+        raise InputError(f"{record.file}: dataWindow {box} extends beyond the sensor, but is capturable")
+    if not record.capturable and not beyond.any():
         raise InputError(f"{record.file}: every dataWindow lies on the sensor, but capturable is false")
     if problem := regions_problem(boxes, camera):
         raise InputError(f"{record.file}: {problem}")

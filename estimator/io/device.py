@@ -12,7 +12,15 @@ from pydantic import Field, Strict, ValidationError
 from estimator.errors import InputError
 from estimator.io.camera import Camera
 from estimator.io.downlink import Downlink, downlink_problem, spots_problem
-from estimator.io.led_map import AnyLed, DeviceNumber, Led, Luminaire, MapDatum, leds_by_id, luminaires_by_id
+from estimator.io.led_map import (
+    AnyLed,
+    DeviceNumber,
+    Led,
+    Luminaire,
+    MapDatum,
+    leds_by_id,
+    luminaires_by_id,
+)
 from estimator.io.records import (
     INT64_MAX,
     Entry,
@@ -326,13 +334,16 @@ def region_of(part: Part) -> NDArray[np.int64]:
     return np.array([[part.column, part.row], [part.column + columns - 1, part.row + rows - 1]], dtype=np.int64)
 
 
-def regions_problem(regions: Sequence[NDArray[np.int64]], camera: Camera) -> str | None:
+def regions_problem(regions: Sequence[NDArray[np.int64]] | NDArray[np.int64], camera: Camera) -> str | None:
     """What is wrong with a frame's regions of interest, None if nothing: two overlap, or they hold too many pixels."""
-    for index, region in enumerate(regions[1:], start=1):
-        before = np.array(regions[:index])
-        if ((region[0] <= before[:, 1]) & (before[:, 0] <= region[1])).all(axis=1).any():
-            return f"region {region.tolist()} overlaps another"
-    pixels = sum(int((region[1] - region[0] + 1).prod()) for region in regions)
+    boxes = np.asarray(regions, dtype=np.int64).reshape(-1, 4)
+    left, top, right, bottom = boxes.T.copy()
+    for n, (first_u, first_v, last_u, last_v) in enumerate(boxes.tolist()):
+        across = (left[:n] <= last_u) & (right[:n] >= first_u)
+        if (across & (top[:n] <= last_v) & (bottom[:n] >= first_v)).any():
+            return f"region {[[first_u, first_v], [last_u, last_v]]} overlaps another"
+    sides = (right - left + 1).tolist(), (bottom - top + 1).tolist()
+    pixels = sum(columns * rows for columns, rows in zip(*sides, strict=True))
     if pixels > MAX_SENSOR_AREAS * camera.width_px * camera.height_px:
         return f"{pixels} pixels, more than {MAX_SENSOR_AREAS} times the sensor's"
     return None
