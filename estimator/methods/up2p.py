@@ -127,12 +127,13 @@ def pair_poses(observations: Observations) -> list[Pose]:
         generator = np.random.Generator(np.random.Philox(key=len(pairs)))
         pairs = [pairs[k] for k in generator.choice(len(pairs), MAX_PAIRS, replace=False)]
     gate = GATE_SIGMA * float(observations.tilt_sigma_rad.max()) + GATE_PX * observations.camera.pixel_angle_rad
-    level_up, leds_up = level @ Y_UP.T, observations.leds_m @ Y_UP.T
-    found = [upright for pair in map(list, pairs) for upright in poselib.up2p(level_up[pair], leds_up[pair])]
+    chosen = np.array(pairs, dtype=np.int64).reshape(-1, 2)
+    of_pairs = zip((level @ Y_UP.T)[chosen], (observations.leds_m @ Y_UP.T)[chosen], strict=True)
+    found = [upright.Rt for level_up, leds_up in of_pairs for upright in poselib.up2p(level_up, leds_up)]
     if not found:
         return []
-    rotations = tilt @ (Y_UP.T @ np.stack([upright.R for upright in found]) @ Y_UP)
-    positions_m = np.stack([upright.center() for upright in found]) @ Y_UP
+    R, t = np.split(np.stack(found), [3], axis=2)
+    rotations, positions_m = tilt @ (Y_UP.T @ R @ Y_UP), (-R.transpose(0, 2, 1) @ t)[:, :, 0] @ Y_UP
     # The eccentricity of centroids is far below the gate.
     p_cam = (observations.leds_m - positions_m[:, None]) @ rotations.transpose(0, 2, 1)
     depth = p_cam[:, :, 2]

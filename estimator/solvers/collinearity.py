@@ -71,9 +71,9 @@ def starts(leds_m: Floats, directions: Floats) -> list[Pose]:
     offsets = ceiling - ceiling.mean()
     # spots = scale (ceiling - place), where the complex scale is e^(-i yaw) / depth.
     scale = centred @ offsets.conj() / np.vdot(offsets, offsets).real
-    size = (np.abs(centred) ** 2).sum(axis=-1)
+    size = _squares(centred)
     up &= np.abs(scale) > 0
-    misfits = (np.abs(centred - scale[..., None] * offsets) ** 2).sum(axis=-1) / np.where(up, size, 1.0)
+    misfits = _squares(centred - scale[..., None] * offsets) / np.where(up, size, 1.0)
     misfits[~up] = np.inf
     minima = np.argwhere(up & (misfits == minimum_filter(misfits, size=3, mode="nearest")))
     poses = []
@@ -83,6 +83,11 @@ def starts(leds_m: Floats, directions: Floats) -> list[Pose]:
         position_m = np.array([place.real, place.imag, leds_m[:, 2].mean() - 1 / abs(scale[i, j])])
         poses.append(Pose(position_m, R_cam_world))
     return poses
+
+
+def _squares(values: NDArray[np.complex128]) -> Floats:
+    """Sums of the squared magnitudes along the last axis, without their roots."""
+    return np.asarray((values.real**2 + values.imag**2).sum(axis=-1))
 
 
 @cache

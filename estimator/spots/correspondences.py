@@ -13,8 +13,7 @@ from estimator.spots.denoise import DENOISERS, Denoiser
 from estimator.spots.detect import Spot, detect
 from estimator.spots.excess_noise import excess_noise_of_spots_e2
 from estimator.spots.identify import Correspondence, gate_px, identify
-from estimator.spots.lamps import has_stripes, lamps_of, light_centre_px
-from estimator.spots.led_light import Readout
+from estimator.spots.lamps import has_stripes, lamps_of, light_centre_px, readouts_of
 from estimator.spots.sampling import lens_blur
 
 Floats = NDArray[np.float64]
@@ -58,20 +57,17 @@ def _detected(frame: DeviceFrame, denoiser: Denoiser, with_covariances: bool = T
     any_square = any(frame.leds[spot.led].shape == "square" for spot in frame.spots)
 
     def detected() -> tuple[Spot, ...]:
-        readouts, sensor = [], frame.sensor
-        floor_sigma_e = float(np.sqrt(sensor.floor_e2()))
-        for part in frame.parts:
-            raw = frame.electrons(part)
-            noise = sensor.floor_e2(), sensor.prnu, sensor.rounding_e2()
-            image = denoiser.apply(raw, floor_sigma_e)
-            readouts.append(Readout(part.row, part.column, image, raw, frame.clipped(part), *noise))
+        readouts, sensor = readouts_of(frame), frame.sensor
+        if denoiser is not RAW:
+            floor_sigma_e = float(np.sqrt(sensor.floor_e2()))
+            readouts = tuple(replace(one, image_e=denoiser.apply(one.raw_e, floor_sigma_e)) for one in readouts)
         decoded_px = np.array([(spot.u_px, spot.v_px) for spot in frame.spots]).reshape(-1, 2)
         sensor_px = frame.camera.width_px * frame.camera.height_px
         rest = _gate_px(frame, denoiser), lens_blur(frame.camera), sensor.crosstalk, with_covariances
         spots = detect(readouts, sensor_px, denoiser.radius_px, decoded_px, any_square, *rest)
         excess_e2 = excess_noise_of_spots_e2(readouts, spots, sensor) if with_covariances else 0.0
         if excess_e2 > 0:
-            readouts = [replace(readout, floor_e2=readout.floor_e2 + excess_e2) for readout in readouts]
+            readouts = tuple(replace(readout, floor_e2=readout.floor_e2 + excess_e2) for readout in readouts)
             spots = detect(readouts, sensor_px, denoiser.radius_px, decoded_px, any_square, *rest)
         return spots
 

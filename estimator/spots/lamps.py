@@ -43,14 +43,18 @@ def _longest_run(chips: str) -> int:
     return max((len(run) for run in re.findall("0+", chips)), default=0)
 
 
-def readouts_of(frame: DeviceFrame) -> list[Readout]:
-    """Regions of a frame, in electrons, as they are."""
-    readouts, sensor = [], frame.sensor
-    for part in frame.parts:
-        electrons = frame.electrons(part)
+def readouts_of(frame: DeviceFrame) -> tuple[Readout, ...]:
+    """Regions of a frame, in electrons, as they are; once for all variants of the frame."""
+
+    def made() -> tuple[Readout, ...]:
+        readouts, sensor = [], frame.sensor
         noise = sensor.floor_e2(), sensor.prnu, sensor.rounding_e2()
-        readouts.append(Readout(part.row, part.column, electrons, electrons, frame.clipped(part), *noise))
-    return readouts
+        for part in frame.parts:
+            electrons = frame.electrons(part)
+            readouts.append(Readout(part.row, part.column, electrons, electrons, frame.clipped(part), *noise))
+        return tuple(readouts)
+
+    return frame.once(("readouts",), made)
 
 
 def lamps_of(frame: DeviceFrame) -> tuple[Lamp, ...]:
