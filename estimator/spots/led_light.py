@@ -142,9 +142,8 @@ class Light:
     """Light of an LED image in the rectangle of its region with the first column `left` and the first row `top`.
 
     `support` (rows, columns) are the pixels that hold it, `above_e` the electrons of all pixels above the background,
-    `variance_e2` their variances. Noise of the background stays
-    below `gate_e`, as far as the device knows of it; `ring_off_e` (n,) is how far pixels of the ring are from it.
-    `sums` are those over the support.
+    `variance_e2` their variances. Noise of the background stays below `gate_e`, as far as the device knows of it;
+    `ring_off_e` (n,) is how far pixels of the ring are from it. `sums` are those over the support.
     """
 
     left: int
