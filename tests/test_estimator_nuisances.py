@@ -6,16 +6,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from estimator.pixels.elimination import solve, square_root
+from estimator.pixels.led_model import LOCAL_PARAMETERS
 from estimator.pixels.nuisances import (
     LED_PARAMETERS,
-    LOCAL_PARAMETERS,
     NO_COMPONENTS,
     Components,
     Gravity,
     Nuisances,
     Priors,
-    solve,
-    square_root,
 )
 
 Floats = NDArray[np.float64]

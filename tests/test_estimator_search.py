@@ -10,11 +10,12 @@ from test_estimator_maximum_likelihood import frame_of
 
 from estimator.camera.pose import Pose
 from estimator.pixels import search
+from estimator.pixels.elimination import Solution
 from estimator.pixels.initial import gravity_of
 from estimator.pixels.led_model import RenderedLeds
 from estimator.pixels.led_pixels import LedPixels
 from estimator.pixels.likelihood import Noise, PhotometricFit, fit_photometry, score
-from estimator.pixels.nuisances import NO_COMPONENTS, SIZE, Nuisances, Priors, Solution
+from estimator.pixels.nuisances import NO_COMPONENTS, SIZE, Nuisances, Priors
 from estimator.pixels.search import ScoringResult, Search, step_factor, unexplained
 
 

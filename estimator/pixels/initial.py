@@ -10,6 +10,7 @@ from estimator.camera.intrinsics import intrinsic_slopes_px, with_errors
 from estimator.camera.leveling import tilt_from_gravity, tilt_sigmas
 from estimator.camera.pose import POSE_PARAMETERS, Pose
 from estimator.io.device import DeviceFrame
+from estimator.pixels.elimination import Solution, solve
 from estimator.pixels.led_model import (
     COARSE_POINTS,
     IMAGE_PARAMETERS,
@@ -26,8 +27,6 @@ from estimator.pixels.nuisances import (
     Gravity,
     Nuisances,
     Priors,
-    Solution,
-    solve,
 )
 from estimator.solvers.observations import light_centres_m
 from estimator.spots.identify import Correspondence

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from estimator.camera.pose import POSE_PARAMETERS, Pose
 from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame
+from estimator.pixels.elimination import Solution, solve, square_root
 from estimator.pixels.initial import CONVERGED_STEP2, tuned
 from estimator.pixels.led_model import (
     MOTION_COLUMNS,
@@ -28,9 +29,6 @@ from estimator.pixels.nuisances import (
     Gravity,
     Nuisances,
     Priors,
-    Solution,
-    solve,
-    square_root,
 )
 
 Floats = NDArray[np.float64]
