@@ -27,6 +27,12 @@ from vlcrender.scene.loader import Scene
 EDGE_GRID = 8
 """Rays across a pixel where surfaces meet: the error is about 0.3 / 8^1.5 = 1.3 % of the step between them."""
 
+EDGE_BATCH = 2**14
+"""Pixels where surfaces meet whose rays, 1 million, are cast at once.
+
+Frames differ in the number of these pixels, and Dr.Jit keeps memory for the largest of them.
+"""
+
 MAX_REACH_PX = 2.0
 """Motion of a surface's image to either side during an exposure, up to which light counts as linear along the motion.
 Light is interpolated between vertices: a pixel next to an edge of a triangle errs by a quarter of the reach, px, times
@@ -183,15 +189,28 @@ class Background:
             rows = np.concatenate([r + roi.row for (r, _), roi in zip(edges, rois, strict=True)])
             columns = np.concatenate([c + roi.column for (_, c), roi in zip(edges, rois, strict=True)])
             if len(rows):
-                u, v = sub_pixels(rows, columns)
-                step = None if len(during) < 2 else _steps_of_sub_pixels(len(rows), len(during))
-                hit = self.trace(posed, u, v, *rates, size_px=1 / EDGE_GRID, during=during, step=step)
-                means = hit.value.numpy().reshape(len(rates), len(rows), -1).mean(axis=2)
-                parts = np.split(means, np.cumsum([len(r) for r, _ in edges])[:-1], axis=1)
+                batches = [slice(start, start + EDGE_BATCH) for start in range(0, len(rows), EDGE_BATCH)]
+                means = [self._pixel_means(posed, rows[some], columns[some], rates, during) for some in batches]
+                parts = np.split(np.concatenate(means, axis=1), np.cumsum([len(r) for r, _ in edges])[:-1], axis=1)
                 for region, edge, mean in zip(regions, edges, parts, strict=True):
                     for image, of_image in zip(region.images, mean, strict=True):
                         image[edge] = of_image
             return regions
+
+    def _pixel_means(
+        self,
+        posed: PosedCamera,
+        rows: NDArray[np.int64],
+        columns: NDArray[np.int64],
+        rates: Sequence[ElectronRates],
+        during: Sequence[LinePoses],
+    ) -> NDArray[np.float32]:
+        """Means over a grid of rays in each of the pixels: (rates, pixels)."""
+        u, v = sub_pixels(rows, columns)
+        step = None if len(during) < 2 else _steps_of_sub_pixels(len(rows), len(during))
+        hit = self.trace(posed, u, v, *rates, size_px=1 / EDGE_GRID, during=during, step=step)
+        means: NDArray[np.float32] = hit.value.numpy().reshape(len(rates), len(rows), -1).mean(axis=2)
+        return means
 
 
 def sub_pixels(rows: NDArray[np.int64], columns: NDArray[np.int64]) -> "tuple[mi.Float, mi.Float]":
