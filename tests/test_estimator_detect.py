@@ -10,7 +10,17 @@ from estimator.spots.denoise import NEIGHBOURHOOD_RADIUS_PX, neighbourhood_mean
 from estimator.spots.detect import Spot, detect
 from estimator.spots.led_light import Ellipse, Readout, light_of
 from estimator.spots.sampling import LensBlur
-from estimator.spots.spot_pixels import distance2, inside_ellipse, median, padded
+from estimator.spots.spot_pixels import (
+    above_half_level,
+    around_face,
+    brightest,
+    distance2,
+    ellipse_spans,
+    median,
+    overlapping,
+    padded,
+    piece_sums,
+)
 
 SMALL = (400, 300, 1500.0)
 # A tenth of the full frame's width with the full frame's pixels.
@@ -428,6 +438,20 @@ def test_a_ring_of_two_surfaces_has_a_background() -> None:
     assert abs(spot.u_px - 30.0) < 14 * 14 * 4950 * 3.5 / 42e6
 
 
+def test_a_neighbour_s_pixels_are_neither_light_nor_background() -> None:
+    """Two discs of radius 5 px, 11.2 px apart: the margins of 2 px overlap, and each is in the other's ring."""
+    v, u = np.mgrid[:60, :60] + 0.5
+    image = np.full((60, 60), 100.0, dtype=np.float32)
+    one, other = (
+        Ellipse((at, 30.0), (1.0, 0.0), (5.0, 5.0), (at - 5, 25.0), (at + 5, 35.0), 78, 1.0) for at in (20.0, 31.2)
+    )
+    off_px, other_px = np.hypot(u - 20, v - 30), np.hypot(u - 31.2, v - 30)
+    light = light_of(Readout(0, 0, image, image, np.zeros(image.shape, bool)), one, [other], 0)
+    nearer, ring = (off_px <= 7) & (off_px <= other_px), (off_px > 7) & (off_px <= 10) & (other_px > 7)
+    assert light.support.sum() == nearer.sum() < (off_px <= 7).sum()
+    assert len(light.ring_off_e) == ring.sum()
+
+
 def test_a_point_is_as_far_from_an_ellipse_as_its_axes_say() -> None:
     """Of a turned ellipse, whose ends are at 1; sums of a dozen products in another order differ by 1e-14."""
     c, s = np.cos(0.7), np.sin(0.7)
@@ -438,12 +462,96 @@ def test_a_point_is_as_far_from_an_ellipse_as_its_axes_say() -> None:
         for k in (0, 1):
             end = centre + axes[:, k] * (semi_axes[k] + padding_px)
             assert distance2(form, *end.tolist()) == pytest.approx(1.0)
-        inside = inside_ellipse(form, 18, 15, 25, 26)
-        for column, row in np.ndindex(25, 26):
-            point = np.array([18.5 + column, 15.5 + row])
-            expected = ((((point - centre) @ axes) / (semi_axes + padding_px)) ** 2).sum()
-            assert distance2(form, *point.tolist()) == pytest.approx(expected, abs=1e-12)
-            assert inside[row, column] == (expected <= 1)
+        # The second rectangle cuts the ellipse on its right, the third is right of it.
+        for left, width in ((18, 25), (8, 25), (45, 12)):
+            spans = ellipse_spans(form, left, 15, width, 26)
+            assert (spans >= 0).all()
+            for column, row in np.ndindex(width, 26):
+                point = np.array([left + 0.5 + column, 15.5 + row])
+                expected = ((((point - centre) @ axes) / (semi_axes + padding_px)) ** 2).sum()
+                assert distance2(form, *point.tolist()) == pytest.approx(expected, abs=1e-12)
+                assert (spans[0, row] <= column < spans[1, row]) == (expected <= 1)
+
+
+def test_of_equally_bright_pixels_in_an_ellipse_the_first_is_the_brightest() -> None:
+    """By NumPy's argmax over whole numbers, of which many are equal; outside of the ellipse are brighter ones."""
+    rng = np.random.default_rng(7)
+    form = Ellipse((30.2, 28.6), (0.8, 0.6), (9.0, 4.0), (0.0, 0.0), (60.0, 60.0), 50, 1.0).form(0.0)
+    v, u = np.mgrid[:60, :60] + 0.5
+    inside = np.array([distance2(form, *at) <= 1 for at in zip(u.ravel(), v.ravel(), strict=True)]).reshape(60, 60)
+    for highest in (1, 2, 5, 1000):
+        image = np.where(inside, rng.integers(0, highest, (60, 60)), 2000).astype(np.float32)
+        row, column = np.unravel_index(np.argmax(np.where(inside, image, -1)), image.shape)
+        clipped = np.zeros((60, 60), dtype=bool)
+        clipped[20, 30] = True
+        assert not inside[20, 30]
+        assert brightest(image, clipped, 15, 15, 30, 30, form) == (row, column, False)
+        clipped[28, 33] = True
+        assert inside[28, 33]
+        assert brightest(image, clipped, 15, 15, 30, 30, form) == (row, column, True)
+
+
+def test_boxes_overlap_where_the_distances_of_their_centres_say_so() -> None:
+    rng = np.random.default_rng(8)
+    boxes = np.concatenate([rng.uniform(0, 100, (30, 2)), rng.uniform(2, 20, (30, 2))], axis=1)
+    apart = np.abs(boxes[:, None, :2] - boxes[:, :2]) < boxes[:, None, 2:] + boxes[:, 2:]
+    expected = np.argwhere(apart.all(axis=2) & ~np.eye(30, dtype=bool))
+    assert 0 < len(expected) < 30 * 29
+    np.testing.assert_array_equal(overlapping(boxes), expected)
+
+
+def pieces() -> list[Array]:
+    """Masks: discs and ellipses, whole and cut by a border, with a hole, a notch or a second piece, and steps aside."""
+    v, u = np.mgrid[:40, :50] + 0.5
+    masks = [np.hypot(u - at, (v - 20) * squeezed) <= 14 for at in (25, 9, 47) for squeezed in (1.0, 2.5)]
+    for column in (25, 11, 38):
+        masks.append(masks[0].copy())
+        masks[-1][20, column] = False
+    masks.append(masks[0] | (np.hypot(u - 47, v - 20) < 2))
+    masks.append(masks[0] | (np.hypot(u - 25, v - 38) < 2))
+    masks.append(masks[0] | ((v > 37) & (u > 30)))
+    # Rows that touch by a corner are one piece; those a pixel further apart are not.
+    masks += [((v < 20) & (u < 20)) | ((v > 20) & (u > aside) & (u < 40)) for aside in (20, 21)]
+    return masks
+
+
+@pytest.mark.parametrize("number", range(len(pieces())))
+def test_sums_over_a_piece_are_those_over_its_pixels(number: int) -> None:
+    """Pieces told without a search are found as one by OpenCV. A plateau of 100 e has its half level at 50 e."""
+    mask = pieces()[number]
+    row, column = np.nonzero(mask)
+    products = np.stack([np.ones_like(row), column, row, column**2, column * row, row**2]).sum(axis=1)
+    box = column.min(), row.min(), column.max(), row.max()
+    assert piece_sums(mask) == (tuple(products.tolist()), tuple(int(end) for end in box))
+
+    smooth = np.where(mask, 100.0, 49.0).astype(np.float32)
+    core, sums, solid = above_half_level(smooth, 0, 0, np.ones(mask.shape, dtype=bool), 0.0)
+    if mask.mean() > 0.25:  # so that the upper quartile is of the plateau
+        np.testing.assert_array_equal(core, mask)
+        assert sums == piece_sums(mask)
+        is_one = cv2.connectedComponents(mask.view(np.uint8), connectivity=8)[0] == 2
+        assert is_one if solid else number >= 6
+
+
+@pytest.mark.parametrize("number", range(len(pieces())))
+def test_a_face_is_padded_as_any_mask(number: int) -> None:
+    """Support and ring by `padded`, and the plane of the light inside by its own slopes: it follows one, without noise.
+
+    Rounding: products of float32, 1e-7 of the light, by levers of ten pixels and more.
+    """
+    face = pieces()[number]
+    v, u = np.mgrid[:40, :50] + 0.5
+    image = (1000.0 * (1 + 0.002 * (u - 25) - 0.003 * (v - 20))).astype(np.float32)
+    for margin_px, border_px in ((2.0, 2.0), (7.0, 0.0), (0.5, 4.3)):
+        support, ring, plane = around_face(image, 0, 0, face, margin_px, 3.0, border_px)
+        near, nearby, outside = padded(face, margin_px, margin_px + 3.0, border_px)
+        np.testing.assert_array_equal(support, near)
+        np.testing.assert_array_equal(ring, np.argwhere(nearby & ~near))
+        inside = ~outside
+        middle = u[inside].mean(), v[inside].mean()
+        level = 1 + 0.002 * (middle[0] - 25) - 0.003 * (middle[1] - 20)
+        np.testing.assert_allclose(plane[:2], middle, rtol=1e-12)
+        np.testing.assert_allclose(plane[2:], [0.002 / level, -0.003 / level], rtol=1e-4)
 
 
 @pytest.mark.parametrize("background_e", [0.0, 40.0])
@@ -478,6 +586,9 @@ def test_the_background_and_its_excess_variance_are_those_of_the_ring(background
     offsets = np.stack([u[support] - light.sums.u, v[support] - light.sums.v])
     covariance_px2 = (variance_e2[support] * offsets) @ offsets.T / light.sums.flux**2
     np.testing.assert_allclose(light.covariance_px2(0), covariance_px2, rtol=1e-8, atol=1e-9 * covariance_px2.max())
+    moments_px2 = (above_e[support] * offsets) @ offsets.T / light.sums.flux
+    expected_px2 = moments_px2[0, 0], moments_px2[0, 1], moments_px2[1, 1]
+    np.testing.assert_allclose(light.sums.moments_px2(), expected_px2, rtol=1e-8, atol=1e-9 * abs(moments_px2).max())
     for sigma, offset in zip(light.sums.moment_sigmas_px2(), offsets, strict=True):
         moment = (above_e[support] * offset**2).sum() / light.sums.flux
         expected = np.sqrt((variance_e2[support] * (offset**2 - moment) ** 2).sum()) / abs(light.sums.flux)

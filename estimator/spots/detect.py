@@ -29,13 +29,14 @@ from estimator.spots.led_light import (
     Ellipse,
     Light,
     LightSums,
+    Mask,
     Pair,
     Pixels,
     Readout,
     light_of,
 )
 from estimator.spots.sampling import PIXEL_VARIANCE, SHARP, LensBlur, sampling_error, sampling_variance_px2
-from estimator.spots.spot_pixels import above_half_level, brightest, piece_sums
+from estimator.spots.spot_pixels import Piece, above_half_level, brightest, overlapping, piece_sums
 
 # Share of the brightest level: above ceiling and walls at 1/100 of an LED, below an LED at a quarter of it.
 THRESHOLD_OF_BRIGHTEST = 0.05
@@ -67,6 +68,9 @@ LARGE_PX = 40.0
 MIN_SIGNAL_FOR_MOMENTS = 50.0
 # A sampling error with a smaller share of the noise's variance is left alone.
 MIN_SAMPLING_SHARE = 1e-3
+# Covariance of a centroid without one.
+UNKNOWN = np.full((2, 2), np.nan)
+UNKNOWN.setflags(write=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,12 +197,11 @@ def _with_neighbours(ellipses: Sequence[Ellipse], denoise_radius_px: int) -> Ite
         yield from ((ellipse, []) for ellipse in ellipses)
         return
     margin_px = MARGIN_PX + max(denoise_radius_px, *(ellipse.fringe_px for ellipse in ellipses))
-    centres = np.array([ellipse.centre_px for ellipse in ellipses])
-    extents = np.array([ellipse.half_extent(margin_px + RING_PX) for ellipse in ellipses])
-    overlap = (np.abs(centres[:, None] - centres) < extents[:, None] + extents).all(axis=2)
-    np.fill_diagonal(overlap, False)
-    for ellipse, row in zip(ellipses, overlap, strict=True):
-        yield ellipse, [ellipses[other] for other in np.flatnonzero(row).tolist()]
+    boxes = np.array([ellipse.centre_px + ellipse.half_extent(margin_px + RING_PX) for ellipse in ellipses])
+    others: list[list[Ellipse]] = [[] for _ in ellipses]
+    for one, other in overlapping(boxes).tolist():
+        others[one].append(ellipses[other])
+    yield from zip(ellipses, others, strict=True)
 
 
 def boxes_near(readouts: Sequence[Readout], decoded_px: Pixels | None, near_px: float) -> list[Box]:
@@ -277,31 +280,35 @@ def _ellipses(
         if not MIN_BLOB_PX <= area_px <= largest_px:
             small, large = small + (area_px < MIN_BLOB_PX), large + (area_px > largest_px)
             continue
-        core = above_half_level(smooth, left, top, blob.view(np.bool_), background_e)
-        count, pieces = cv2.connectedComponents(core.view(np.uint8), connectivity=8)
-        own = [1]
-        if count > 2:
-            areas = np.bincount(pieces.ravel())[1:]
-            own = (np.flatnonzero(areas >= MIN_PIECE * areas.max()) + 1).tolist()
-        ellipses += [_ellipse(pieces, piece, left, top, stretch, alone=count == 2) for piece in own]
+        core, sums, solid = above_half_level(smooth, left, top, blob.view(np.bool_), background_e)
+        pieces, alone = ([(core, sums)], True) if solid else _pieces(core)
+        ellipses += [_ellipse(*piece, left, top, stretch, alone) for piece in pieces]
     return ellipses, (small, large)
 
 
-def _ellipse(pieces: NDArray[np.int32], piece: int, left: int, top: int, stretch: float, alone: bool) -> Ellipse:
-    """Ellipse with the centroid and second moments of a piece; (left, top) is the first pixel of `pieces`.
+def _pieces(core: Mask) -> tuple[list[tuple[Mask, Piece]], bool]:
+    """Pieces of a mask that count as LED images, with their sums, and whether there is no other piece."""
+    count, numbers = cv2.connectedComponents(core.view(np.uint8), connectivity=8)
+    own = np.array([1])
+    if count > 2:
+        areas = np.bincount(numbers.ravel())[1:]
+        own = np.flatnonzero(areas >= MIN_PIECE * areas.max()) + 1
+    pieces = [numbers == number for number in own.tolist()]
+    return [(piece, piece_sums(piece)) for piece in pieces], count == 2
 
-    `pieces` has the size of the box around its blob, which is its fringe if it is `alone` in it.
+
+def _ellipse(piece: Mask, sums: Piece, left: int, top: int, stretch: float, alone: bool) -> Ellipse:
+    """Ellipse with the centroid and second moments of a piece by its sums; (left, top) is its mask's first pixel.
+
+    The mask has the size of the box around the piece's blob, which is its fringe if it is `alone` in it.
     """
-    (count, of_u, of_v, of_uu, of_uv, of_vv), (first_column, first_row, last_column, last_row) = piece_sums(
-        pieces, piece
-    )
+    (count, of_u, of_v, of_uu, of_uv, of_vv), (first_column, first_row, last_column, last_row) = sums
     # Sums of whole numbers: exact before they are divided.
     uu, uv, vv = count * of_uu - of_u * of_u, count * of_uv - of_u * of_v, count * of_vv - of_v * of_v
     variances, axis = _principal_axes(uu / count**2, uv / count**2, vv / count**2)
     semi_axes_px = _semi_axes_px(variances, stretch)
     uses_core = semi_axes_px[0] > (LARGE_PX if stretch == 1.0 else SMALL_PX)
-    box = np.s_[first_row : last_row + 1, first_column : last_column + 1]
-    height, width = pieces.shape
+    height, width = piece.shape
     wider_px = max(first_column, first_row, width - last_column - 1, height - last_row - 1)
     return Ellipse(
         centre_px=(of_u / count + left + 0.5, of_v / count + top + 0.5),
@@ -312,7 +319,7 @@ def _ellipse(pieces: NDArray[np.int32], piece: int, left: int, top: int, stretch
         area_px=count,
         stretch=stretch,
         fringe_px=_fringe_px(wider_px, semi_axes_px[0]) if alone else 0.0,
-        core=pieces[box] == piece if uses_core else None,
+        core=piece[first_row : last_row + 1, first_column : last_column + 1] if uses_core else None,
     )
 
 
@@ -435,7 +442,7 @@ def _measure(
     spot = Spot(
         u_px=sums.u + readout.column,
         v_px=sums.v + readout.row,
-        covariance_px2=light.covariance_px2(denoise_radius_px) if with_covariance else np.full((2, 2), np.nan),
+        covariance_px2=light.covariance_px2(denoise_radius_px) if with_covariance else UNKNOWN,
         brightest_u_px=column + 0.5 + readout.column,
         brightest_v_px=row + 0.5 + readout.row,
         area_px=ellipse.area_px,

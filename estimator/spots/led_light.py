@@ -18,12 +18,11 @@ from estimator.spots.spot_pixels import (
     BACKGROUND_SIGMA,
     LEVEL,
     Form,
-    above_background,
     around_ellipse,
     around_face,
     light_sums,
+    light_within,
     median,
-    share_among,
 )
 
 Pixels = NDArray[np.float64]
@@ -40,6 +39,7 @@ SIGMA_OF_MEDIAN = 1.4826
 LIT_SHARE = 0.1
 # Pieces of a blob count as separate LED images from this share of the largest piece on, by area or by light.
 MIN_PIECE = 0.2
+NO_FORMS = np.empty((0, 5))
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,15 +245,16 @@ def light_of(readout: Readout, ellipse: Ellipse, others: list[Ellipse], denoise_
         face[row : row + ellipse.core.shape[0], column : column + ellipse.core.shape[1]] = ellipse.core
         paddings_px = own_px, RING_PX, SMOOTHING_PX // 2 + ellipse.fringe_px
         support, ring, illumination = around_face(readout.image_e, left, top, face, *paddings_px)
+    padded, bare = NO_FORMS, NO_FORMS
     if others:
         padded = np.array([other.form(margin_px(other)) for other in others])
         bare = np.array([other.form(0.0) for other in others])
-        share_among(support, ring, left, top, ellipse.form(own_px), padded, bare)
+    shared = ellipse.form(own_px), padded, bare
     noise = readout.floor_e2, readout.prnu, readout.rounding_e2
-    images = readout.image_e, readout.raw_e
-    above_e, variance_e2, gate_e, off_e = above_background(*images, left, top, support, ring, illumination, *noise)
-    sums = LightSums(*light_sums(above_e, support, variance_e2, left, top))
-    return Light(left, top, support, above_e, variance_e2, gate_e, off_e, sums)
+    above_e, variance_e2, gate_e, off_e, sums = light_within(
+        readout.image_e, readout.raw_e, left, top, support, ring, illumination, *shared, *noise
+    )
+    return Light(left, top, support, above_e, variance_e2, gate_e, off_e, LightSums(*sums))
 
 
 def _surroundings(ellipse: Ellipse, padding_px: float, shape: tuple[int, ...]) -> tuple[int, int, int, int]:

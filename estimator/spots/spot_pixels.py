@@ -5,7 +5,8 @@ and v are continuous pixels of the region with pixel centres at +0.5. An ellipse
 offset (du, dv) from (u, v) is inside where uu du^2 + 2 uv du dv + vv dv^2 is at most 1. A plane of illumination is
 (u, v, slope along u, slope along v): 1 at (u, v), with these slopes per pixel.
 
-Loops go over slices of rows, and sum or compare by columns: the processor's vectors then take several pixels at once.
+Spans (2, rows) are pixels of a rectangle, in each row from a first column to before a last one: none where the last one
+is not behind the first. Loops go over slices of rows: the processor's vectors then take several pixels at once.
 """
 
 import math
@@ -13,7 +14,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.compiled import compiled
+from estimator.compiled import compiled, compiled_sums
 
 Image = NDArray[np.float32]
 Floats = NDArray[np.float64]
@@ -21,6 +22,8 @@ Ints = NDArray[np.int32]
 Mask = NDArray[np.bool_]
 Form = tuple[float, float, float, float, float]
 Plane = tuple[float, float, float, float]
+Piece = tuple[tuple[int, int, int, int, int, int], tuple[int, int, int, int]]
+Sums = tuple[float, float, float, float, float, float, float, float, float, float, float, float]
 
 # Pixels of the ring this many standard deviations from its median are no background of the LED.
 BACKGROUND_SIGMA = 3.0
@@ -36,6 +39,8 @@ STRUCTURE_SIGMA = 4.0
 MAX_ROUNDING_SHARE = 0.25
 # A sample of numbers, and the ranks in it to either side of one that is looked for, two standard deviations.
 SAMPLE, SPREAD = 64, 8
+# A chord by its equation is longer by this on each side before its ends are tested: rounding changes it by far less.
+SPARE_PX = 1e-3
 LEVEL: Plane = (0.0, 0.0, 0.0, 0.0)
 
 
@@ -100,8 +105,9 @@ def median(values: Floats) -> float:
 
 
 @compiled
-def above_half_level(smooth: Image, left: int, top: int, blob: Mask, background_e: float) -> Mask:
-    """Pixels of a blob (rows, columns) at least half as far above the background as its upper quartile.
+def above_half_level(smooth: Image, left: int, top: int, blob: Mask, background_e: float) -> tuple[Mask, Piece, bool]:
+    """Pixels of a blob (rows, columns) at least half as far above the background as its upper quartile, their
+    sums as by `piece_sums`, and whether they are one piece, as far as `_spans_of` tells.
 
     The upper quartile is the plateau of an LED image; the maximum would be its noise.
     """
@@ -119,35 +125,71 @@ def above_half_level(smooth: Image, left: int, top: int, blob: Mask, background_
         line = smooth[top + row, left : left + width]
         for column in range(width):
             core[row, column] = blob[row, column] & (line[column] >= half_e)
-    return core
+    spans, solid = _spans_of(core)
+    return core, _sums_between(core, spans, solid), solid
 
 
 @compiled
-def piece_sums(pieces: Ints, piece: int) -> tuple[tuple[int, int, int, int, int, int], tuple[int, int, int, int]]:
-    """Sums of 1, u, v, u^2, u v and v^2 over the pixels of a piece, u its column and v its row, and the box around it:
+def _spans_of(mask: Mask) -> tuple[Ints, bool]:
+    """Spans from the first to the last pixel of each row of a mask, and whether they are all of it and adjoin each
+    other: it is one piece then.
+    """
+    height, width = mask.shape
+    spans, solid, begun, ended = np.empty((2, height), dtype=np.int32), True, False, False
+    for row in range(height):
+        line, first, last, count = mask[row], 0, width, 0
+        while first < width and not line[first]:
+            first += 1
+        while last > first and not line[last - 1]:
+            last -= 1
+        for column in range(first, last):
+            count += line[column]
+        if first < last:
+            solid &= count == last - first and not ended
+            solid &= not begun or (first <= spans[1, row - 1] and last >= spans[0, row - 1])
+        ended |= begun and first == last
+        begun |= first < last
+        spans[0, row], spans[1, row] = first, last
+    return spans, solid
+
+
+@compiled
+def piece_sums(piece: Mask) -> Piece:
+    """Sums of 1, u, v, u^2, u v and v^2 over the pixels of a mask, u its column and v its row, and the box around it:
     first column and row, last column and row.
     """
-    height, width = pieces.shape
+    spans, solid = _spans_of(piece)
+    return _sums_between(piece, spans, solid)
+
+
+@compiled
+def _sums_between(mask: Mask, spans: Ints, solid: bool) -> Piece:
+    """The `piece_sums` of a mask with these spans, which are all of it where it is `solid`."""
+    height, width = mask.shape
     count, of_u, of_v, of_uu, of_uv, of_vv = 0, 0, 0, 0, 0, 0
     first_column, first_row, last_column, last_row = width, height, -1, -1
     for row in range(height):
-        size, sum_u, sum_uu, first, last = 0, 0, 0, width, -1
-        for column in range(width):
-            own = pieces[row, column] == piece
-            size += own
-            sum_u += own * column
-            sum_uu += own * column * column
-            first = min(first, column if own else width)
-            last = max(last, column if own else -1)
-        if size > 0:
-            count += size
-            of_u += sum_u
-            of_v += size * row
-            of_uu += sum_uu
-            of_uv += sum_u * row
-            of_vv += size * row * row
-            first_column, last_column = min(first_column, first), max(last_column, last)
-            first_row, last_row = min(first_row, row), row
+        first, last = int(spans[0, row]), int(spans[1, row])
+        if first == last:
+            continue
+        size, sum_u, sum_uu = 0, 0, 0
+        if solid:
+            size, sum_u = last - first, (first + last - 1) * (last - first) // 2
+            sum_uu = ((last - 1) * last * (2 * last - 1) - (first - 1) * first * (2 * first - 1)) // 6
+        else:
+            for column in range(first, last):
+                own = mask[row, column]
+                size += own
+                sum_u += own * column
+                sum_uu += own * column * column
+        count += size
+        of_u += sum_u
+        of_v += size * row
+        of_uu += sum_uu
+        of_uv += sum_u * row
+        of_vv += size * row * row
+        first_column, last_column = min(first_column, first), max(last_column, last - 1)
+        first_row, last_row = min(first_row, row), row
     return (count, of_u, of_v, of_uu, of_uv, of_vv), (first_column, first_row, last_column, last_row)
 
 
@@ -159,23 +201,62 @@ def distance2(form: Form, u: float, v: float) -> float:
 
 
 @compiled
-def inside_ellipse(form: Form, left: int, top: int, width: int, height: int) -> Mask:
-    """Pixels of a rectangle inside an ellipse, (height, width)."""
-    inside = np.empty((height, width), dtype=np.bool_)
+def ellipse_spans(form: Form, left: int, top: int, width: int, height: int) -> Ints:
+    """Spans of the pixels of a rectangle inside an ellipse."""
+    spans = np.empty((2, height), dtype=np.int32)
     for row in range(height):
-        for column in range(width):
-            inside[row, column] = distance2(form, left + column + 0.5, top + row + 0.5) <= 1
+        v = top + row + 0.5
+        dv = v - form[1]
+        middle = form[0] - left - form[3] * dv / form[2]
+        half = math.sqrt(max(form[3] * form[3] * dv * dv - form[2] * (form[4] * dv * dv - 1), 0.0)) / form[2] + SPARE_PX
+        first = math.ceil(max(middle - half - 0.5, 0.0))
+        last = math.floor(max(min(middle + half + 0.5, width), 0.0))
+        while first < last and distance2(form, left + first + 0.5, v) > 1:
+            first += 1
+        while first < last and distance2(form, left + last - 0.5, v) > 1:
+            last -= 1
+        spans[0, row], spans[1, row] = first, last
+    return spans
+
+
+@compiled
+def _within(spans: Ints, width: int) -> Mask:
+    """Pixels of spans, (rows, width)."""
+    height = spans.shape[1]
+    inside = np.zeros((height, width), dtype=np.bool_)
+    for row in range(height):
+        inside[row, spans[0, row] : spans[1, row]] = True
     return inside
 
 
 @compiled
-def around_ellipse(own: Form, outer: Form, left: int, top: int, width: int, height: int) -> tuple[Mask, Mask]:
-    """Pixels of a rectangle inside an ellipse, and those beside it inside an outer one, (height, width)."""
-    support, ring = inside_ellipse(own, left, top, width, height), inside_ellipse(outer, left, top, width, height)
-    for row in range(height):
-        for column in range(width):
-            ring[row, column] &= not support[row, column]
-    return support, ring
+def _between(inner: Ints, outer: Ints) -> Ints:
+    """Rows and columns (n, 2) of the pixels of outer spans that are not in inner ones."""
+    count, found = 0, 0
+    for row in range(outer.shape[1]):
+        count += max(outer[1, row] - outer[0, row], 0)
+    pixels = np.empty((count, 2), dtype=np.int32)
+    for row in range(outer.shape[1]):
+        first, last = outer[0, row], outer[1, row]
+        hole, beyond = inner[0, row], inner[1, row]
+        if hole >= beyond:
+            hole, beyond = last, last
+        for column in range(first, hole):
+            pixels[found, 0], pixels[found, 1] = row, column
+            found += 1
+        for column in range(beyond, last):
+            pixels[found, 0], pixels[found, 1] = row, column
+            found += 1
+    return pixels[:found]
+
+
+@compiled
+def around_ellipse(own: Form, outer: Form, left: int, top: int, width: int, height: int) -> tuple[Mask, Ints]:
+    """Pixels of a rectangle inside an ellipse, (height, width), and rows and columns (n, 2) of those beside it that are
+    inside an outer one.
+    """
+    inner = ellipse_spans(own, left, top, width, height)
+    return _within(inner, width), _between(inner, ellipse_spans(outer, left, top, width, height))
 
 
 @compiled
@@ -218,52 +299,83 @@ def padded(mask: Mask, radius_px: float, larger_px: float, outside_px: float) ->
 
 
 @compiled
-def around_face(
-    image_e: Image, left: int, top: int, face: Mask, margin_px: float, ring_px: float, border_px: float
-) -> tuple[Mask, Mask, Plane]:
-    """The face of an LED image padded by a margin, the ring of pixels up to `ring_px` beyond, and the illumination by
-    the lens.
-
-    The illumination is the plane of the light more than `border_px` inside the face.
-    """
-    support, ring, outside = padded(face, margin_px, margin_px + ring_px, border_px)
-    for row in range(len(ring)):
-        for column in range(ring.shape[1]):
-            ring[row, column] &= not support[row, column]
-    return support, ring, _fall_off(image_e, left, top, outside)
+def _padded_spans(spans: Ints, width: int, radius_px: float) -> Ints:
+    """Spans of the pixels at most a radius from a pixel of spans, of which those of neighbouring rows adjoin."""
+    height, halves = spans.shape[1], _half_chords(radius_px)
+    near = np.empty((2, height), dtype=np.int32)
+    near[0], near[1] = width, 0
+    for step in range(1 - len(halves), len(halves)):
+        half = halves[abs(step)]
+        for row in range(max(-step, 0), min(height - step, height)):
+            first, last = spans[0, row + step], spans[1, row + step]
+            near[0, row] = min(near[0, row], max(first - half, 0) if first < last else width)
+            near[1, row] = max(near[1, row], min(last + half, width) if first < last else 0)
+    return near
 
 
 @compiled
+def _beside(mask: Mask, larger: Mask) -> Ints:
+    """Rows and columns (n, 2) of the pixels of a larger mask that are not in a mask."""
+    height, width = mask.shape
+    pixels, count = np.empty((height * width + 1, 2), dtype=np.int32), 0
+    for row in range(height):
+        for column in range(width):
+            pixels[count, 0], pixels[count, 1] = row, column
+            count += larger[row, column] and not mask[row, column]
+    return pixels[:count]
+
+
+@compiled
+def around_face(
+    image_e: Image, left: int, top: int, face: Mask, margin_px: float, ring_px: float, border_px: float
+) -> tuple[Mask, Ints, Plane]:
+    """The face of an LED image padded by a margin, (rows, columns); rows and columns (n, 2) of the ring of pixels up to
+    `ring_px` beyond; and the illumination by the lens.
+
+    The illumination is the plane of the light more than `border_px` inside the face.
+    """
+    height, width = face.shape
+    spans, solid = _spans_of(face)
+    if not solid:
+        support, outer, outside = padded(face, margin_px, margin_px + ring_px, border_px)
+        return support, _beside(support, outer), _fall_off(image_e, left, top, outside)
+    inner, outer_spans = _padded_spans(spans, width, margin_px), _padded_spans(spans, width, margin_px + ring_px)
+    # What is not in the face are a span before it and one behind it in each row.
+    before, behind = np.zeros((2, height), dtype=np.int32), np.full((2, height), width, dtype=np.int32)
+    before[1], behind[0] = spans[0], spans[1]
+    inside = np.empty((2, height), dtype=np.int32)
+    inside[0] = _padded_spans(before, width, border_px)[1]
+    inside[1] = _padded_spans(behind, width, border_px)[0]
+    return _within(inner, width), _between(inner, outer_spans), _fall_off(image_e, left, top, ~_within(inside, width))
+
+
+@compiled_sums
 def _fall_off(image_e: Image, left: int, top: int, outside: Mask) -> Plane:
     """Plane that the light inside an LED image follows, 1 at its middle.
 
     With the second moments S of the pixels inside, a relative gradient g of the light moves their centroid by S g.
     """
     height, width = outside.shape
-    # Sums of 1, v and v^2, of the light, and of the light times v, with v from the rectangle's middle.
-    sums = np.zeros((5, width))
-    for row in range(height):
-        v, line_e = row - 0.5 * height, image_e[top + row, left : left + width]
-        for column in range(width):
-            inside = 0.0 if outside[row, column] else 1.0
-            light = inside * line_e[column]
-            sums[0, column] += inside
-            sums[1, column] += inside * v
-            sums[2, column] += inside * v * v
-            sums[3, column] += light
-            sums[4, column] += light * v
     count, of_u, of_v, of_uu, of_uv, of_vv, total, light_u, light_v = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for column in range(width):
-        u = column - 0.5 * width
-        count += sums[0, column]
-        of_u += sums[0, column] * u
-        of_v += sums[1, column]
-        of_uu += sums[0, column] * u * u
-        of_uv += sums[1, column] * u
-        of_vv += sums[2, column]
-        total += sums[3, column]
-        light_u += sums[3, column] * u
-        light_v += sums[4, column]
+    for row in range(height):
+        v, line, line_e = row - 0.5 * height, outside[row], image_e[top + row, left : left + width]
+        size, sum_u, sum_uu, light, moved = 0.0, 0.0, 0.0, 0.0, 0.0
+        for column in range(width):
+            u, inside = column - 0.5 * width, 0.0 if line[column] else 1.0
+            size += inside
+            sum_u += inside * u
+            sum_uu += inside * u * u
+            light += inside * line_e[column]
+            moved += inside * line_e[column] * u
+        count += size
+        of_u += sum_u
+        of_v += size * v
+        of_uu += sum_uu
+        of_uv += sum_u * v
+        of_vv += size * v * v
+        total += light
+        light_u += moved
+        light_v += light * v
     if count < MIN_INSIDE_PIXELS:
         return LEVEL
     u, v = of_u / count, of_v / count
@@ -275,42 +387,65 @@ def _fall_off(image_e: Image, left: int, top: int, outside: Mask) -> Plane:
 
 
 @compiled
+def overlapping(boxes: Floats) -> Ints:
+    """Pairs (k, 2) of the numbers of upright boxes (n, 4) that overlap, in both orders.
+
+    A box is its centre and its half extent, (u, v, along u, along v).
+    """
+    count = len(boxes)
+    pairs, found = np.empty((count * count + 1, 2), dtype=np.int32), 0
+    for one in range(count):
+        for other in range(count):
+            u, v = abs(boxes[one, 0] - boxes[other, 0]), abs(boxes[one, 1] - boxes[other, 1])
+            across_u, across_v = boxes[one, 2] + boxes[other, 2], boxes[one, 3] + boxes[other, 3]
+            pairs[found, 0], pairs[found, 1] = one, other
+            found += one != other and u < across_u and v < across_v
+    return pairs[:found]
+
+
+@compiled
 def _illumination(plane: Plane, u: float, v: float) -> float:
     """Illumination by the lens, relative to a plane's middle."""
+    if plane[2] == 0 and plane[3] == 0:
+        return 1.0
     light = 1 + plane[2] * (u - plane[0]) + plane[3] * (v - plane[1])
     light = MIN_FALL_OFF if light < MIN_FALL_OFF else light
     return MAX_FALL_OFF if light > MAX_FALL_OFF else light
 
 
 @compiled
-def share_among(support: Mask, ring: Mask, left: int, top: int, own: Form, others: Floats, bare: Floats) -> None:
-    """Take pixels nearer to one of k other ellipses out of a support, and those inside of one out of a ring.
+def _share_among(support: Mask, ring: Ints, left: int, top: int, own: Form, others: Floats, bare: Floats) -> Ints:
+    """Take pixels nearer to one of k other ellipses out of a support; the pixels of a ring, rows and columns (n, 2),
+    that are outside of these.
 
     `own` and the `others` (k, 5) are padded, `bare` (k, 5) are the others without padding: the ring is what is outside
     of these if all of it is inside of the padded ones.
     """
     height, width = support.shape
-    around, left_over = ring.copy(), False
     for row in range(height):
-        for column in range(width):
-            if not (support[row, column] or ring[row, column]):
-                continue
-            u, v = left + column + 0.5, top + row + 0.5
-            here = distance2(own, u, v)
-            for k in range(len(others)):
-                form = (others[k, 0], others[k, 1], others[k, 2], others[k, 3], others[k, 4])
-                there = distance2(form, u, v)
-                support[row, column] &= here <= there
-                ring[row, column] &= there > 1
-            left_over |= ring[row, column]
-    if left_over:
-        return
-    for row in range(height):
-        for column in range(width):
-            ring[row, column] = around[row, column]
-            for k in range(len(bare)):
-                form = (bare[k, 0], bare[k, 1], bare[k, 2], bare[k, 3], bare[k, 4])
-                ring[row, column] &= distance2(form, left + column + 0.5, top + row + 0.5) > 1
+        line, v = support[row], top + row + 0.5
+        for k in range(len(others)):
+            form = (others[k, 0], others[k, 1], others[k, 2], others[k, 3], others[k, 4])
+            for column in range(width):
+                u = left + column + 0.5
+                line[column] &= distance2(own, u, v) <= distance2(form, u, v)
+    outside = _outside(ring, left, top, others)
+    return outside if len(outside) > 0 else _outside(ring, left, top, bare)
+
+
+@compiled
+def _outside(pixels: Ints, left: int, top: int, ellipses: Floats) -> Ints:
+    """Those of pixels, rows and columns (n, 2), outside of all ellipses (k, 5)."""
+    found, count = np.empty((len(pixels) + 1, 2), dtype=np.int32), 0
+    for number in range(len(pixels)):
+        row, column = pixels[number, 0], pixels[number, 1]
+        free = True
+        for k in range(len(ellipses)):
+            form = (ellipses[k, 0], ellipses[k, 1], ellipses[k, 2], ellipses[k, 3], ellipses[k, 4])
+            free &= distance2(form, left + column + 0.5, top + row + 0.5) > 1
+        found[count, 0], found[count, 1] = row, column
+        count += free
+    return found[:count]
 
 
 @compiled
@@ -322,40 +457,40 @@ def _variance(raw_e: float, floor_e2: float, prnu: float) -> float:
     return lit_e + floor_e2 + uneven_e * uneven_e
 
 
-@compiled
-def above_background(
+@compiled_sums
+def light_within(
     image_e: Image,
     raw_e: Image,
     left: int,
     top: int,
     support: Mask,
-    ring: Mask,
+    ring: Ints,
     plane: Plane,
+    own: Form,
+    others: Floats,
+    bare: Floats,
     floor_e2: float,
     prnu: float,
     rounding_e2: float,
-) -> tuple[Floats, Floats, float, Floats]:
+) -> tuple[Floats, Floats, float, Floats, Sums]:
     """Electrons above the background, and a pixel's variance, (rows, columns); what noise of the background stays below
-    as far as the device knows of it; and how far pixels of the ring are from the background, (n,).
+    as far as the device knows of it; how far pixels of the ring are from the background, (n,); and the `light_sums`.
 
-    The background is the mean of the ring without pixels of another surface or light, times the illumination; of all of
-    it where its median is between two surfaces.
+    The support and the ring, rows and columns (n, 2), leave out what is of the other ellipses (k, 5), see
+    `_share_among`: the support is changed. The background is the mean of the ring without pixels of another surface or
+    light, times the illumination; of all of it where its median is between two surfaces.
     """
     height, width = support.shape
-    ring_e, of_raw_e, of_ring_e2 = np.empty(ring.size), np.empty(ring.size), np.empty(ring.size)
-    columns, count = np.empty(width + 1, dtype=np.int64), 0
-    for row in range(height):
-        line, found = ring[row], 0
-        for column in range(width):
-            columns[found] = column
-            found += line[column]
-        image, raw = image_e[top + row, left : left + width], raw_e[top + row, left : left + width]
-        for column in columns[:found]:
-            light = _illumination(plane, left + column + 0.5, top + row + 0.5)
-            ring_e[count], of_raw_e[count] = image[column] / light, raw[column] / light
-            of_ring_e2[count] = _variance(raw[column], floor_e2, prnu)
-            count += 1
-    ring_e, of_raw_e, of_ring_e2 = ring_e[:count], of_raw_e[:count], of_ring_e2[:count]
+    if len(others) > 0:
+        ring = _share_among(support, ring, left, top, own, others, bare)
+    count = len(ring)
+    ring_e, of_raw_e, of_ring_e2 = np.empty(count), np.empty(count), np.empty(count)
+    for k in range(count):
+        row, column = ring[k, 0], ring[k, 1]
+        light = _illumination(plane, left + column + 0.5, top + row + 0.5)
+        raw = raw_e[top + row, left + column]
+        ring_e[k], of_raw_e[k] = image_e[top + row, left + column] / light, raw / light
+        of_ring_e2[k] = _variance(raw, floor_e2, prnu)
     background_e, gate_e, excess_e2, off_e = 0.0, math.inf, 0.0, np.empty(count)
     if count > 0:
         # One electron more: the noise of a pixel with fewer is not normal.
@@ -372,28 +507,27 @@ def above_background(
             excess_e2 = _excess_variance(of_raw_e, off_e, limit_e, model_e2, rounding_e2)
     above_e, variance_e2 = np.empty((height, width)), np.empty((height, width))
     for row in range(height):
-        image, raw = image_e[top + row, left : left + width], raw_e[top + row, left : left + width]
+        image, raw_line = image_e[top + row, left : left + width], raw_e[top + row, left : left + width]
         for column in range(width):
             above = image[column] - background_e * _illumination(plane, left + column + 0.5, top + row + 0.5)
-            variance = _variance(raw[column], floor_e2, prnu)
+            variance = _variance(raw_line[column], floor_e2, prnu)
             of_ring = variance + excess_e2 if variance > -excess_e2 else 0.0
             above_e[row, column] = above
             variance_e2[row, column] = of_ring if support[row, column] & (above <= gate_e) else variance
-    return above_e, variance_e2, gate_e, off_e
+    return above_e, variance_e2, gate_e, off_e, light_sums(above_e, support, variance_e2, left, top)
 
 
-@compiled
+@compiled_sums
 def _mean_where(values: Floats, off_e: Floats, limit_e: float) -> float:
     """Mean of the numbers whose pixels are off the background by at most a limit."""
     total, count = 0.0, 0
     for k in range(len(values)):
-        if off_e[k] <= limit_e:
-            total += values[k]
-            count += 1
+        total += values[k] if off_e[k] <= limit_e else 0.0
+        count += off_e[k] <= limit_e
     return total / count
 
 
-@compiled
+@compiled_sums
 def _excess_variance(ring_e: Floats, off_e: Floats, limit_e: float, model_e2: float, rounding_e2: float) -> float:
     """Variance of a pixel without light of an LED, by the ring's pixels off the background by at most a limit, less
     that by the model, electrons squared.
@@ -403,65 +537,59 @@ def _excess_variance(ring_e: Floats, off_e: Floats, limit_e: float, model_e2: fl
     """
     mean_e, total_e2, count = _mean_where(ring_e, off_e, limit_e), 0.0, 0
     for k in range(len(ring_e)):
-        if off_e[k] <= limit_e:
-            total_e2 += (ring_e[k] - mean_e) * (ring_e[k] - mean_e)
-            count += 1
+        off = ring_e[k] - mean_e if off_e[k] <= limit_e else 0.0
+        total_e2 += off * off
+        count += off_e[k] <= limit_e
     excess_e2 = total_e2 / (count - 1) - model_e2
     # The variance of n normal numbers has a relative standard deviation of sqrt(2 / n).
     structured = excess_e2 > STRUCTURE_SIGMA * math.sqrt(2 / count) * model_e2
     return excess_e2 if structured or rounding_e2 > MAX_ROUNDING_SHARE * model_e2 else 0.0
 
 
-@compiled
-def light_sums(
-    above_e: Floats, support: Mask, variance_e2: Floats, left: int, top: int
-) -> tuple[float, float, float, float, float, float, float, float, float, float, float, float]:
+@compiled_sums
+def light_sums(above_e: Floats, support: Mask, variance_e2: Floats, left: int, top: int) -> Sums:
     """Flux and centroid (u, v) of the light in a support (rows, columns), its sums times du^2, du dv and dv^2 about the
     centroid, and the sums of the variances there times 1, du^2, du dv, dv^2, du^4 and dv^4.
     """
     height, width = above_e.shape
-    sums = np.zeros((2, width))
-    for row in range(height):
-        for column in range(width):
-            light = above_e[row, column] if support[row, column] else 0.0
-            sums[0, column] += light
-            sums[1, column] += light * (row + 0.5)
     flux, u, v = 0.0, 0.0, 0.0
-    for column in range(width):
-        flux += sums[0, column]
-        u += sums[0, column] * (column + 0.5)
-        v += sums[1, column]
-    u, v = u / flux, v / flux
-    of_light, of_noise = np.zeros((3, width)), np.zeros((4, width))
     for row in range(height):
-        dv = row + 0.5 - v
-        dv2 = dv * dv
+        line, own, light, along = above_e[row], support[row], 0.0, 0.0
         for column in range(width):
-            light = above_e[row, column] if support[row, column] else 0.0
-            noise = variance_e2[row, column] if support[row, column] else 0.0
-            of_light[0, column] += light
-            of_light[1, column] += light * dv
-            of_light[2, column] += light * dv2
-            of_noise[0, column] += noise
-            of_noise[1, column] += noise * dv
-            of_noise[2, column] += noise * dv2
-            of_noise[3, column] += noise * dv2 * dv2
+            here = line[column] if own[column] else 0.0
+            light += here
+            along += here * (column + 0.5)
+        flux += light
+        u += along
+        v += light * (row + 0.5)
+    u, v = u / flux, v / flux
     uu, uv, vv = 0.0, 0.0, 0.0
     noise, noise_uu, noise_uv, noise_vv, noise_uuuu, noise_vvvv = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for column in range(width):
-        du = column + 0.5 - u
-        du2 = du * du
-        uu += of_light[0, column] * du2
-        uv += of_light[1, column] * du
-        vv += of_light[2, column]
-        noise += of_noise[0, column]
-        noise_uu += of_noise[0, column] * du2
-        noise_uv += of_noise[1, column] * du
-        noise_vv += of_noise[2, column]
-        noise_uuuu += of_noise[0, column] * du2 * du2
-        noise_vvvv += of_noise[3, column]
-    of_light_itself = flux, left + u, top + v, uu, uv, vv
-    return *of_light_itself, noise, noise_uu, noise_uv, noise_vv, noise_uuuu, noise_vvvv
+    for row in range(height):
+        line, line_e2, own = above_e[row], variance_e2[row], support[row]
+        light, light_u, light_uu, of_noise, of_u, of_uu, of_uuuu = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for column in range(width):
+            du = column + 0.5 - u
+            here, here_e2 = (line[column], line_e2[column]) if own[column] else (0.0, 0.0)
+            light += here
+            light_u += here * du
+            light_uu += here * du * du
+            of_noise += here_e2
+            of_u += here_e2 * du
+            of_uu += here_e2 * du * du
+            of_uuuu += here_e2 * du * du * du * du
+        dv = row + 0.5 - v
+        uu += light_uu
+        uv += light_u * dv
+        vv += light * dv * dv
+        noise += of_noise
+        noise_uu += of_uu
+        noise_uv += of_u * dv
+        noise_vv += of_noise * dv * dv
+        noise_uuuu += of_uuuu
+        noise_vvvv += of_noise * dv * dv * dv * dv
+    of_light = flux, left + u, top + v, uu, uv, vv
+    return *of_light, noise, noise_uu, noise_uv, noise_vv, noise_uuuu, noise_vvvv
 
 
 @compiled
@@ -471,18 +599,21 @@ def brightest(
     """Row and column of the brightest pixel of a rectangle inside an ellipse, row by row the first of equal ones, and
     whether a pixel inside is `clipped`.
     """
-    inside = inside_ellipse(form, left, top, width, height)
-    peaks_e, rows = np.full(width, -np.inf, dtype=np.float32), np.zeros(width, dtype=np.int32)
-    saturated = False
+    spans = ellipse_spans(form, left, top, width, height)
+    peaks_e, saturated = np.full(width, -np.inf, dtype=np.float32), 0
     for row in range(height):
-        line_e, line_clipped = image_e[top + row, left : left + width], clipped[top + row, left : left + width]
-        for column in range(width):
-            higher = inside[row, column] & (line_e[column] > peaks_e[column])
-            peaks_e[column] = line_e[column] if higher else peaks_e[column]
-            rows[column] = row if higher else rows[column]
-            saturated |= inside[row, column] & line_clipped[column]
-    best = 0
-    for column in range(1, width):
-        earlier = rows[column] < rows[best] and peaks_e[column] == peaks_e[best]
-        best = column if peaks_e[column] > peaks_e[best] or earlier else best
-    return top + int(rows[best]), left + best, saturated
+        first, last = spans[0, row], spans[1, row]
+        line_e, highest_e = image_e[top + row, left + first : left + last], peaks_e[first:last]
+        for k in range(len(highest_e)):
+            highest_e[k] = max(highest_e[k], line_e[k])
+        for is_clipped in clipped[top + row, left + first : left + last]:
+            saturated += is_clipped
+    peak_e = peaks_e.max()
+    for row in range(height):
+        first, last = spans[0, row], spans[1, row]
+        line_e, equal = image_e[top + row, left + first : left + last], 0
+        for pixel_e in line_e:
+            equal += pixel_e == peak_e
+        if equal > 0:
+            return top + row, left + first + line_e.argmax(), saturated > 0
+    return top, left, False
