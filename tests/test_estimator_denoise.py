@@ -52,6 +52,16 @@ def test_at_the_border_the_mean_is_over_the_neighbours_there_are() -> None:
     np.testing.assert_allclose(result[8, 16], side.mean(), rtol=3e-7)
 
 
+@pytest.mark.parametrize("name", ["corrected", "literal"])
+def test_means_that_denoisers_share_give_the_same_and_stay_as_they_were(name: str) -> None:
+    image = np.random.default_rng(4).poisson(50, (14, 17)).astype(np.float32)
+    means = neighbourhood_mean(image)
+    denoiser = DENOISERS[name]
+    assert denoiser.by_means is not None
+    np.testing.assert_array_equal(denoiser.by_means(image, means), denoiser.apply(image, 0.0))
+    np.testing.assert_array_equal(means, neighbourhood_mean(image))
+
+
 def test_a_flat_image_stays_flat_and_the_input_stays_as_it_was() -> None:
     image = np.full((20, 30), 7.0, np.float32)
     np.testing.assert_allclose(neighbourhood_mean(image), 7.0, rtol=1e-7)

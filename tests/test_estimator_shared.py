@@ -16,6 +16,7 @@ from estimator.methods.variant import DeviceMethod, Estimate, Variant
 from estimator.solvers.observations import Observations
 from estimator.solvers.robust_fit import Consensus
 from estimator.spots.correspondences import find_correspondences
+from estimator.spots.denoise import Image, neighbourhood_mean
 from estimator.spots.detect import Spot, detect
 
 
@@ -89,6 +90,18 @@ def test_spots_are_detected_once_a_denoiser_and_charged_to_every_variant(
 
 
 @pytest.mark.slow
+def test_denoisers_share_the_means_of_a_frame(synthetic_set: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    dataset, calls = est.read_dataset(synthetic_set), []
+
+    def counted(image: Image) -> Image:
+        calls.append(None)
+        return neighbourhood_mean(image)
+
+    monkeypatch.setattr("estimator.spots.correspondences.neighbourhood_mean", counted)
+    estimate_dataset(dataset, [VARIANTS["huynh2016"], VARIANTS["huynh2016-as-printed"]], lambda: None)
+    assert len(calls) == sum(len(est.read_frame(dataset, frame).parts) for frame in range(len(dataset.frames)))
+
+
 def test_estimates_are_those_of_each_variant_alone(synthetic_set: Path) -> None:
     dataset, variants = est.read_dataset(synthetic_set), list(VARIANTS.values())
     together = estimate_dataset(dataset, variants, lambda: None)

@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 
 from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame
-from estimator.spots.denoise import DENOISERS, Denoiser
+from estimator.spots.denoise import DENOISERS, Denoiser, neighbourhood_mean
 from estimator.spots.detect import Spot, detect
 from estimator.spots.excess_noise import excess_noise_of_spots_e2
 from estimator.spots.identify import Correspondence, gate_px, identify
 from estimator.spots.lamps import has_stripes, lamps_of, light_centre_px, readouts_of
+from estimator.spots.led_light import Readout
 from estimator.spots.sampling import lens_blur
 
 Floats = NDArray[np.float64]
@@ -57,10 +58,7 @@ def _detected(frame: DeviceFrame, denoiser: Denoiser, with_covariances: bool = T
     any_square = any(frame.leds[spot.led].shape == "square" for spot in frame.spots)
 
     def detected() -> tuple[Spot, ...]:
-        readouts, sensor = readouts_of(frame), frame.sensor
-        if denoiser is not RAW:
-            floor_sigma_e = float(np.sqrt(sensor.floor_e2()))
-            readouts = tuple(replace(one, image_e=denoiser.apply(one.raw_e, floor_sigma_e)) for one in readouts)
+        readouts, sensor = _denoised(frame, denoiser), frame.sensor
         decoded_px = np.array([(spot.u_px, spot.v_px) for spot in frame.spots]).reshape(-1, 2)
         sensor_px = frame.camera.width_px * frame.camera.height_px
         rest = _gate_px(frame, denoiser), lens_blur(frame.camera), sensor.crosstalk, with_covariances
@@ -72,6 +70,20 @@ def _detected(frame: DeviceFrame, denoiser: Denoiser, with_covariances: bool = T
         return spots
 
     return frame.once(("spots", denoiser, frame.spots, any_square, with_covariances), detected)
+
+
+def _denoised(frame: DeviceFrame, denoiser: Denoiser) -> tuple[Readout, ...]:
+    """Regions of a frame with denoised images."""
+    readouts = readouts_of(frame)
+    if denoiser is RAW:
+        return readouts
+    if denoiser.by_means is None:
+        floor_sigma_e = float(np.sqrt(frame.sensor.floor_e2()))
+        images = [denoiser.apply(one.raw_e, floor_sigma_e) for one in readouts]
+    else:
+        means = frame.once(("means",), lambda: tuple(neighbourhood_mean(one.raw_e) for one in readouts))
+        images = [denoiser.by_means(one.raw_e, mean) for one, mean in zip(readouts, means, strict=True)]
+    return tuple(replace(one, image_e=image) for one, image in zip(readouts, images, strict=True))
 
 
 def _striped(frame: DeviceFrame) -> list[Spot]:

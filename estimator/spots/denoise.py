@@ -27,11 +27,14 @@ BILATERAL_SPACE_PX = 1.5
 class Denoiser:
     """A denoiser and its radius: a pixel of the result depends on a square of 2 `radius_px` + 1 pixels.
 
-    `apply` takes the image and the standard deviation of the signal-independent noise, electrons.
+    `apply` takes the image and the standard deviation of the signal-independent noise, electrons. `by_means`
+    gives the same from the image and its `neighbourhood_mean`, which the denoisers of a frame share; None where the
+    result takes more.
     """
 
     apply: Callable[[Image, float], Image]
     radius_px: int
+    by_means: Callable[[Image, Image], Image] | None = None
 
 
 def neighbourhood_mean(image: Image) -> Image:
@@ -60,9 +63,12 @@ def algorithm_1(image: Image) -> Image:
     lambda_1: the mean of the Poisson variable that models the pixel in Eq. 12, hence its value without noise (Eq. 11).
     With c - mu_S in its place the result is `neighbourhood_mean`, and lines 10 to 12 are not needed.
     """
-    result = neighbourhood_mean(image)
-    _turn_into_adjusted(result, np.ascontiguousarray(image))
-    return result
+    return adjusted(image, neighbourhood_mean(image))
+
+
+def adjusted(image: Image, means: Image) -> Image:
+    """Lines 9 to 12 of `algorithm_1`, by the `neighbourhood_mean` of the image."""
+    return _adjusted(np.ascontiguousarray(image), means)
 
 
 def box_mean(image: Image) -> Image:
@@ -109,8 +115,10 @@ def unbiased_inverse(stabilised: Image, read_noise_e: float) -> Image:
 
 
 DENOISERS: dict[str, Denoiser] = {
-    "corrected": Denoiser(lambda image, read_noise_e: neighbourhood_mean(image), NEIGHBOURHOOD_RADIUS_PX),
-    "literal": Denoiser(lambda image, read_noise_e: algorithm_1(image), NEIGHBOURHOOD_RADIUS_PX),
+    "corrected": Denoiser(
+        lambda image, read_noise_e: neighbourhood_mean(image), NEIGHBOURHOOD_RADIUS_PX, lambda image, means: means
+    ),
+    "literal": Denoiser(lambda image, read_noise_e: algorithm_1(image), NEIGHBOURHOOD_RADIUS_PX, adjusted),
     "box": Denoiser(lambda image, read_noise_e: box_mean(image), NEIGHBOURHOOD_RADIUS_PX),
     "none": Denoiser(lambda image, read_noise_e: image, 0),
     "anscombe": Denoiser(variance_stabilised, BILATERAL_PX // 2),
@@ -138,12 +146,12 @@ def _count(at: int, length_px: int) -> int:
 
 
 @compiled
-def _turn_into_adjusted(means: Image, image: Image) -> None:
-    """Turn the means of pixels' neighbours into the adjusted intensities of Algorithm 1, by its lines 9 to 12."""
+def _adjusted(image: Image, means: Image) -> Image:
+    """Adjusted intensities of Algorithm 1, by the means of pixels' neighbours."""
     height, width = image.shape
-    last = np.empty(width, dtype=np.float32)
+    result, last = np.empty((height, width), dtype=np.float32), np.empty(width, dtype=np.float32)
     for row in range(height):
-        line, line_means = image[row], means[row]
+        line, line_means, line_result = image[row], means[row], result[row]
         # The last neighbour of each pixel; for pixels beyond the image, those at its border.
         below = image[min(row + NEIGHBOURHOOD_RADIUS_PX, height - 1)]
         for column in range(width):
@@ -151,4 +159,5 @@ def _turn_into_adjusted(means: Image, image: Image) -> None:
         for column in range(width):
             mu, off = line[column] - line_means[column], line[column] - last[column]
             sigma = mu - off * off / np.float32(NEIGHBOURS)
-            line_means[column] = (sigma * sigma + mu) / np.float32(2)
+            line_result[column] = (sigma * sigma + mu) / np.float32(2)
+    return result
