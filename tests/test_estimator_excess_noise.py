@@ -56,6 +56,27 @@ def lit(sensor: Sensor, more_e: float = 0.0, seed: int = 1, count: int = 40, sid
     return [(one, np.ones(one.shape, dtype=bool)) for one in read]
 
 
+@pytest.mark.parametrize("precision", [np.float32, np.float64])
+@pytest.mark.parametrize("shape", [(25, 25), (13, 40), (3, 3), (1, 9), (6, 2)])
+@pytest.mark.parametrize("mosaic", ["none", "rggb"])
+def test_variances_are_of_the_pixels_with_two_neighbours_inside(
+    precision: type, shape: tuple[int, int], mosaic: str
+) -> None:
+    """By NumPy's differences of slices, summed in double precision in another order."""
+    rng = np.random.default_rng(9)
+    electrons, inside = (1.37 * rng.poisson(3000, shape)).astype(precision), rng.random(shape) < 0.9
+    sensor, apart = FULL.model_copy(update={"mosaic": mosaic}), 1 if mosaic == "none" else 2
+    expected, counts = [], []
+    for pixels, known, offset_e in ((electrons, inside, 30.0), (electrons.T, inside.T, 40.0)):
+        own, before, after = np.s_[:, apart:-apart], np.s_[:, : -2 * apart], np.s_[:, 2 * apart :]
+        off = (pixels[own] - (pixels[before] + pixels[after]) / 2)[known[own] & known[before] & known[after]]
+        expected.append((off.astype(np.float64) ** 2).sum() / (1.5 * max(off.size, 1)) - offset_e**2)
+        counts.append(off.size)
+    variances_e2, count = _variances(electrons, inside, sensor)
+    assert count == min(counts)
+    np.testing.assert_allclose(variances_e2, expected, rtol=1e-12)
+
+
 @pytest.mark.parametrize(
     "sensor", [SHOT, FULL, FULL.model_copy(update={"mosaic": "rggb"})], ids=["shot", "full", "rggb"]
 )

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.compiled import compiled_sums
 from estimator.io.sensor import Sensor
 from estimator.spots.detect import Spot
 from estimator.spots.led_light import SMOOTHING_PX, Readout
@@ -36,6 +37,8 @@ ENOUGH_DIFFERENCES, ENOUGH_IMAGES = 500, 5
 MIN_RATIO = 1.5
 SURE_SIGMA = 6.0
 SQUARES_VARIANCE = 35 / 9
+# Of single precision, so that a product has the precision of the images.
+HALF = np.float32(0.5)
 
 
 def excess_noise_e2(images: Iterable[tuple[Floats, Mask]], sensor: Sensor) -> float:
@@ -70,17 +73,38 @@ def _variances(electrons: Floats, inside: Mask, sensor: Sensor) -> tuple[tuple[f
     these.
     """
     apart = 1 if sensor.mosaic == "none" else 2
-    found, numbers = [], []
+    # Copies are in one piece, as compiled loops take arrays.
+    of_rows, of_columns, along_rows, along_columns = _squares(electrons.copy(), inside.copy(), apart)
     # Along a row its offset cancels, those of the columns do not.
-    for pixels, known, offset_e in (
-        (electrons, inside, sensor.column_offset_e),
-        (electrons.T, inside.T, sensor.row_offset_e),
-    ):
-        own, before, after = np.s_[:, apart:-apart], np.s_[:, : -2 * apart], np.s_[:, 2 * apart :]
-        off = (pixels[own] - (pixels[before] + pixels[after]) / 2)[known[own] & known[before] & known[after]]
-        found.append(float(np.einsum("i,i", off, off, dtype=np.float64)) / (1.5 * max(off.size, 1)) - offset_e**2)
-        numbers.append(off.size)
-    return (found[0], found[1]), min(numbers)
+    along_row_e2 = of_rows / (1.5 * max(along_rows, 1)) - sensor.column_offset_e**2
+    along_column_e2 = of_columns / (1.5 * max(along_columns, 1)) - sensor.row_offset_e**2
+    return (along_row_e2, along_column_e2), min(along_rows, along_columns)
+
+
+@compiled_sums
+def _squares(electrons: Floats, inside: Mask, apart: int) -> tuple[float, float, int, int]:
+    """Sums of the squares of pixels minus the means of the two `apart` from them, along rows and along columns, and the
+    numbers of these; all three pixels are inside.
+    """
+    height, width = electrons.shape
+    of_rows, of_columns, along_rows, along_columns = 0.0, 0.0, 0, 0
+    for row in range(height):
+        line, own = electrons[row], inside[row]
+        for column in range(apart, width - apart):
+            known = own[column] & own[column - apart] & own[column + apart]
+            off = np.float64(line[column] - (line[column - apart] + line[column + apart]) * HALF)
+            of_rows += off * off if known else 0.0
+            along_rows += known
+    for row in range(apart, height - apart):
+        line, own = electrons[row], inside[row]
+        above, below = electrons[row - apart], electrons[row + apart]
+        own_above, own_below = inside[row - apart], inside[row + apart]
+        for column in range(width):
+            known = own[column] & own_above[column] & own_below[column]
+            off = np.float64(line[column] - (above[column] + below[column]) * HALF)
+            of_columns += off * off if known else 0.0
+            along_columns += known
+    return of_rows, of_columns, along_rows, along_columns
 
 
 def _exceed(measured: Sequence[tuple[float, float]], stated: Sequence[float], differences: int) -> bool:
