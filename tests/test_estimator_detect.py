@@ -13,6 +13,7 @@ from estimator.spots.sampling import LensBlur
 from estimator.spots.spot_pixels import (
     above_half_level,
     around_face,
+    boxes_around,
     brightest,
     distance2,
     ellipse_spans,
@@ -489,6 +490,21 @@ def test_of_equally_bright_pixels_in_an_ellipse_the_first_is_the_brightest() -> 
         clipped[28, 33] = True
         assert inside[28, 33]
         assert brightest(image, clipped, 15, 15, 30, 30, form) == (row, column, True)
+
+
+def test_the_pixels_near_a_point_are_a_box_of_each_region_that_has_some() -> None:
+    """Against the distances of pixels' borders; ends are whole pixels towards the region's first one."""
+    points = np.array([(10.2, 8.7), (33.0, 21.5), (90.0, 90.0), (25.0, -2.0)])
+    regions = [(0, 0, 30, 20), (25, 10, 12, 30), (0, 60, 30, 8)]
+    expected = []
+    for u, v in points:
+        for region, (column, row, width, height) in enumerate(regions):
+            left, right = (int(np.clip(u + off - column, 0, width)) for off in (-6.0, 6.0))
+            top, bottom = (int(np.clip(v + off - row, 0, height)) for off in (-6.0, 6.0))
+            if left < right and top < bottom:
+                expected.append([region, left, top, right, bottom])
+    assert [box[0] for box in expected] == [0, 0, 1, 0]
+    np.testing.assert_array_equal(boxes_around(points, np.array(regions, dtype=float), 6.0), expected)
 
 
 def test_boxes_overlap_where_the_distances_of_their_centres_say_so() -> None:

@@ -14,12 +14,14 @@ which holds less background than an ellipse around it (`estimator.spots.led_ligh
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from statistics import median
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.compiled import compact
 from estimator.errors import EstimationFailure
 from estimator.spots.led_light import (
     MARGIN_PX,
@@ -36,7 +38,7 @@ from estimator.spots.led_light import (
     light_of,
 )
 from estimator.spots.sampling import PIXEL_VARIANCE, SHARP, LensBlur, sampling_error, sampling_variance_px2
-from estimator.spots.spot_pixels import Piece, above_half_level, brightest, overlapping, piece_sums
+from estimator.spots.spot_pixels import Piece, above_half_level, boxes_around, brightest, overlapping, piece_sums
 
 # Share of the brightest level: above ceiling and walls at 1/100 of an LED, below an LED at a quarter of it.
 THRESHOLD_OF_BRIGHTEST = 0.05
@@ -208,13 +210,8 @@ def boxes_near(readouts: Sequence[Readout], decoded_px: Pixels | None, near_px: 
     """Boxes of pixels of regions within `near_px` of pixels (n, 2) of the sensor; none without such."""
     if decoded_px is None:
         return []
-    first = np.array([(readout.column, readout.row) for readout in readouts])
-    size = np.array([readout.image_e.shape[::-1] for readout in readouts])
-    middle = decoded_px[:, None] - first
-    low, high = (np.minimum(np.maximum(end, 0), size).astype(int) for end in (middle - near_px, middle + near_px))
-    pixels, regions = np.nonzero((low < high).all(axis=2))
-    ends = np.concatenate([regions[:, None], low[pixels, regions], high[pixels, regions]], axis=1)
-    return [Box(*values) for values in ends.tolist()]
+    regions = [(readout.column, readout.row, *readout.image_e.shape[::-1]) for readout in readouts]
+    return [Box(*values) for values in boxes_around(compact(decoded_px), compact(regions), near_px).tolist()]
 
 
 def brightest_of(images: Sequence[NDArray[np.float32]], boxes: Sequence[Box]) -> float:
@@ -224,7 +221,7 @@ def brightest_of(images: Sequence[NDArray[np.float32]], boxes: Sequence[Box]) ->
     parts = [images[box.region][box.top : box.bottom, box.left : box.right] for box in boxes]
     # OpenCV takes half of NumPy's time.
     peaks = [cv2.minMaxLoc(part)[1] for part in parts or images]
-    return float(np.median(peaks)) if parts else max(peaks)
+    return median(peaks) if parts else max(peaks)
 
 
 def levels_of(smooth: Sequence[NDArray[np.float32]], whole: bool, brightest_e: float) -> tuple[float, float]:
