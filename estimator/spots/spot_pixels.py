@@ -83,9 +83,10 @@ def _near_nth(values: Floats, n: int) -> tuple[Floats, int]:
         low, high = _nth(sample, max(rank - SPREAD, 0)), _nth(sample, min(rank + SPREAD, len(sample) - 1))
         some, count, below = np.empty(size), 0, 0
         for k in range(size):
+            below += values[k] < low
+        for k in range(size):
             some[count] = values[k]
             count += (values[k] >= low) & (values[k] <= high)
-            below += values[k] < low
         if below < n < below + count:
             return some[:count], n - below
     return values.copy(), n
