@@ -102,9 +102,24 @@ def test_a_square_root_has_the_information_and_the_gradient() -> None:
     design = generator.standard_normal((3, 20, LOCAL_PARAMETERS)) * 10.0 ** generator.integers(-4, 5, LOCAL_PARAMETERS)
     information = design.transpose(0, 2, 1) @ design
     gradient = np.einsum("nrp,nr->np", design, generator.standard_normal((3, 20)))
-    rows, right = square_root(information, gradient)
+    rows, right = square_root(information, gradient, np.arange(LOCAL_PARAMETERS))
     np.testing.assert_allclose(rows.transpose(0, 2, 1) @ rows, information, rtol=1e-6)
     np.testing.assert_allclose(np.einsum("nrp,nr->np", rows, right), gradient, rtol=1e-6)
+
+
+def test_a_square_root_of_some_parameters_takes_the_others_as_known() -> None:
+    """It has their information and gradient, and as many rows as they are; the others' columns are 0."""
+    design, some = np.random.default_rng(2).standard_normal((3, 30, LOCAL_PARAMETERS)), np.array([0, 2, 5, 13])
+    gradient = design.sum(axis=1)
+    rows, right = square_root(design.transpose(0, 2, 1) @ design, gradient, some)
+    assert rows.shape == (3, len(some), LOCAL_PARAMETERS)
+    np.testing.assert_allclose(
+        rows[:, :, some].transpose(0, 2, 1) @ rows[:, :, some],
+        (design.transpose(0, 2, 1) @ design)[:, some][:, :, some],
+        rtol=1e-9,
+    )
+    np.testing.assert_allclose(np.einsum("nrp,nr->np", rows, right)[:, some], gradient[:, some], rtol=1e-9)
+    assert not np.delete(rows, some, axis=2).any()
 
 
 def test_a_component_is_what_values_and_redundancy_say() -> None:

@@ -112,6 +112,7 @@ def test_slopes_are_what_moving_the_outline_gives() -> None:
 
 
 def test_pixels_that_two_regions_share_are_the_same_pixels_in_each() -> None:
-    of_first, of_second = roi(2, 10, 6, 8).intersection(0, roi(5, 7, 9, 5), 0)
+    first = np.zeros(1, dtype=np.int64)
+    ((of_first, of_second),) = roi(2, 10, 6, 8).intersections(first, roi(5, 7, 9, 5), first)
     assert of_first == (np.s_[3:6], np.s_[0:2])
     assert of_second == (np.s_[0:3], np.s_[3:5])

@@ -46,7 +46,7 @@ def test_a_blurred_region_is_its_convolution_averaged(
             sharp.rows - radii[0], sharp.columns - radii[1], sharp.heights + 2 * radii[0], sharp.widths + 2 * radii[1]
         )
         expected = np.zeros((int(rois.heights[k]), int(rois.widths[k])))
-        source, target = around.intersection(k, rois, k)
+        ((source, target),) = around.intersections(np.array([k]), rois, np.array([k]))
         expected[target] = whole[source]
         np.testing.assert_allclose(rois.roi(blurred, k), expected, rtol=0, atol=1e-12 * whole.max())
         assert expected.any()

@@ -46,17 +46,17 @@ from estimator.pixels.camera_check import SHIFT_TOLERANCE_PX, camera_errors_by_p
 from estimator.pixels.initial import START_SIGMA_SHARE, Start, gravity_of, start_at_spots
 from estimator.pixels.led_model import (
     IMAGE_PARAMETERS,
-    MOTION_COLUMNS,
     PRINCIPAL_POINT,
     PROFILE_PARAMETERS,
     SIZE_PARAMETER,
-    rim,
+    rims,
 )
 from estimator.pixels.led_pixels import LedPixels, LedsInView, gather_led_pixels, leds_in_view
 from estimator.pixels.likelihood import Noise, fit_photometry, score
 from estimator.pixels.nuisances import NO_COMPONENTS, NO_GRAVITY, Components, Gravity, Nuisances, Priors
 from estimator.pixels.search import (
     DIVERGED,
+    MAX_LAST_PX,
     MAX_STEPS,
     RIM_POINTS,
     ScoringResult,
@@ -90,8 +90,6 @@ MAX_MODEL_ERROR_PX = 0.3
 START_COMPONENTS = Components(place_m=5e-3, size=0.01, profile=0.03)
 SIZE_TOLERANCE_PX = 0.02
 PROFILE_TOLERANCE = 3e-3
-# Images that the last step moved by less reveal what they would reveal after it: a small share of SHIFT_TOLERANCE_PX.
-MAX_LAST_PX = 3e-4
 # Probability that noise reveals one.
 REVEALED_PROBABILITY = 1e-9
 # Movement of an image above which its pixels are gathered once more.
@@ -247,29 +245,21 @@ def _revealed(
     Also the errors of the camera, as `Maximum` holds them.
     """
     pixels, result, had = found.pixels, found.last, found.components
-    if had == START_COMPONENTS or all(vars(had).values()):
+    if _has_all(had):
         return had, None
     if found.model_is_wrong:
         return START_COMPONENTS, None
     of_leds = priors.only(pixels.index)
-    of_place = priors.camera, priors.datum, priors.luminaires, had.added(priors).leds[:, :3]
-    checks_camera = frame.camera.states_no_errors and not any(part.any() for part in of_place)
-    # A shift of the principal point is one of the image.
-    shift, size = list(PRINCIPAL_POINT), [SIZE_PARAMETER]
-    profile, photometry = result.nuisances.profile(), result.photometry
-    columns = np.array(shift + size)
-    if checks_camera:
-        columns = np.concatenate([np.arange(SIZE_PARAMETER + 1), MOTION_COLUMNS[: len(priors.motion)]])
-    if result.last_px < MAX_LAST_PX:
-        rendered = result.rendered.by(columns)
-    else:
-        rendered = pixels.model.render(result.nuisances.state(result.pose, frame.camera, of_leds), columns)
-        photometry = fit_photometry(
-            pixels, rendered, result.used, Noise.of(frame, pixels.excess_e2), photometry, profile
-        )
-    information, gradient = (one[result.used] for one in score(pixels, rendered, photometry, profile))
+    scored = result.checked
+    if scored is None or result.last_px >= MAX_LAST_PX:
+        state, profile = result.nuisances.state(result.pose, frame.camera, of_leds), result.nuisances.profile()
+        rendered = pixels.model.render(state, _to_check(frame, priors, had))
+        noise = Noise.of(frame, pixels.excess_e2)
+        photometry = fit_photometry(pixels, rendered, result.used, noise, result.photometry, profile)
+        scored = score(pixels, rendered, photometry, profile)
+    information, gradient = (one[result.used] for one in scored)
     camera = None
-    if checks_camera:
+    if _checks_camera(frame, priors, had):
         camera = camera_errors_by_pixels(frame, gravity, of_leds, result, information.sum(axis=0), gradient.sum(axis=0))
     radius_px = pixels.radius_px[result.used]
 
@@ -281,13 +271,31 @@ def _revealed(
     of_priors = gravity.deviance(result.pose.rig_angles(frame.camera)) + _of_places(placed, result.used)
     ones = np.ones(len(radius_px))
     new = {}
-    if had.place_m == 0 and reveals(shift, SHIFT_TOLERANCE_PX * ones, of_priors, 2):
+    # A shift of the principal point is one of the image.
+    if had.place_m == 0 and reveals(list(PRINCIPAL_POINT), SHIFT_TOLERANCE_PX * ones, of_priors, 2):
         new["place_m"] = START_COMPONENTS.place_m
-    if had.size == 0 and reveals(size, SIZE_TOLERANCE_PX / radius_px):
+    if had.size == 0 and reveals([SIZE_PARAMETER], SIZE_TOLERANCE_PX / radius_px):
         new["size"] = START_COMPONENTS.size
     if had.profile == 0 and reveals(of_profile, PROFILE_TOLERANCE * ones):
         new["profile"] = START_COMPONENTS.profile
     return replace(had, **new), camera
+
+
+def _has_all(components: Components) -> bool:
+    """Whether there is no component that images may reveal beside these."""
+    return components == START_COMPONENTS or all(vars(components).values())
+
+
+def _checks_camera(frame: DeviceFrame, priors: Priors, components: Components) -> bool:
+    """Whether the images of a maximum check the camera: one that states no errors, beside a map that is exact."""
+    of_place = priors.camera, priors.datum, priors.luminaires, components.added(priors).leds[:, :3]
+    return frame.camera.states_no_errors and not any(part.any() for part in of_place)
+
+
+def _to_check(frame: DeviceFrame, priors: Priors, components: Components) -> Ints:
+    """Parameters of images whose score `_revealed` needs of a maximum, those to estimate among them."""
+    checked = np.arange(SIZE_PARAMETER) if _checks_camera(frame, priors, components) else np.array(PRINCIPAL_POINT)
+    return np.union1d(image_parameters(components.added(priors)), checked)
 
 
 def _differ(information: Floats, gradient: Floats, tolerance: Floats, more: float, freedom: int) -> bool:
@@ -316,6 +324,7 @@ def maximize(frame: DeviceFrame, gravity: Gravity, priors: Priors, start: Start)
     excluded = np.zeros(len(priors.leds), dtype=bool)
     max_settled_px = MAX_SETTLED_PX if priors.exact else np.inf
     wrong, settled = 0, False
+    to_check = None if _has_all(components) else _to_check(frame, priors, components)
     start_information = np.asarray(np.linalg.inv(start.covariance), dtype=np.float64)
     damping = 1.0 if _shape_sigma_px(frame, priors, start) > DAMPED_SIGMA_PX else 0.0
 
@@ -327,7 +336,8 @@ def maximize(frame: DeviceFrame, gravity: Gravity, priors: Priors, start: Start)
         pixels = gather_led_pixels(frame, in_view(), image_parameters(components.added(priors)))
         located[pixels.index] = True
         used = ~excluded[pixels.index]
-        search = Search(frame, pixels, gravity, priors.only(pixels.index), start_information, damping)
+        of_leds = priors.only(pixels.index)
+        search = Search(frame, pixels, gravity, of_leds, start_information, damping, to_check)
         result = search.run(used, pose, nuisances.only(pixels.index), components)
         if not result.converged and 2 * result.faint.sum() > used.sum():
             raise EstimationFailure("fit", FAINT)
@@ -368,7 +378,7 @@ def _shape_sigma_px(frame: DeviceFrame, priors: Priors, start: Start) -> float:
         return 0.0
     every_led = tuple(frame.leds.values())
     leds = [every_led[k] for k in located]
-    rims_m = np.stack([rim(led, RIM_POINTS) for led in leds])
+    rims_m = rims(leds, RIM_POINTS)
     state = start.nuisances.state(start.pose, frame.camera, priors).of(located)
     centres_m = np.array([led.position_m for led in leds]) + state.shifts_m
     points_m = np.concatenate([centres_m[:, None], centres_m[:, None] + rims_m], axis=1)

@@ -18,6 +18,7 @@ from estimator.pixels.led_model import LOCAL_PARAMETERS
 from estimator.pixels.nuisances import LUMINAIRE_PARAMETERS, Gravity, Nuisances, Priors
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 # Directions with less than this share of the largest information of an LED hold rounding errors alone.
 MIN_INFORMATION_SHARE = 1e-13
@@ -54,13 +55,13 @@ def _triangle(matrix: Floats) -> Floats:
     return np.asarray(np.linalg.qr(matrix, mode="r"), dtype=np.float64)
 
 
-def square_root(information: Floats, gradient: Floats) -> tuple[Floats, Floats]:
+def square_root(information: Floats, gradient: Floats, parameters: Ints) -> tuple[Floats, Floats]:
     """Rows (n, r, p) and right-hand sides (n, r) of least squares with the information (n, p, p), gradient (n, p).
 
-    There are as many rows as parameters of which any of the n has information.
+    Of the `parameters` alone: there are as many rows as those of which any of the n has information.
     """
     diagonal = np.diagonal(information, axis1=1, axis2=2)
-    informed = np.flatnonzero((diagonal > 0).any(axis=0))
+    informed = parameters[(diagonal[:, parameters] > 0).any(axis=0)]
     diagonal = diagonal[:, informed]
     scale = np.divide(1.0, np.sqrt(np.maximum(diagonal, 0.0)), out=np.zeros_like(diagonal), where=diagonal > 0)
     scaled = information[:, informed[:, None], informed] * scale[:, :, None] * scale[:, None]

@@ -140,7 +140,7 @@ def led_footprints(leds: Sequence[Led], state: ImageState) -> LedFootprints:
     """Footprints of LEDs under a state."""
     pose, camera = state.pose, state.camera
     centres_m = np.array([led.position_m for led in leds]) + state.shifts_m
-    rims_m = state.rims_m(np.stack([rim(led, COARSE_POINTS) for led in leds])) + centres_m[:, None]
+    rims_m = state.rims_m(rims(leds, COARSE_POINTS)) + centres_m[:, None]
     projected = state.project(rims_m.reshape(-1, 3))
     pixels = projected.pixels.reshape(len(leds), COARSE_POINTS, 2)
     from_above = centres_m[:, 2] <= pose.position_m[2]
@@ -168,6 +168,12 @@ def rim(led: Led, points: int) -> Floats:
     `points` is a multiple of 4.
     """
     return np.asarray(led.half_width_m * _unit_rim(led.shape, points))
+
+
+def rims(leds: Sequence[Led], points: int) -> Floats:
+    """Polygons of n faces, (n, points, 3), each as by `rim`."""
+    half_widths_m = np.array([led.half_width_m for led in leds])
+    return np.asarray(half_widths_m[:, None, None] * np.array([_unit_rim(led.shape, points) for led in leds]))
 
 
 @lru_cache(maxsize=256)
@@ -203,24 +209,47 @@ def fall_off(rois: RoiStack, centres_px: Floats, camera: Camera, factors: Ints |
     u, v = np.broadcast_to(at[:, None, :, 0], shape), np.broadcast_to(at[:, :, None, 1], shape)
     values = relative_illumination(np.column_stack([u.ravel(), v.ravel()]), camera).reshape(shape)
     values = np.nan_to_num(values / relative_illumination(centres_px, camera)[:, None, None])
-    cells = np.zeros(rois.cells())
-    for roi, value in enumerate(values):
-        columns, rows = (_interpolation(int(size), count) for size in (rois.widths[roi], rois.heights[roi]))
-        rois.roi(cells, roi)[:] = rows @ value @ columns.T
+    return _interpolated(np.ascontiguousarray(values), nodes, rois.heights, rois.widths, rois.starts)
+
+
+@compiled
+def _interpolated(values: Floats, nodes: Floats, heights: Ints, widths: Ints, starts: Ints) -> Floats:
+    """Polynomials in the pixels of n regions, (cells,), 0 beyond their ends, with `values` (n, q, q) at q x q nodes.
+
+    The `nodes` (q,) are Chebyshev's of the first kind on (-1, 1), the extent of each region.
+    """
+    cells, count = np.zeros(starts[-1]), len(nodes)
+    for k in range(len(heights)):
+        of_columns, of_rows = _lagrange(widths[k], nodes), _lagrange(heights[k], nodes)
+        for row in range(heights[k]):
+            first = starts[k] + row * (widths[k] + 1)
+            line = cells[first : first + widths[k]]
+            for q in range(count):
+                weight, polynomial = 0.0, of_columns[q]
+                for p in range(count):
+                    weight += of_rows[p, row] * values[k, p, q]
+                for i in range(len(line)):
+                    line[i] += weight * polynomial[i]
     return cells
 
 
-@lru_cache(maxsize=512)
-def _interpolation(pixels: int, nodes: int) -> Floats:
-    """Lagrange's polynomials of Chebyshev nodes at the centres of pixels along a line, (pixels, nodes)."""
-    k = np.arange(nodes)
-    # Barycentric weights of Chebyshev's first-kind nodes.
-    barycentric = (-1.0) ** k * np.sin(np.pi * (k + 0.5) / nodes)
-    offset = ((2 * np.arange(pixels) + 1) / pixels - 1)[:, None] - np.cos(np.pi * (k + 0.5) / nodes)
-    on_node = np.abs(offset) < 1e-14
-    weights = barycentric / np.where(on_node, 1.0, offset)
-    weights = np.where(on_node.any(axis=1, keepdims=True), on_node, weights)
-    return np.asarray(weights / weights.sum(axis=1, keepdims=True))
+@compiled
+def _lagrange(pixels: int, nodes: Floats) -> Floats:
+    """Lagrange's polynomials of Chebyshev nodes (q,) at the centres of pixels along a line, (q, pixels)."""
+    weights = np.empty((len(nodes), pixels))
+    for pixel in range(pixels):
+        at, total, on_node = (2 * pixel + 1) / pixels - 1, 0.0, -1
+        for k in range(len(nodes)):
+            if abs(at - nodes[k]) < 1e-14:
+                on_node = k
+        for k in range(len(nodes)):
+            # Barycentric weights of Chebyshev's first-kind nodes: alternating sines of the nodes' angles.
+            weight = np.sqrt(1 - nodes[k] * nodes[k]) * (1 - 2 * (k % 2)) / (at - nodes[k])
+            weights[k, pixel] = weight if on_node < 0 else 1.0 if k == on_node else 0.0
+            total += weights[k, pixel]
+        for k in range(len(nodes)):
+            weights[k, pixel] /= total
+    return weights
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from estimator.compiled import compiled
 from estimator.errors import EstimationFailure
-from estimator.io.device import DeviceFrame, LineGains, Part
+from estimator.io.device import DeviceFrame, LineGains
 from estimator.io.led_map import Led, led_arrays
 from estimator.pixels.led_model import (
     POSE_ALONE,
@@ -39,6 +39,7 @@ from estimator.pixels.readings import (
     sorted_pixels,
 )
 from estimator.spots.excess_noise import excess_noise_e2
+from estimator.spots.lamps import readouts_of
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -185,10 +186,11 @@ def gather_led_pixels(frame: DeviceFrame, view: LedsInView, parameters: Ints = P
     known_share = known_shares(pixels.share, known, rois.heights, rois.widths, rois.starts)
     saturated = ~(known_share > MIN_KNOWN_SHARE)
     left_out = saturated & ~saturated.all()
-    for k, other in rois.meeting(rois):
-        if other != k and not left_out[k]:
-            own, its = rois.intersection(k, rois, other)
-            rois.roi(known, k)[own] &= ~rois.roi(pixels.lit, other)[its]
+    own, other = rois.meeting(rois)
+    beside = (own != other) & ~left_out[own]
+    own, other = own[beside], other[beside]
+    for k, its, (here, there) in zip(own.tolist(), other.tolist(), rois.intersections(own, rois, other), strict=True):
+        rois.roi(known, k)[here] &= ~rois.roi(pixels.lit, its)[there]
     lines = _lines(frame, leds, rois)
     edge, inside = known & pixels.edge & pixels.near, known & ~pixels.edge & (pixels.share > 0.5)
     faces = Faces(footprints.centre, footprints.to_face, model.fall_off)
@@ -306,12 +308,13 @@ def _rois(frame: DeviceFrame, footprints: LedFootprints, margin_px: int) -> RoiS
 
 def _readings(frame: DeviceFrame, rois: RoiStack) -> tuple[NDArray[np.float32], Mask]:
     """Electrons in the cells of regions, (cells,), and which of them are known: read out and not saturated."""
-    image_dn, read_out = np.zeros(rois.cells(), dtype=np.uint32), np.zeros(rois.cells(), dtype=bool)
-    first = np.array([(part.row, part.column) for part in frame.parts])
-    parts = RoiStack(*first.T, *np.array([part.image_dn.shape for part in frame.parts]).T)
-    for number, k in parts.meeting(rois):
-        source, target = parts.intersection(number, rois, k)
-        rois.roi(image_dn, k)[target] = frame.parts[number].image_dn[source]
-        rois.roi(read_out, k)[target] = True
-    cells = Part(0, 0, image_dn)
-    return frame.electrons(cells), read_out & ~frame.clipped(cells)
+    electrons, known = np.zeros(rois.cells(), dtype=np.float32), np.zeros(rois.cells(), dtype=bool)
+    readouts = readouts_of(frame)
+    first = np.array([(readout.row, readout.column) for readout in readouts])
+    regions = RoiStack(*first.T, *np.array([readout.raw_e.shape for readout in readouts]).T)
+    numbers, own = regions.meeting(rois)
+    boxes = regions.intersections(numbers, rois, own)
+    for number, k, (source, target) in zip(numbers.tolist(), own.tolist(), boxes, strict=True):
+        rois.roi(electrons, k)[target] = readouts[number].raw_e[source]
+        np.logical_not(readouts[number].clipped[source], out=rois.roi(known, k)[target])
+    return electrons, known

@@ -150,6 +150,8 @@ class Components:
 
     def added(self, stated: Priors) -> Priors:
         """Priors with both."""
+        if self == NO_COMPONENTS:
+            return stated
         extra = np.array([self.place_m] * 3 + [self.size] + [0.0] * 2 + [self.profile] * PROFILE_PARAMETERS)
         leds = np.hypot(stated.leds, extra)
         if self.place_m > 0:
@@ -225,8 +227,7 @@ class Nuisances:
     def standardized(self, priors: Priors) -> "Nuisances":
         """These in standard deviations of their priors; 0 for what is known exactly."""
         sigmas = (priors.camera, priors.datum, priors.luminaires, priors.leds, priors.motion)
-        pairs = zip(vars(self).values(), sigmas, strict=True)
-        return Nuisances(*(np.divide(v, s, out=np.zeros_like(v), where=s > 0) for v, s in pairs))
+        return Nuisances(*(_ratio(v, s) for v, s in zip(vars(self).values(), sigmas, strict=True)))
 
     def deviance(self, priors: Priors) -> float:
         """Sum of squares in standard deviations: minus twice the logarithm of the prior."""
@@ -249,6 +250,13 @@ class Nuisances:
         sizes, tilts = 1 + self.leds[:, SIZE], self.leds[:, TILTS]
         velocity = priors.velocity + self.motion if len(self.motion) else None
         return ImageState(pose, with_errors(camera, self.camera), self.shifts_m(priors), sizes, tilts, velocity)
+
+
+def _ratio(values: Floats, sigmas: Floats) -> Floats:
+    """Values in standard deviations, 0 where these are."""
+    if not values.any():
+        return values
+    return np.divide(values, sigmas, out=np.zeros_like(values), where=sigmas > 0)
 
 
 @dataclass(frozen=True, eq=False)

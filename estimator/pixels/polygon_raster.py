@@ -19,6 +19,8 @@ from estimator.compiled import compiled
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 T = TypeVar("T", bound=np.generic)
+Box = tuple[slice, slice]
+"""Rows and columns of a region."""
 
 # Shorter than a pixel, so that an edge crosses at most one line between rows and one between columns.
 MAX_EDGE_PX = 0.75
@@ -70,30 +72,30 @@ class RoiStack:
         row, column = np.divmod(cell - self.starts[roi], self.widths[roi] + 1)
         return row + self.rows[roi], column + self.columns[roi]
 
-    def meeting(self, others: "RoiStack") -> list[tuple[int, int]]:
-        """Pairs of a region of this stack and one of another that share pixels."""
+    def meeting(self, others: "RoiStack") -> tuple[Ints, Ints]:
+        """Pairs of a region of this stack and one of another that share pixels, by their numbers, (pairs,) each."""
         shared = np.ones((len(self.rows), len(others.rows)), dtype=bool)
         for first, size, other_first, other_size in (
             (self.rows, self.heights, others.rows, others.heights),
             (self.columns, self.widths, others.columns, others.widths),
         ):
             shared &= (first[:, None] < other_first + other_size) & (first[:, None] + size[:, None] > other_first)
-        return list(zip(*(index.tolist() for index in np.nonzero(shared)), strict=True))
+        own, other = np.nonzero(shared)
+        return own, other
 
-    def intersection(self, k: int, others: "RoiStack", other: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-        """The pixels that region k shares with one of another stack, as (rows, columns) slices of each."""
-        own, its = self._spans(k), others._spans(other)
-        shared = [(max(a[0], b[0]), min(a[1], b[1])) for a, b in zip(own, its, strict=True)]
-        (rows, columns), (other_rows, other_columns) = (
-            [slice(low - span[0], high - span[0]) for span, (low, high) in zip(spans, shared, strict=True)]
-            for spans in (own, its)
-        )
-        return (rows, columns), (other_rows, other_columns)
-
-    def _spans(self, k: int) -> tuple[tuple[int, int], tuple[int, int]]:
-        """First row and the row after the last of region k, and its columns."""
-        top, left = int(self.rows[k]), int(self.columns[k])
-        return (top, top + int(self.heights[k])), (left, left + int(self.widths[k]))
+    def intersections(self, own: Ints, others: "RoiStack", other: Ints) -> list[tuple[Box, Box]]:
+        """The pixels that regions of this stack share with those of another, pair by pair, as slices of each."""
+        ends = []
+        for first, size, other_first, other_size in (
+            (self.rows[own], self.heights[own], others.rows[other], others.heights[other]),
+            (self.columns[own], self.widths[own], others.columns[other], others.widths[other]),
+        ):
+            low, high = np.maximum(first, other_first), np.minimum(first + size, other_first + other_size)
+            ends += [low - first, high - first, low - other_first, high - other_first]
+        return [
+            ((slice(top, bottom), slice(left, right)), (slice(its_top, its_bottom), slice(its_left, its_right)))
+            for top, bottom, its_top, its_bottom, left, right, its_left, its_right in np.transpose(ends).tolist()
+        ]
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -44,18 +43,49 @@ def sorted_pixels(rois: RoiStack, light: Floats, fall_off: Floats) -> SortedPixe
         share = light / fall_off
     lit = share > UNIFORM_TOLERANCE
     partly_lit = lit & (share < 1 - UNIFORM_TOLERANCE)
-    edge, may_be_lit, near = (
-        _dilated(rois, mask, px) for mask, px in ((partly_lit, EDGE_PX), (lit, EDGE_PX), (lit, NEAR_PX))
-    )
-    return SortedPixels(share, edge, may_be_lit, near)
+    near = _widened(rois, lit, NEAR_PX)
+    may_be_lit = _widened(rois, near, EDGE_PX - NEAR_PX)
+    return SortedPixels(share, _widened(rois, partly_lit, EDGE_PX), may_be_lit, near)
 
 
-def _dilated(rois: RoiStack, mask: Mask, by_px: int) -> Mask:
+def _widened(rois: RoiStack, mask: Mask, by_px: int) -> Mask:
     """Cells (cells,) of each region that are at most `by_px` from one of a mask, along rows and along columns."""
-    square, dilated = np.ones((2 * by_px + 1, 2 * by_px + 1), dtype=np.uint8), np.zeros(len(mask), dtype=bool)
-    for k in range(len(rois.rows)):
-        rois.roi(dilated, k)[:] = cv2.dilate(rois.roi(mask.view(np.uint8), k), square)
-    return dilated
+    for _ in range(by_px):
+        mask = _with_neighbours(mask.view(np.uint8), rois.heights, rois.widths, rois.starts).view(np.bool_)
+    return mask
+
+
+@compiled
+def _with_neighbours(mask: NDArray[np.uint8], heights: Ints, widths: Ints, starts: Ints) -> NDArray[np.uint8]:
+    """Cells (cells,) that are 1 in a mask, and their up to eight neighbours in the same region.
+
+    The cells beyond the regions' ends, set to 0, part a row from the next.
+    """
+    mask = mask.copy()
+    _clear_ends(mask, heights, widths, starts)
+    along = mask.copy()
+    before, own, after = mask[:-2], along[1:-1], mask[2:]
+    for i in range(len(own)):
+        own[i] |= before[i] | after[i]
+    wide = along.copy()
+    for k in range(len(heights)):
+        region, stride = slice(starts[k], starts[k + 1]), widths[k] + 1
+        above, below = along[region][:-stride], along[region][stride:]
+        upper, lower = wide[region][:-stride], wide[region][stride:]
+        for i in range(len(above)):
+            lower[i] |= above[i]
+        for i in range(len(above)):
+            upper[i] |= below[i]
+    _clear_ends(wide, heights, widths, starts)
+    return wide
+
+
+@compiled
+def _clear_ends(mask: NDArray[np.uint8], heights: Ints, widths: Ints, starts: Ints) -> None:
+    """Set the cells beyond the regions' ends to 0."""
+    for k in range(len(heights)):
+        for row in range(heights[k]):
+            mask[starts[k] + row * (widths[k] + 1) + widths[k]] = 0
 
 
 @compiled
@@ -66,10 +96,11 @@ def known_shares(share: Floats, known: Mask, heights: Ints, widths: Ints, starts
         inside, both = 0, 0
         for row in range(heights[k]):
             first = starts[k] + row * (widths[k] + 1)
-            for cell in range(first, first + widths[k]):
-                if share[cell] > 1 - UNIFORM_TOLERANCE:
-                    inside += 1
-                    both += known[cell]
+            line, known_line = share[first : first + widths[k]], known[first : first + widths[k]]
+            for i in range(len(line)):
+                is_inside = line[i] > 1 - UNIFORM_TOLERANCE
+                inside += is_inside
+                both += is_inside & known_line[i]
         if inside > 0:
             shares[k] = both / inside
     return shares

@@ -35,6 +35,8 @@ class RegionBlur:
         self._blurred = RoiStack(
             sharp.rows - rows, sharp.columns - columns, sharp.heights + 2 * rows, sharp.widths + 2 * columns
         )
+        every = np.arange(len(kernels))
+        self._shared = self._blurred.intersections(every, rois, every)
 
     def __call__(self, image: Floats) -> Floats:
         """Blurred image in the cells of `rois` by one in those of `fine`."""
@@ -45,7 +47,7 @@ class RegionBlur:
             height, width = region.shape
             phases = region.reshape(height // factor, factor, width // factor, factor).transpose(1, 3, 0, 2)
             product = (rfft2(phases, self._shape(k)) * spectrum).sum(axis=(0, 1))
-            source, target = self._blurred.intersection(k, self._rois, k)
+            source, target = self._shared[k]
             self._rois.roi(blurred, k)[target] = irfft2(product, self._shape(k))[source]
         return blurred
 

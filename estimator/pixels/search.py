@@ -11,13 +11,15 @@ from estimator.io.device import DeviceFrame
 from estimator.pixels.elimination import Solution, solve, square_root
 from estimator.pixels.initial import CONVERGED_STEP2, tuned
 from estimator.pixels.led_model import (
+    IMAGE_PARAMETERS,
     MOTION_COLUMNS,
     POSE_ALONE,
+    PROFILE_PARAMETERS,
     SIZE_PARAMETER,
     TILT_PARAMETERS,
     ImageState,
     RenderedLeds,
-    rim,
+    rims,
 )
 from estimator.pixels.led_pixels import LedPixels
 from estimator.pixels.likelihood import Noise, PhotometricFit, excess_chi2, fit_photometry, score
@@ -36,10 +38,17 @@ Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 MAX_STEPS = 40
+# Images that a step moves by less are next to those after it: a small share of the shift that `camera_check` tolerates.
+MAX_LAST_PX = 3e-4
+# A step of up to a third of a standard deviation, squared, is the last where it moves no image by more, and where it is
+# a tenth of the one before: a tenth of it is left.
+MAX_LAST_STEP2, MAX_LAST_RATIO2, MAX_LEFT_PX = 0.1, 0.01, 1e-4
 # A search that ends by the number of its steps has converged if they are shorter than a standard deviation, squared.
 MAX_CIRCLE2 = 1.0
 # Points of a rim whose movement is looked at.
 RIM_POINTS = 4
+# After a step that moves images by less, the next is mostly the last: the score is then by the parameters to check too.
+NEARLY_AT_MAXIMUM_PX = 0.1
 # With nuisances a step of the pose may be short while LEDs still move in their images: no rim may move by more. Smaller
 # than the shift that `likelihood` tolerates in an LED's chi-square.
 CONVERGED_PX = 0.02
@@ -80,7 +89,8 @@ class ScoringResult:
     `converged` says whether the maximum was reached, and not the limit of validity of the gathered pixels. `used`,
     `faint` (used, but with a low signal-to-noise ratio) and `excess` (of chi-square over its limit) are by LED, (n,).
     `moved_px` is the largest movement of an image since its pixels were gathered, `damping` that of the next step.
-    `rendered` are the images before the last step, which moved them by `last_px` at most.
+    `checked` are information and gradient (see `likelihood.score`) before the last step, which moved images by
+    `last_px` at most, by the parameters to check; None where these were not found.
     """
 
     pose: Pose
@@ -94,12 +104,15 @@ class ScoringResult:
     excess: Floats
     moved_px: float
     damping: float
-    rendered: RenderedLeds
+    checked: tuple[Floats, Floats] | None
     last_px: float
 
 
 class Search:
-    """Fisher scoring with the readings around LEDs; `priors` are those of the LEDs."""
+    """Fisher scoring with the readings around LEDs; `priors` are those of the LEDs.
+
+    `to_check` are parameters, those to estimate among them, whose score at the maximum is wanted, with the profile's.
+    """
 
     def __init__(
         self,
@@ -109,6 +122,7 @@ class Search:
         priors: Priors,
         start_information: Floats,
         damping: float,
+        to_check: Ints | None = None,
     ) -> None:
         """Prepare a search; `start_information` (6, 6) is that of the initial pose, which `damping` times holds it."""
         self._camera = frame.camera
@@ -118,8 +132,9 @@ class Search:
         self._noise = Noise.of(frame, pixels.excess_e2)
         self._start_information = start_information
         self._first_damping = damping
+        self._to_check = to_check
         # Of a large LED, a point of the rim moves more than the centre.
-        self._rims_m = np.stack([rim(led, RIM_POINTS) for led in pixels.leds])
+        self._rims_m = rims(pixels.leds, RIM_POINTS)
         self._centres_m = np.array([led.position_m for led in pixels.leds])
         self._origin_px = self._rims_px(pixels.state)
 
@@ -132,6 +147,7 @@ class Search:
         photometry: PhotometricFit | None = None
         factor, accepted, min_deviance = 1.0, (pose, nuisances), np.inf
         step: Solution | None = None
+        checked, moved_px, length2 = None, np.inf, 0.0
         damping, shortened, steps = self._first_damping, 0, 0
         for _ in range(MAX_STEPS):
             state = nuisances.state(pose, camera, priors)
@@ -154,7 +170,15 @@ class Search:
                 pose, nuisances = self._moved(accepted, step, factor)
                 continue
             photometry, accepted, shortened, steps = candidate, (pose, nuisances), 0, steps + 1
-            rows, right = square_root(*score(pixels, rendered, photometry, profile))
+            estimated = rendered.parameters
+            if profile is not None:
+                estimated = np.concatenate([estimated, IMAGE_PARAMETERS + np.arange(PROFILE_PARAMETERS)])
+            checked = None
+            if self._to_check is not None and moved_px < NEARLY_AT_MAXIMUM_PX:
+                of_images = checked = score(pixels, rendered.by(self._to_check), photometry, nuisances.profile())
+            else:
+                of_images = score(pixels, rendered, photometry, profile)
+            rows, right = square_root(*of_images, estimated)
             before = step
             if damping > 0:
                 held = damping * self._start_information
@@ -174,7 +198,9 @@ class Search:
                 factor *= pixels.max_move_px / moved_px
                 pose, nuisances = self._moved(accepted, step, factor)
                 rims_px = self._rims_px(nuisances.state(pose, camera, priors))
-            converged = step.step2 * factor**2 < CONVERGED_STEP2 and short and damping == 0
+            before2, length2 = length2, step.step2 * factor**2
+            ends = moved_px < MAX_LEFT_PX and length2 < min(MAX_LAST_STEP2, MAX_LAST_RATIO2 * before2)
+            converged = (length2 < CONVERGED_STEP2 or ends) and short and damping == 0
             converged &= priors.exact or moved_px < CONVERGED_PX
             if damping > 0:
                 damping *= DAMPING_RATIO ** (-1 if short else moved_px > 4 * pixels.max_move_px)
@@ -209,7 +235,7 @@ class Search:
             excess=excess,
             moved_px=off_px,
             damping=damping,
-            rendered=rendered,
+            checked=checked,
             last_px=moved_px,
         )
 
