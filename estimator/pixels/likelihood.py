@@ -105,15 +105,17 @@ class Noise:
 class PhotometricFit:
     """Amplitudes and backgrounds of g groups given the image, and the m readings expected by them.
 
-    `basis` (m, c) are the derivatives of the readings by a group's c = 5 coefficients, four of the background and its
-    amplitude, and where LEDs send by a sixth, the amplitude times a change of the phase;
-    `amplitude`, `background` (by the face) and `signal_to_noise` are (g,); `expected` (m,) are electrons; `weight` (m,)
-    is 1 / variance, 0 for readings not used; `covariance` (g, c, c) is that of the coefficients, 0 if the readings do
-    not determine them; `level` (g,) is the scale of the background's prior; `deviance` is the mean over the readings of
-    twice the log likelihood ratio of a saturated model, expected to be near 1. Where LEDs send, `phase` (g,) are the
-    errors of their waves' phases, in lines, and `gain` (m,) the gains by which the light of the readings is multiplied.
+    `light` (m,) is that of the image, of an even face; `basis` (m, c) are the derivatives of the readings by a
+    group's c = 5 coefficients, four of the background and its amplitude, and where LEDs send by a sixth, the
+    amplitude times a change of the phase; `amplitude`, `background` (by the face) and `signal_to_noise` are (g,);
+    `expected` (m,) are electrons; `weight` (m,) is 1 / variance, 0 for readings not used; `covariance` (g, c, c) is
+    that of the coefficients, 0 if the readings do not determine them; `level` (g,) is the scale of the background's
+    prior; `deviance` is the mean over the readings of twice the log likelihood ratio of a saturated model, expected
+    to be near 1. Where LEDs send, `phase` (g,) are the errors of their waves' phases, in lines, and `gain` (m,) the
+    gains by which the light of the readings is multiplied.
     """
 
+    light: Floats
     basis: Floats
     amplitude: Floats
     background: Floats
@@ -142,7 +144,7 @@ def fit_photometry(
     luminance, 0 if None. Readings that the previous fit did not use may enter if `may_enter`, and else may only leave.
     """
     n, y, group, starts = pixels.pixel_counts, pixels.electrons, pixels.group, pixels.starts
-    light = pixels.light(rendered)
+    light = of_image = pixels.light(rendered)
     if profile is not None:
         light = light * pixels.brightness(profile)
     unlit = light < MAX_UNLIT_SHARE * pixels.background[:, 0]
@@ -195,6 +197,7 @@ def fit_photometry(
     signal_to_noise = np.divide(amplitude, sigma, out=np.zeros_like(sigma), where=sigma > 0)
     deviance = _mean_deviance(y, expected, n * noise.dark_e2, weight > 0)
     return PhotometricFit(
+        of_image,
         basis.T,
         amplitude,
         coefficients[:, 0],
@@ -268,12 +271,15 @@ def _expected(
     readings = len(pixel_counts)
     expected, per_pixel, variance = np.zeros(readings), np.empty(readings), np.empty(readings)
     for g in range(len(starts) - 1):
+        group, floor_e = slice(starts[g], starts[g + 1]), floors_e[g]
+        total, lit, noise, counts = expected[group], per_pixel[group], variance[group], pixel_counts[group]
         for a in range(len(basis)):
-            for i in range(starts[g], starts[g + 1]):
-                expected[i] += coefficients[g, a] * basis[a, i]
-        for i in range(starts[g], starts[g + 1]):
-            lit = max(expected[i] / pixel_counts[i], floors_e[g])
-            per_pixel[i], variance[i] = lit, lit + dark_e2 + prnu2 * lit * lit
+            coefficient, one = coefficients[g, a], basis[a, group]
+            for i in range(len(one)):
+                total[i] += coefficient * one[i]
+        for i in range(len(counts)):
+            lit[i] = max(total[i] / counts[i], floor_e)
+            noise[i] = lit[i] + dark_e2 + prnu2 * lit[i] * lit[i]
     return expected, per_pixel, variance
 
 
@@ -321,11 +327,11 @@ def score(
     at_edges, slopes = rendered.places_of_slopes(pixels.cells)
     place = np.full(len(pixels.electrons), -1)
     place[pixels.edges] = at_edges
-    columns, shape = rendered.parameters, np.empty((0, len(place)))
-    factor = np.ones(len(place)) if photometry.gain is None else photometry.gain
+    columns, face = rendered.parameters, pixels.face[:, :0]
+    light, factor = photometry.light, np.ones(len(place)) if photometry.gain is None else photometry.gain
     if profile is not None:
-        light = pixels.light(rendered) * factor
-        shape = np.ascontiguousarray((pixels.face * light[:, None]).T)
+        face = pixels.face
+        light = light if photometry.gain is None else light * photometry.gain
         factor = factor * pixels.brightness(profile)
         columns = np.concatenate([columns, IMAGE_PARAMETERS + np.arange(PROFILE_PARAMETERS)])
     in_motion = bool((columns >= LOCAL_PARAMETERS).any())
@@ -335,7 +341,7 @@ def score(
     off_e = pixels.electrons - photometry.expected
     fit = np.ascontiguousarray(photometry.basis.T), off_e, photometry.weight
     # By the parameters, by the coefficients, and the gradient: (g, p, p + c + 1).
-    products, count = _products(pixels.starts, slopes, place, factor, shape, *fit), len(columns)
+    products, count = _products(pixels.starts, slopes, place, factor, face, light, *fit), len(columns)
     own, mixed = products[:, :, :count], products[:, :, count:-1]
     # Less what a change of amplitude and background makes up for.
     own = own - mixed @ photometry.covariance @ mixed.transpose(0, 2, 1)
@@ -354,7 +360,8 @@ def _products(
     slopes: Floats,
     place: Ints,
     factor: Floats,
-    shape: Floats,
+    face: Floats,
+    light: Floats,
     basis: Floats,
     off_e: Floats,
     weight: Floats,
@@ -363,42 +370,52 @@ def _products(
 
     The products are with these, with the derivatives by c coefficients, `basis` (c, m), and with what a reading is off,
     `off_e` (m,). A reading that changes as images move has derivatives at its `place` (m,) in `slopes` (s, q), times
-    its `factor` (m,); one that does not has the place -1. By the face's profile it has those of `shape` (r, m), (0, m)
-    for none: p = q + r.
+    its `factor` (m,); one that does not has the place -1. By the face's profile it has those of `face` (m, r), (m, 0)
+    for none, times its `light` (m,): p = q + r.
     """
-    of_image, of_shape = slopes.shape[1], len(shape)
-    count, width = of_image + of_shape, of_image + of_shape + len(basis) + 1
-    products = np.zeros((len(starts) - 1, count, width))
+    of_image, of_face, of_basis = slopes.shape[1], face.shape[1], len(basis)
+    count, others = of_image + of_face, of_face + of_basis + 1
+    products = np.zeros((len(starts) - 1, count, of_image + others))
     for g in range(len(starts) - 1):
-        # Those that move first, then the others, which the profile alone changes.
-        for moving in (True, False):
-            start = 0 if moving else of_image
-            if start == count:
-                continue
-            used = 0
-            for i in range(starts[g], starts[g + 1]):
-                used += weight[i] > 0 and (place[i] >= 0) == moving
-            # Times the square root of the weight; a derivative after another in memory.
-            design, n = np.empty((width, used)), 0
-            for i in range(starts[g], starts[g + 1]):
-                if not (weight[i] > 0 and (place[i] >= 0) == moving):
-                    continue
-                root = math.sqrt(weight[i])
-                for a in range(start, of_image):
-                    design[a, n] = root * factor[i] * slopes[place[i], a]
-                for a in range(of_shape):
-                    design[of_image + a, n] = root * shape[a, i]
-                for a in range(len(basis)):
-                    design[count + a, n] = root * basis[a, i]
-                design[width - 1, n] = root * off_e[i]
-                n += 1
-            for a in range(start, count):
-                first = design[a]
-                for b in range(a, width):
-                    second, total = design[b], 0.0
-                    for i in range(used):
-                        total += first[i] * second[i]
-                    products[g, a, b] += total
+        first, size = starts[g], starts[g + 1] - starts[g]
+        readings = slice(first, first + size)
+        # All is times the square root of the weight; a derivative after another in memory.
+        root, of_light = np.sqrt(weight[readings]), light[readings]
+        every = np.empty((others, size))
+        for a in range(of_face):
+            one, of_one = every[a], face[readings, a]
+            for i in range(size):
+                one[i] = root[i] * of_light[i] * of_one[i]
+        for a in range(of_basis + 1):
+            one, of_one = every[of_face + a], basis[a, readings] if a < of_basis else off_e[readings]
+            for i in range(size):
+                one[i] = root[i] * of_one[i]
+        moving, moved = np.empty(size, dtype=np.int64), 0
+        for i in range(size):
+            moving[moved] = i
+            moved += root[i] > 0 and place[first + i] >= 0
+        design = np.empty((of_image + others, moved))
+        for n in range(moved):
+            i = moving[n]
+            change, at = root[i] * factor[first + i], place[first + i]
+            for a in range(of_image):
+                design[a, n] = change * slopes[at, a]
+        for a in range(others):
+            one, of_one = design[of_image + a], every[a]
+            for n in range(moved):
+                one[n] = of_one[moving[n]]
+        for a in range(of_image):
+            for b in range(a, of_image + others):
+                one, other, total = design[a], design[b], 0.0
+                for n in range(moved):
+                    total += one[n] * other[n]
+                products[g, a, b] = total
+        for a in range(of_face):
+            for b in range(a, others):
+                one, other, total = every[a], every[b], 0.0
+                for i in range(size):
+                    total += one[i] * other[i]
+                products[g, of_image + a, of_image + b] = total
         for a in range(count):
             for b in range(a):
                 products[g, a, b] = products[g, b, a]
