@@ -271,9 +271,18 @@ def relative_illumination(pixels: Floats, camera: Camera) -> Floats:
     projection = projection_of(camera)
     rays = projection.unproject(camera.normalized(pixels))
     jacobian = projection.project(rays)[1]
-    with np.errstate(all="ignore"):
-        area = np.abs((np.cross(jacobian[:, 0], jacobian[:, 1]) * rays).sum(axis=1))
-        return np.asarray(np.maximum(rays[:, 2], 0.0) / area)
+    return _foreshortened(compact(jacobian), compact(rays))
+
+
+@compiled
+def _foreshortened(jacobian: Floats, rays: Floats) -> Floats:
+    """Of unit vectors (n, 3), the cosine to the axis over the area of the parallelepiped with the rows m1, m2, (n,)."""
+    values = np.empty(len(rays))
+    for i in range(len(rays)):
+        (a, b, c), (d, e, f), (x, y, z) = jacobian[i, 0], jacobian[i, 1], rays[i]
+        volume = (b * f - c * e) * x + (c * d - a * f) * y + (a * e - b * d) * z
+        values[i] = max(z, 0.0) / abs(volume)
+    return values
 
 
 def rotation_axes(pose: Pose, camera: Camera) -> Floats:

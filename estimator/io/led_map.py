@@ -195,7 +195,8 @@ class LedArrays:
     """What the n LEDs of a map are, in its order.
 
     `positions_m` (n, 3), world metres; `half_widths_m` (n,), NaN where the map does not say the size; `sigmas` (n, 6)
-    as `Led.sigmas` has them; `luminaires` (n,) ids, -1 for none. `have_sizes` says whether all have one.
+    as `Led.sigmas` has them; `luminaires` (n,) ids, -1 for none. `have_sizes` says whether all have one. `numbers` are
+    those of the LEDs in the arrays, by id.
     """
 
     positions_m: Floats
@@ -203,6 +204,7 @@ class LedArrays:
     sigmas: Floats
     luminaires: NDArray[np.int64]
     have_sizes: bool
+    numbers: Mapping[int, int]
 
 
 class LedMap(dict[int, AnyLed]):
@@ -226,6 +228,7 @@ def _arrays(leds: Sequence[Led]) -> LedArrays:
         sigmas=np.array([led.sigmas() for led in leds]).reshape(-1, 6),
         luminaires=np.array([-1 if led.luminaire is None else led.luminaire for led in leds], dtype=np.int64),
         have_sizes=all(led.has_size for led in leds),
+        numbers={led.id: k for k, led in enumerate(leds)},
     )
 
 

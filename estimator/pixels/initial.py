@@ -10,6 +10,7 @@ from estimator.camera.intrinsics import intrinsic_slopes_px, with_errors
 from estimator.camera.leveling import tilt_from_gravity, tilt_sigmas
 from estimator.camera.pose import POSE_PARAMETERS, Pose
 from estimator.io.device import DeviceFrame
+from estimator.io.led_map import led_arrays
 from estimator.pixels.elimination import Solution, solve
 from estimator.pixels.led_model import (
     COARSE_POINTS,
@@ -85,7 +86,7 @@ def start_at_spots(
     `priors` are of all LEDs of the map. Where LEDs are not where the map says, their images then are where their spots
     are. Raises EstimationFailure if the spots do not determine a pose.
     """
-    number = {led: k for k, led in enumerate(frame.leds)}
+    number = led_arrays(frame.leds).numbers
     index = np.array([number[one.led.id] for one in spots], dtype=np.int64)
     of_spots, nuisances = priors.only(index), Nuisances.zero(priors).only(index)
     lift_m2 = np.array([4 * one.led.mean_square_extent_m2 for one in spots])
@@ -156,7 +157,7 @@ def tuned(
 ) -> tuple[Components, Solution]:
     """Components of the LEDs used, (n,), that agree with the step they lead to, and that step; see `solve`."""
     solution = solve(rows, right, components.added(stated), now, gravity, angles)
-    for _ in range(MAX_TUNING):
+    for _ in range(0 if components == NO_COMPONENTS else MAX_TUNING):
         new = components.updated(stated, now.moved(solution.step), solution.redundancy, used)
         if not new.differs(components):
             break

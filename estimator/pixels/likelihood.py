@@ -422,14 +422,13 @@ def _products(
     return products
 
 
-def excess_chi2(pixels: LedPixels, rendered: RenderedLeds, photometry: PhotometricFit) -> Floats:
+def excess_chi2(pixels: LedPixels, photometry: PhotometricFit) -> Floats:
     """Excess of each group's chi-square, (g,), over its limit: positive for an LED that the model does not explain."""
-    weight, edges = photometry.weight, pixels.edges
+    weight = photometry.weight
     chi2 = pixels.sum_by_group((pixels.electrons - photometry.expected) ** 2 * weight)
     freedom = np.maximum(pixels.sum_by_group((weight > 0).astype(float)) - photometry.basis.shape[1], 0.0)
     # The model error is largest at the edge: 4 share (1 - share) is 1 at half coverage and 0 on uniform pixels.
-    share = np.zeros(len(weight))
-    share[edges] = rendered.light[pixels.cells] / pixels.background[edges, 0]
+    share = photometry.light / pixels.background[:, 0]
     model_error_e = MODEL_ERROR_SHARE * photometry.amplitude[pixels.group] * 4 * share * (1 - share)
     if photometry.gain is not None:
         model_error_e *= photometry.gain

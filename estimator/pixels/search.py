@@ -219,9 +219,7 @@ class Search:
         count = len(pixels.leds)
         max_signal_to_noise = np.zeros(count)
         np.maximum.at(max_signal_to_noise, pixels.led, photometry.signal_to_noise)
-        excess: Floats = np.asarray(
-            np.bincount(pixels.led, excess_chi2(pixels, rendered, photometry), count), dtype=np.float64
-        )
+        excess: Floats = np.asarray(np.bincount(pixels.led, excess_chi2(pixels, photometry), count), dtype=np.float64)
         faint = used & (max_signal_to_noise < MIN_SIGNAL_TO_NOISE)
         return ScoringResult(
             pose=pose,
