@@ -29,10 +29,11 @@ import numpy as np
 from target import Targets, alternating_s, peer, ratio
 
 import estimator.spots.correspondences
-from estimator.evaluate.batch import estimate_dataset, estimate_frame
+from estimator.evaluate.batch import estimate_burst, estimate_dataset, estimate_frame
 from estimator.evaluate.memory import keep_freed_memory
 from estimator.io.dataset import Dataset, read_dataset, read_frame
 from estimator.io.device import DeviceFrame
+from estimator.io.shared import SharedResults
 from estimator.methods.catalogue import VARIANTS
 from estimator.methods.gravity_fit import fit_correspondences
 from estimator.methods.variant import Variant
@@ -78,7 +79,7 @@ def stages_ms(folder: Path, name: str) -> np.ndarray:
         tries = []
         for _ in range(TRIES):
             start = time.process_time()
-            frame = read_frame(dataset, record)
+            frame = replace(read_frame(dataset, record), shared=SharedResults())
             read_s = time.process_time() - start
             clock.seconds = 0.0
             estimator.spots.correspondences.detect = clock
@@ -98,7 +99,7 @@ def frames_per_s(folder: Path, name: str, first: int) -> float:
     chosen = dataset.frames[first::WORKERS]
     start = time.perf_counter()
     for record in chosen:
-        estimate_frame(VARIANTS[name], read_frame(dataset, record), record.frame)
+        estimate_burst(dataset, (record,), [VARIANTS[name]])
     return len(chosen) / (time.perf_counter() - start)
 
 

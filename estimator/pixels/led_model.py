@@ -358,8 +358,7 @@ class LedImageModel:
         offsets_m, points_m = _rim_points(self._rims_m, self._led, centres_m, state.sizes, state.tilts)
         rims = state.project(points_m)
         outlines = Outlines(rims.pixels * self.lens.factors[self._led, None], self._following, self._led)
-        covered, pieces = cover(self.fine, outlines)
-        covered *= self.fine_fall_off
+        covered, pieces = cover(self.fine, outlines, self.fine_fall_off)
         light = covered if self._blur is None else self._blur(covered)
         return RenderedLeds(light, parameters, self, state.camera, rims, offsets_m, outlines, pieces)
 

@@ -124,11 +124,14 @@ class EdgePieces:
     length: Floats
 
 
-def cover(rois: RoiStack, outlines: Outlines) -> tuple[Floats, EdgePieces]:
-    """Covered share of each cell, (cells,), and the pieces of the outlines."""
+def cover(rois: RoiStack, outlines: Outlines, light: Floats | None = None) -> tuple[Floats, EdgePieces]:
+    """Covered share of each cell, (cells,), and the pieces of the outlines.
+
+    `light` (cells,), if given, is that of a cell wholly covered: the share is times that.
+    """
     edges = outlines.points, outlines.following, outlines.roi
     regions = rois.rows, rois.columns, rois.heights, rois.widths, rois.starts
-    covered, edge, cell, length = _cover(*edges, *regions)
+    covered, edge, cell, length = _cover(*edges, *regions, np.ones(rois.cells()) if light is None else light)
     return covered, EdgePieces(edge, cell, length)
 
 
@@ -142,8 +145,9 @@ def _cover(
     heights: Ints,
     widths: Ints,
     starts: Ints,
+    light: Floats,
 ) -> tuple[Floats, Ints, Ints, Floats]:
-    """Covered share (cells,), and the arrays of `EdgePieces`."""
+    """Covered share (cells,) times the light, and the arrays of `EdgePieces`."""
     covered, count = np.zeros(starts[-1] + 1), 0
     most = 3 * len(points)
     edges, cells, lengths = np.empty(most, dtype=np.int64), np.empty(most, dtype=np.int64), np.empty(most)
@@ -171,9 +175,9 @@ def _cover(
                 edges[count], cells[count], lengths[count] = i, cell, length
                 count += 1
     total = 0.0
-    for cell in range(len(covered)):
+    for cell in range(len(light)):
         total += covered[cell]
-        covered[cell] = total
+        covered[cell] = total * light[cell]
     return covered[:-1], edges[:count], cells[:count], lengths[:count]
 
 

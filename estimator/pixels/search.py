@@ -147,6 +147,7 @@ class Search:
         photometry: PhotometricFit | None = None
         factor, accepted, min_deviance = 1.0, (pose, nuisances), np.inf
         step: Solution | None = None
+        rims_px: Floats | None = None
         checked, moved_px, length2 = None, np.inf, 0.0
         damping, shortened, steps = self._first_damping, 0, 0
         for _ in range(MAX_STEPS):
@@ -168,6 +169,7 @@ class Search:
                 shortened += 1
                 factor /= 4
                 pose, nuisances = self._moved(accepted, step, factor)
+                rims_px = None
                 continue
             photometry, accepted, shortened, steps = candidate, (pose, nuisances), 0, steps + 1
             estimated = rendered.parameters
@@ -189,7 +191,7 @@ class Search:
             of_priors = self._gravity.deviance(angles) + nuisances.deviance(priors)
             min_deviance = candidate.deviance + of_priors / len(pixels.electrons)
             factor = 1.0 if before is None else step_factor(step, before, factor)
-            before_px = self._rims_px(state)
+            before_px = self._rims_px(state) if rims_px is None else rims_px
             pose, nuisances = self._moved(accepted, step, factor)
             rims_px = self._rims_px(nuisances.state(pose, camera, priors))
             moved_px = _largest(rims_px - before_px)
