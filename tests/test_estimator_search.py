@@ -12,11 +12,11 @@ from estimator.camera.pose import Pose
 from estimator.pixels import search
 from estimator.pixels.elimination import Solution
 from estimator.pixels.initial import gravity_of
-from estimator.pixels.led_model import RenderedLeds
+from estimator.pixels.led_model import PRINCIPAL_POINT, SIZE_PARAMETER, RenderedLeds
 from estimator.pixels.led_pixels import LedPixels
 from estimator.pixels.likelihood import Noise, PhotometricFit, fit_photometry, score
-from estimator.pixels.nuisances import NO_COMPONENTS, SIZE, Nuisances, Priors
-from estimator.pixels.search import ScoringResult, Search, step_factor, unexplained
+from estimator.pixels.nuisances import NO_COMPONENTS, NO_GRAVITY, SIZE, Nuisances, Priors
+from estimator.pixels.search import ScoringResult, Search, is_last, step_factor, unexplained
 
 
 def step_of(length: float) -> Solution:
@@ -46,6 +46,40 @@ def test_a_step_that_takes_back_less_than_half_is_a_full_one() -> None:
     assert step_factor(step_of(-0.51), step_of(1.0), 1.0) == 0.5
     assert step_factor(step_of(-0.24), step_of(1.0), 0.5) == 1.0  # of half a step before
     assert step_factor(step_of(-0.26), step_of(1.0), 0.5) == 0.5
+
+
+def test_a_step_of_a_third_of_a_standard_deviation_is_the_last_where_it_is_a_tenth_of_the_one_before() -> None:
+    """A tenth of it is left then, less than of the step of a tenth that ends a search anyway."""
+    assert is_last(0.09**2, 0.0, 1.0)
+    assert is_last(0.3**2, 3.1**2, 0.9e-4)
+    assert not is_last(0.3**2, 2.9**2, 0.9e-4)
+    assert not is_last(0.32**2, 10.0**2, 0.9e-4)
+    assert not is_last(0.3**2, 3.1**2, 1.1e-4), "it moves an image"
+    assert not is_last(0.3**2, 0.0, 0.9e-4), "the first step"
+
+
+def test_what_is_to_be_checked_is_scored_in_the_last_step_and_changes_no_estimate() -> None:
+    """By pose, size and principal point, and the profile's three: the search's own maximum has no gradient by the pose
+    there, but for the last step, at most a tenth of a standard deviation, 0.1 by its information's root.
+    """
+    frame = drawn(4000.0, 3)
+    pose = true_pose(frame)
+    pixels, priors = gathered(frame, pose), Priors.of(frame)
+    used, zero = np.ones(len(pixels.leds), dtype=bool), Nuisances.zero(priors)
+    to_check = np.array([*range(6), *PRINCIPAL_POINT, SIZE_PARAMETER])
+    alone, checked = (
+        Search(frame, pixels, NO_GRAVITY, priors, np.eye(6), 0.0, columns).run(used, pose, zero, NO_COMPONENTS)
+        for columns in (None, to_check)
+    )
+    assert alone.checked is None
+    np.testing.assert_allclose(checked.pose.position_m, alone.pose.position_m, rtol=1e-12)
+    np.testing.assert_allclose(checked.solution.covariance, alone.solution.covariance, rtol=1e-9)
+    assert checked.checked is not None
+    information, gradient = (one.sum(axis=0) for one in checked.checked)
+    informed = [*to_check, *range(SIZE_PARAMETER + 3, SIZE_PARAMETER + 6)]
+    assert np.flatnonzero(np.diag(information)).tolist() == informed
+    view = np.s_[:6]
+    assert gradient[view] @ np.linalg.solve(information[view, view], gradient[view]) < 0.1**2
 
 
 @pytest.mark.parametrize("angle_rad", [0.0, 2e-4])

@@ -201,8 +201,7 @@ class Search:
                 pose, nuisances = self._moved(accepted, step, factor)
                 rims_px = self._rims_px(nuisances.state(pose, camera, priors))
             before2, length2 = length2, step.step2 * factor**2
-            ends = moved_px < MAX_LEFT_PX and length2 < min(MAX_LAST_STEP2, MAX_LAST_RATIO2 * before2)
-            converged = (length2 < CONVERGED_STEP2 or ends) and short and damping == 0
+            converged = is_last(length2, before2, moved_px) and short and damping == 0
             converged &= priors.exact or moved_px < CONVERGED_PX
             if damping > 0:
                 damping *= DAMPING_RATIO ** (-1 if short else moved_px > 4 * pixels.max_move_px)
@@ -265,6 +264,15 @@ class Search:
         centres_m = self._centres_m + state.shifts_m
         points_m = centres_m[:, None] + state.rims_m(self._rims_m)
         return state.project(points_m.reshape(-1, 3)).pixels.reshape(-1, RIM_POINTS, 2)
+
+
+def is_last(length2: float, before2: float, moved_px: float) -> bool:
+    """Whether a step leaves next to nothing: one of a length, squared, after another, 0 for none, in standard
+    deviations, that moved an image by `moved_px` at most.
+    """
+    if length2 < CONVERGED_STEP2:
+        return True
+    return moved_px < MAX_LEFT_PX and length2 < min(MAX_LAST_STEP2, MAX_LAST_RATIO2 * before2)
 
 
 def step_factor(step: Solution, before: Solution, factor: float) -> float:
