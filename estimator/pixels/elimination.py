@@ -98,9 +98,12 @@ def solve(
     uncertain = np.flatnonzero(priors.leds.any(axis=0))
     own = np.concatenate([shifted, rows[:, :, of_led]], axis=2)[:, :, uncertain] * priors.leds[:, None, uncertain]
     uncertain_datum, uncertain_camera = np.flatnonzero(priors.datum), np.flatnonzero(priors.camera)
+    by_datum = shifted[:, :, :0]
+    if len(uncertain_datum) > 0:
+        by_datum = (shifted @ (priors.datum_slopes() * priors.datum))[:, :, uncertain_datum]
     common = np.concatenate(
         [
-            (shifted @ (priors.datum_slopes() * priors.datum))[:, :, uncertain_datum],
+            by_datum,
             (rows[:, :, of_camera] * priors.camera)[:, :, uncertain_camera],
             rows[:, :, :POSE_PARAMETERS],
             rows[:, :, LOCAL_PARAMETERS:] * priors.motion,
@@ -124,7 +127,7 @@ def solve(
 
     remaining = [rest[~has][:, :, luminaire_count:].reshape(-1, common_count + 1)]
     luminaire_rows = {}
-    for k in np.unique(priors.luminaire[has]).tolist():
+    for k in sorted(set(priors.luminaire[has].tolist())):
         block = rest[priors.luminaire == k].reshape(-1, rest.shape[2])
         prior = np.zeros((LUMINAIRE_PARAMETERS, rest.shape[2]))
         prior[:, :LUMINAIRE_PARAMETERS] = np.eye(LUMINAIRE_PARAMETERS)
