@@ -74,8 +74,9 @@ def test_information_about_an_image_is_the_schur_complement_of_all_of_it() -> No
     brightness = photometry.amplitude[pixels.group]
     design[pixels.edges, :6] = pixels.rendered.slopes(pixels.cells) * brightness[pixels.edges, None]
     design[:, 6:9] = pixels.face * (brightness * pixels.light(pixels.rendered))[:, None]
+    basis = [*pixels.background.T, *photometry.by_light]
     for k in range(COEFFICIENTS):
-        design[np.arange(readings), 9 + k * groups + pixels.group] = photometry.basis[:, k]
+        design[np.arange(readings), 9 + k * groups + pixels.group] = basis[k]
     full = design.T @ (design * photometry.weight[:, None])
     for k, sigma in enumerate(BACKGROUND_SIGMAS, start=1):
         own = 9 + k * groups + np.arange(groups)

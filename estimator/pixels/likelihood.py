@@ -19,6 +19,7 @@ With `sensor.noise` "full" the variance is shot noise plus the data sheet's dark
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,18 +106,18 @@ class Noise:
 class PhotometricFit:
     """Amplitudes and backgrounds of g groups given the image, and the m readings expected by them.
 
-    `light` (m,) is that of the image, of an even face; `basis` (m, c) are the derivatives of the readings by a
-    group's c = 5 coefficients, four of the background and its amplitude, and where LEDs send by a sixth, the
-    amplitude times a change of the phase; `amplitude`, `background` (by the face) and `signal_to_noise` are (g,);
-    `expected` (m,) are electrons; `weight` (m,) is 1 / variance, 0 for readings not used; `covariance` (g, c, c) is
-    that of the coefficients, 0 if the readings do not determine them; `level` (g,) is the scale of the background's
-    prior; `deviance` is the mean over the readings of twice the log likelihood ratio of a saturated model, expected
-    to be near 1. Where LEDs send, `phase` (g,) are the errors of their waves' phases, in lines, and `gain` (m,) the
-    gains by which the light of the readings is multiplied.
+    `light` (m,) is that of the image, of an even face; a group has c = 5 coefficients, four of the background and its
+    amplitude, and where LEDs send a sixth, the amplitude times a change of the phase; `by_light` (c - 4, m) are the
+    derivatives of the readings by the amplitude and the sixth; `amplitude`, `background` (by the face) and
+    `signal_to_noise` are (g,); `expected` (m,) are electrons; `weight` (m,) is 1 / variance, 0 for readings not used;
+    `covariance` (g, c, c) is that of the coefficients, 0 if the readings do not determine them; `level` (g,) is the
+    scale of the background's prior; `electrons` (m,) are those of the readings, `dark_e2` (m,) their variances in the
+    dark. Where LEDs send, `phase` (g,) are the errors of their waves' phases, in lines, and `gain` (m,) the gains by
+    which the light of the readings is multiplied.
     """
 
     light: Floats
-    basis: Floats
+    by_light: Floats
     amplitude: Floats
     background: Floats
     signal_to_noise: Floats
@@ -124,9 +125,15 @@ class PhotometricFit:
     weight: Floats
     covariance: Floats
     level: Floats
-    deviance: float
+    electrons: Floats
+    dark_e2: Floats
     phase: Floats | None = None
     gain: Floats | None = None
+
+    @cached_property
+    def deviance(self) -> float:
+        """Mean over the readings of twice the log likelihood ratio of a saturated model, expected to be near 1."""
+        return _mean_deviance(self.electrons, self.expected, self.dark_e2, self.weight > 0)
 
 
 def fit_photometry(
@@ -156,15 +163,14 @@ def fit_photometry(
     weight = used_groups[group] / n if before is None else before.weight
     level = np.maximum.reduceat(y / n, starts[:-1]) if before is None else before.level
     count = COEFFICIENTS if phase is None else COEFFICIENTS + 1
-    # One coefficient after another in memory: (c, m), the readings last.
-    basis = np.empty((count, len(y)))
-    basis[:AMPLITUDE], basis[AMPLITUDE] = pixels.background.T, light
+    # One coefficient after another in memory, the readings last.
+    basis = pixels.background.T, light[None]
     # Without variances of a previous fit, iterate: the first weights are a guess.
     for _ in range(3 if before is None else 1):
         if pixels.gains is not None and phase is not None:
             gain, by_phase = pixels.gains.at(phase)
-            basis[AMPLITUDE], basis[AMPLITUDE + 1] = light * gain, light * by_phase
-        normal, right = _normal_equations(starts, basis, y, weight)
+            basis = pixels.background.T, np.stack([light * gain, light * by_phase])
+        normal, right = _normal_equations(starts, *basis, y, weight)
         determined = (normal[:, 0, 0] > 0) & (normal[:, AMPLITUDE, AMPLITUDE] > 0)
         prior = np.maximum(np.outer(level, BACKGROUND_SIGMAS), MIN_VARIANCE_E2) ** -2.0
         slopes = range(1, AMPLITUDE)
@@ -182,7 +188,7 @@ def fit_photometry(
         scaled[~determined] = np.eye(count)
         covariance = np.linalg.inv(scaled) * scale[:, :, None] * scale[:, None] * determined[:, None, None]
         coefficients = np.einsum("gij,gj->gi", covariance, right)
-        expected, per_pixel, variance = _expected(starts, basis, n, coefficients, floors_e, noise.dark_e2, noise.prnu2)
+        expected, per_pixel, variance = _expected(starts, *basis, n, coefficients, floors_e, noise.dark_e2, noise.prnu2)
         variance = noise.reduced_where_alike(variance, y - expected, n, unlit, group)
         weight = _weights(starts, n, per_pixel, variance, used_groups & determined, noise.saturation_e)
         if before is not None and not may_enter:
@@ -195,10 +201,9 @@ def fit_photometry(
     amplitude = coefficients[:, AMPLITUDE]
     sigma = np.sqrt(covariance[:, AMPLITUDE, AMPLITUDE])
     signal_to_noise = np.divide(amplitude, sigma, out=np.zeros_like(sigma), where=sigma > 0)
-    deviance = _mean_deviance(y, expected, n * noise.dark_e2, weight > 0)
     return PhotometricFit(
         of_image,
-        basis.T,
+        basis[1],
         amplitude,
         coefficients[:, 0],
         signal_to_noise,
@@ -206,7 +211,8 @@ def fit_photometry(
         weight,
         covariance,
         level,
-        deviance,
+        y,
+        n * noise.dark_e2,
         phase,
         gain,
     )
@@ -231,23 +237,28 @@ def _floors_e(starts: Ints, electrons: Floats, pixel_counts: Floats, unlit: Mask
 
 
 @compiled_sums
-def _normal_equations(starts: Ints, basis: Floats, electrons: Floats, weight: Floats) -> tuple[Floats, Floats]:
+def _normal_equations(
+    starts: Ints, background: Floats, by_light: Floats, electrons: Floats, weight: Floats
+) -> tuple[Floats, Floats]:
     """Normal equations (g, c, c) and right-hand sides (g, c) of readings (m,), weighted (m,).
 
-    `basis` (c, m) are the derivatives by the c coefficients.
+    The derivatives by the c coefficients are those of the `background` (b, m), then those `by_light` (c - b, m).
     """
-    groups, count = len(starts) - 1, len(basis)
+    groups, of_background = len(starts) - 1, len(background)
+    count = of_background + len(by_light)
     normal, right = np.empty((groups, count, count)), np.empty((groups, count))
     for g in range(groups):
         readings = slice(starts[g], starts[g + 1])
         weights, values = weight[readings], electrons[readings]
         for a in range(count):
-            first, total = basis[a, readings], 0.0
+            first = background[a, readings] if a < of_background else by_light[a - of_background, readings]
+            total = 0.0
             for i in range(len(weights)):
                 total += weights[i] * first[i] * values[i]
             right[g, a] = total
             for b in range(a + 1):
-                second, total = basis[b, readings], 0.0
+                second = background[b, readings] if b < of_background else by_light[b - of_background, readings]
+                total = 0.0
                 for i in range(len(weights)):
                     total += weights[i] * first[i] * second[i]
                 normal[g, a, b] = normal[g, b, a] = total
@@ -257,7 +268,8 @@ def _normal_equations(starts: Ints, basis: Floats, electrons: Floats, weight: Fl
 @compiled
 def _expected(
     starts: Ints,
-    basis: Floats,
+    background: Floats,
+    by_light: Floats,
     pixel_counts: Floats,
     coefficients: Floats,
     floors_e: Floats,
@@ -266,15 +278,17 @@ def _expected(
 ) -> tuple[Floats, Floats, Floats]:
     """Expected electrons (m,), those that a pixel has noise of, (m,), and a pixel's variance, (m,).
 
-    `basis` (c, m) are the derivatives by the `coefficients` (g, c). No pixel has less noise than of `floors_e` (g,).
+    The derivatives by the `coefficients` (g, c) are as in `_normal_equations`. No pixel has less noise than of
+    `floors_e` (g,).
     """
-    readings = len(pixel_counts)
+    readings, of_background = len(pixel_counts), len(background)
     expected, per_pixel, variance = np.zeros(readings), np.empty(readings), np.empty(readings)
     for g in range(len(starts) - 1):
         group, floor_e = slice(starts[g], starts[g + 1]), floors_e[g]
         total, lit, noise, counts = expected[group], per_pixel[group], variance[group], pixel_counts[group]
-        for a in range(len(basis)):
-            coefficient, one = coefficients[g, a], basis[a, group]
+        for a in range(coefficients.shape[1]):
+            coefficient = coefficients[g, a]
+            one = background[a, group] if a < of_background else by_light[a - of_background, group]
             for i in range(len(one)):
                 total[i] += coefficient * one[i]
         for i in range(len(counts)):
@@ -339,7 +353,7 @@ def score(
     information = np.zeros((len(pixels.leds), all_of_them, all_of_them))
     gradient = np.zeros((len(pixels.leds), all_of_them))
     off_e = pixels.electrons - photometry.expected
-    fit = np.ascontiguousarray(photometry.basis.T), off_e, photometry.weight
+    fit = pixels.background.T, photometry.by_light, off_e, photometry.weight
     # By the parameters, by the coefficients, and the gradient: (g, p, p + c + 1).
     products, count = _products(pixels.starts, slopes, place, factor, face, light, *fit), len(columns)
     own, mixed = products[:, :, :count], products[:, :, count:-1]
@@ -362,19 +376,20 @@ def _products(
     factor: Floats,
     face: Floats,
     light: Floats,
-    basis: Floats,
+    background: Floats,
+    by_light: Floats,
     off_e: Floats,
     weight: Floats,
 ) -> Floats:
     """Sums (g, p, p + c + 1) over the readings of each group, of weighted products of the derivatives by p parameters.
 
-    The products are with these, with the derivatives by c coefficients, `basis` (c, m), and with what a reading is off,
-    `off_e` (m,). A reading that changes as images move has derivatives at its `place` (m,) in `slopes` (s, q), times
-    its `factor` (m,); one that does not has the place -1. By the face's profile it has those of `face` (m, r), (m, 0)
-    for none, times its `light` (m,): p = q + r.
+    The products are with these, with the derivatives by c coefficients, as in `_normal_equations`, and with what a
+    reading is off, `off_e` (m,). A reading that changes as images move has derivatives at its `place` (m,) in `slopes`
+    (s, q), times its `factor` (m,); one that does not has the place -1. By the face's profile it has those of `face`
+    (m, r), (m, 0) for none, times its `light` (m,): p = q + r.
     """
-    of_image, of_face, of_basis = slopes.shape[1], face.shape[1], len(basis)
-    count, others = of_image + of_face, of_face + of_basis + 1
+    of_image, of_face, of_background = slopes.shape[1], face.shape[1], len(background)
+    count, others = of_image + of_face, of_face + of_background + len(by_light) + 1
     products = np.zeros((len(starts) - 1, count, of_image + others))
     for g in range(len(starts) - 1):
         first, size = starts[g], starts[g + 1] - starts[g]
@@ -386,8 +401,12 @@ def _products(
             one, of_one = every[a], face[readings, a]
             for i in range(size):
                 one[i] = root[i] * of_light[i] * of_one[i]
-        for a in range(of_basis + 1):
-            one, of_one = every[of_face + a], basis[a, readings] if a < of_basis else off_e[readings]
+        for a in range(others - of_face):
+            one, of_one = every[of_face + a], off_e[readings]
+            if a < of_background:
+                of_one = background[a, readings]
+            elif a < of_background + len(by_light):
+                of_one = by_light[a - of_background, readings]
             for i in range(size):
                 one[i] = root[i] * of_one[i]
         moving, moved = np.empty(size, dtype=np.int64), 0
@@ -426,7 +445,7 @@ def excess_chi2(pixels: LedPixels, photometry: PhotometricFit) -> Floats:
     """Excess of each group's chi-square, (g,), over its limit: positive for an LED that the model does not explain."""
     weight = photometry.weight
     chi2 = pixels.sum_by_group((pixels.electrons - photometry.expected) ** 2 * weight)
-    freedom = np.maximum(pixels.sum_by_group((weight > 0).astype(float)) - photometry.basis.shape[1], 0.0)
+    freedom = np.maximum(pixels.sum_by_group((weight > 0).astype(float)) - photometry.covariance.shape[1], 0.0)
     # The model error is largest at the edge: 4 share (1 - share) is 1 at half coverage and 0 on uniform pixels.
     share = photometry.light / pixels.background[:, 0]
     model_error_e = MODEL_ERROR_SHARE * photometry.amplitude[pixels.group] * 4 * share * (1 - share)

@@ -171,7 +171,7 @@ def read(
         cells=made.cells[:singles],
         pixel_counts=made.pixel_counts[:total],
         electrons=made.electrons[:total],
-        background=made.background[:, :total].T,
+        background=made.background[:, :total].copy().T,
         face=made.face[:total],
         uniform_light=made.uniform_light[:total],
         lines=made.lines[:total],

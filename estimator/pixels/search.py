@@ -36,6 +36,7 @@ from estimator.pixels.nuisances import (
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
+Fitted = tuple[PhotometricFit, Pose, Nuisances]
 
 MAX_STEPS = 40
 # Images that a step moves by less are next to those after it: a small share of the shift that `camera_check` tolerates.
@@ -55,6 +56,8 @@ CONVERGED_PX = 0.02
 # A step that multiplies the mean deviance by more was too long. Smaller increases occur when readings near saturation
 # enter or leave.
 MAX_DEVIANCE_RATIO = 1.01
+# A step that moves no image by more is not too long for the linearization.
+MAX_LINEAR_PX = 0.02
 # After so many steps readings near saturation may only leave: amplitudes decide which are used and come from them,
 # so that they could enter and leave for ever.
 SETTLING_STEPS = 4
@@ -145,7 +148,7 @@ class Search:
         stated = self._with_edge_errors(at_start)
         priors = components.added(stated)
         photometry: PhotometricFit | None = None
-        factor, accepted, min_deviance = 1.0, (pose, nuisances), np.inf
+        factor, accepted = 1.0, (pose, nuisances)
         step: Solution | None = None
         rims_px: Floats | None = None
         checked, moved_px, length2 = None, np.inf, 0.0
@@ -162,9 +165,12 @@ class Search:
                 if first
                 else fit_photometry(pixels, rendered, used, self._noise, photometry, profile, may_enter)
             )
-            of_priors = self._gravity.deviance(angles) + nuisances.deviance(priors)
-            deviance = candidate.deviance + of_priors / len(pixels.electrons)
-            too_long = deviance > MAX_DEVIANCE_RATIO * min_deviance  # for the linearization
+            too_long = (
+                step is not None
+                and photometry is not None
+                and moved_px > MAX_LINEAR_PX
+                and self._is_worse((candidate, pose, nuisances), (photometry, *accepted), priors)
+            )
             if step is not None and too_long and shortened < MAX_SHORTENED:
                 shortened += 1
                 factor /= 4
@@ -188,8 +194,6 @@ class Search:
             else:
                 components, step = tuned(components, stated, used, rows, right, nuisances, self._gravity, angles)
             priors = components.added(stated)
-            of_priors = self._gravity.deviance(angles) + nuisances.deviance(priors)
-            min_deviance = candidate.deviance + of_priors / len(pixels.electrons)
             factor = 1.0 if before is None else step_factor(step, before, factor)
             before_px = self._rims_px(state) if rims_px is None else rims_px
             pose, nuisances = self._moved(accepted, step, factor)
@@ -237,6 +241,16 @@ class Search:
             checked=checked,
             last_px=moved_px,
         )
+
+    def _is_worse(self, now: Fitted, before: Fitted, priors: Priors) -> bool:
+        """Whether the mean deviance of readings and priors has grown by more than a step may let it."""
+        deviance, least = (
+            photometry.deviance
+            + (self._gravity.deviance(pose.rig_angles(self._camera)) + nuisances.deviance(priors))
+            / len(self._pixels.electrons)
+            for photometry, pose, nuisances in (now, before)
+        )
+        return deviance > MAX_DEVIANCE_RATIO * least
 
     def _with_edge_errors(self, photometry: PhotometricFit) -> Priors:
         """The priors, with the errors of the sizes that an imperfect background causes."""
