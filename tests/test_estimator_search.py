@@ -1,6 +1,7 @@
 """Search of the most likely pose: the length of its steps, and LEDs that it leaves out."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,11 +12,11 @@ from test_estimator_maximum_likelihood import frame_of
 from estimator.camera.pose import Pose
 from estimator.pixels import search
 from estimator.pixels.elimination import Solution
-from estimator.pixels.initial import gravity_of
+from estimator.pixels.initial import gravity_of, tuned
 from estimator.pixels.led_model import PRINCIPAL_POINT, SIZE_PARAMETER, RenderedLeds
 from estimator.pixels.led_pixels import LedPixels
 from estimator.pixels.likelihood import Noise, PhotometricFit, fit_photometry, score
-from estimator.pixels.nuisances import NO_COMPONENTS, NO_GRAVITY, SIZE, Nuisances, Priors
+from estimator.pixels.nuisances import NO_COMPONENTS, NO_GRAVITY, SIZE, Components, Nuisances, Priors
 from estimator.pixels.search import ScoringResult, Search, is_last, step_factor, unexplained
 
 
@@ -56,6 +57,44 @@ def test_a_step_of_a_third_of_a_standard_deviation_is_the_last_where_it_is_a_ten
     assert not is_last(0.32**2, 10.0**2, 0.9e-4)
     assert not is_last(0.3**2, 3.1**2, 1.1e-4), "it moves an image"
     assert not is_last(0.3**2, 0.0, 0.9e-4), "the first step"
+
+
+@pytest.mark.parametrize(("moved_px", "shortened"), [(0.5, True), (0.015, False)])
+def test_a_step_that_makes_the_images_less_likely_is_cut_to_a_quarter(
+    monkeypatch: pytest.MonkeyPatch, moved_px: float, shortened: bool
+) -> None:
+    """Half a pixel from the maximum edges of 4000 e are off by hundreds of them, where noise is 60. A step that moves
+    no image by 0.02 px is taken as it is. The search ends at the maximum either way.
+    """
+    frame = drawn(4000.0, 3)
+    pose = true_pose(frame)
+    pixels, priors = gathered(frame, pose), Priors.of(frame)
+    used, zero = np.ones(len(pixels.leds), dtype=bool), Nuisances.zero(priors)
+
+    def searched() -> ScoringResult:
+        return Search(frame, pixels, NO_GRAVITY, priors, np.eye(6), 0.0).run(used, pose, zero, NO_COMPONENTS)
+
+    free, factors, steps = searched(), list[float](), 0
+
+    def first_wrong(*arguments: Any) -> tuple[Components, Solution]:
+        nonlocal steps
+        components, step = tuned(*arguments)
+        steps += 1
+        turn = np.array([0, 0, 0, moved_px / frame.camera.K[0][0], 0, 0])
+        return components, replace(step, view_step=turn, step2=1e6) if steps == 1 else step
+
+    def noted(of: Search, start: tuple[Pose, Nuisances], step: Solution, factor: float) -> tuple[Pose, Nuisances]:
+        factors.append(factor)
+        return moved(of, start, step, factor)
+
+    moved = Search._moved
+    monkeypatch.setattr(search, "tuned", first_wrong)
+    monkeypatch.setattr(Search, "_moved", noted)
+    found = searched()
+    assert found.converged
+    assert factors[:2] == [1.0, 0.25 if shortened else 0.5]  # a half where the next step takes it back
+    off_m = found.pose.position_m - free.pose.position_m
+    assert off_m @ np.linalg.solve(free.solution.covariance[:3, :3], off_m) < 0.1**2
 
 
 def test_what_is_to_be_checked_is_scored_in_the_last_step_and_changes_no_estimate() -> None:
