@@ -100,7 +100,9 @@ def test_slopes_are_what_moving_the_outline_gives() -> None:
     rois = roi(0, 0, 26, 26)
     outline = outlines(points)
     place = np.full(rois.cells(), -1)
-    rim = rim_slopes(outline, cover(rois, outline)[1], moves, np.ones(rois.cells()), place)
+    middle, edge = (moves + moves[outline.following]) / 2, points[outline.following] - points
+    swept = middle[:, 0] * edge[:, 1:] - middle[:, 1] * edge[:, :1]
+    rim = rim_slopes(outline, cover(rois, outline)[1], swept, np.ones(rois.cells()), place)
     assert (place == -1).all()
     for parameter in range(3):
         found = np.zeros(rois.cells())

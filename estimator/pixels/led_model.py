@@ -302,15 +302,30 @@ class RenderedLeds:
     @cached_property
     def _sharp_slopes(self) -> RimSlopes:
         """Derivatives of the images without blur, on pixels subdivided by the lens's factors."""
-        model, rims, parameters = self._model, self._rims, self.parameters
-        intrinsic = motion = np.empty((0, 2, 0))
-        if ((parameters >= POSE_PARAMETERS) & (parameters < SIZE_PARAMETER)).any():
+        model, rims, wanted = self._model, self._rims, self.parameters
+        intrinsic = motion = np.empty((len(rims.pixels), 2, 0))
+        found = [POSE_ALONE, np.array([SIZE_PARAMETER])]
+        if ((wanted >= POSE_PARAMETERS) & (wanted < SIZE_PARAMETER)).any():
             intrinsic = intrinsic_slopes_px(rims.p_cam, self._camera.normalized(rims.pixels), self._camera)
-        if rims.motion_slopes is not None:
+            found.insert(1, np.arange(POSE_PARAMETERS, SIZE_PARAMETER))
+        tilts = bool(np.isin(TILT_PARAMETERS, wanted).any())
+        if tilts:
+            found.append(np.array(TILT_PARAMETERS))
+        if (wanted >= LOCAL_PARAMETERS).any() and rims.motion_slopes is not None:
             motion = rims.motion_slopes
-        factors = model.lens.factors[self._outlines.roi]
-        slopes = _slopes(rims.slopes, self._offsets_m, intrinsic, motion, parameters, factors)
-        return rim_slopes(self._outlines, self._pieces, slopes, model.fine_fall_off, model.place)
+            found.append(MOTION_COLUMNS)
+        outlines, factors = self._outlines, model.lens.factors[self._outlines.roi]
+        edges = outlines.points, outlines.following, factors
+        swept = _swept(*edges, rims.slopes, self._offsets_m, intrinsic, motion, tilts)
+        slopes = rim_slopes(outlines, self._pieces, swept, model.fine_fall_off, model.place)
+        every = np.concatenate(found)
+        if np.array_equal(every, wanted):
+            return slopes
+        # Profile parameters have none.
+        columns = np.zeros((len(slopes.slopes), len(wanted)))
+        has = np.isin(wanted, every)
+        columns[:, has] = slopes.slopes[:, np.searchsorted(every, wanted[has])]
+        return replace(slopes, slopes=columns)
 
 
 class LedImageModel:
@@ -381,31 +396,48 @@ def _rim_points(level_m: Floats, led: Ints, centres_m: Floats, sizes: Floats, ti
 
 
 @compiled
-def _slopes(
-    pose: Floats, offsets_m: Floats, intrinsic: Floats, motion: Floats, parameters: Ints, factors: Ints
+def _swept(
+    points: Floats,
+    following: Ints,
+    factors: Ints,
+    pose: Floats,
+    offsets_m: Floats,
+    intrinsic: Floats,
+    motion: Floats,
+    with_tilts: bool,
 ) -> Floats:
-    """Derivatives (n, 2, p) of points of rims by parameters (p,), in pixels finer by `factors` (n,).
+    """Areas (n, p) that edges of outlines sweep as they move with each of p parameters, as `rim_slopes` takes them.
 
-    By the pose they are `pose` (n, 2, 6), by the intrinsics `intrinsic` (n, 2, 7), by the camera's motion `motion`
-    (n, 2, 6), where they are wanted. `offsets_m` (n, 3) are the points from their LEDs' centres.
+    The parameters are those of the pose, then where they are wanted of the intrinsics, the size, the two tilts where
+    they are wanted, and the motion. Of the n `points` (n, 2) of the outlines, in pixels finer by `factors` (n,), the
+    derivatives in pixels of the sensor are `pose` (n, 2, 6), `intrinsic` (n, 2, 7) or (n, 2, 0), and `motion` (n, 2, 6)
+    or (n, 2, 0). `offsets_m` (n, 3) are the points from their LEDs' centres.
     """
-    slopes = np.zeros((len(pose), 2, len(parameters)))
-    for i in range(len(pose)):
-        for axis in range(2):
-            for column in range(len(parameters)):
-                parameter = parameters[column]
-                slope = 0.0
-                # A point of the face moves its image as much as the camera moves it by the opposite way.
-                if parameter < pose.shape[2]:
-                    slope = pose[i, axis, parameter]
-                elif parameter < SIZE_PARAMETER:
-                    slope = intrinsic[i, axis, parameter - pose.shape[2]]
-                elif parameter == SIZE_PARAMETER:
-                    for along in range(3):
-                        slope -= pose[i, axis, along] * offsets_m[i, along]
-                elif parameter < IMAGE_PARAMETERS:
-                    slope = -pose[i, axis, 2] * offsets_m[i, parameter - SIZE_PARAMETER - 1]
-                elif parameter >= LOCAL_PARAMETERS:
-                    slope = motion[i, axis, parameter - LOCAL_PARAMETERS]
-                slopes[i, axis, column] = slope * factors[i]
-    return slopes
+    of_pose, of_camera, of_motion = pose.shape[2], intrinsic.shape[2], motion.shape[2]
+    size = of_pose + of_camera
+    last = size + 1 + (2 if with_tilts else 0)
+    swept = np.empty((len(points), last + of_motion))
+    for i in range(len(points)):
+        j, row = following[i], swept[i]
+        # Half the edge, since the velocity at its middle is half the sum of both ends': over so short an edge it is
+        # constant.
+        half = factors[i] / 2
+        du, dv = (points[j, 0] - points[i, 0]) * half, (points[j, 1] - points[i, 1]) * half
+        for q in range(of_pose):
+            row[q] = (pose[i, 0, q] + pose[j, 0, q]) * dv - (pose[i, 1, q] + pose[j, 1, q]) * du
+        for q in range(of_camera):
+            of_u, of_v = intrinsic[i, 0, q] + intrinsic[j, 0, q], intrinsic[i, 1, q] + intrinsic[j, 1, q]
+            row[of_pose + q] = of_u * dv - of_v * du
+        # A point of the face moves its image as much as the camera moves it by the opposite way.
+        row[size] = 0.0
+        for axis in range(3):
+            of_u = pose[i, 0, axis] * offsets_m[i, axis] + pose[j, 0, axis] * offsets_m[j, axis]
+            of_v = pose[i, 1, axis] * offsets_m[i, axis] + pose[j, 1, axis] * offsets_m[j, axis]
+            row[size] += of_v * du - of_u * dv
+        for axis in range(2 if with_tilts else 0):
+            of_u = pose[i, 0, 2] * offsets_m[i, axis] + pose[j, 0, 2] * offsets_m[j, axis]
+            of_v = pose[i, 1, 2] * offsets_m[i, axis] + pose[j, 1, 2] * offsets_m[j, axis]
+            row[size + 1 + axis] = of_v * du - of_u * dv
+        for q in range(of_motion):
+            row[last + q] = (motion[i, 0, q] + motion[j, 0, q]) * dv - (motion[i, 1, q] + motion[j, 1, q]) * du
+    return swept

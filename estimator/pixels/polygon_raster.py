@@ -1,9 +1,9 @@
 """Polygon rasterization: share of each pixel inside outlines, and its derivatives as the outlines move; exact.
 
 By Green's theorem the area of a pixel that a closed outline covers is a sum over the pieces of the outline in the pixel
-and to the left of it in its row. Each edge is cut where it crosses a line between pixels. A piece that rises by dv in a
+and to the left of it in its row. Each edge is cut where it crosses a line between pixels. A piece that falls by dv in a
 pixel adds dv times the share of the pixel to its right, and dv to all pixels further right. If the piece (du, dv) moves
-with velocity (a, b), the covered area of the pixel grows by b du - a dv, exactly.
+with velocity (a, b), the covered area of the pixel grows by a dv - b du, exactly.
 """
 
 import math
@@ -200,53 +200,36 @@ class RimSlopes:
     slopes: Floats
 
 
-def rim_slopes(outlines: Outlines, pieces: EdgePieces, motion: Floats, light: Floats, place: Ints) -> RimSlopes:
-    """Derivatives by p parameters, by which the outlines' points have the derivatives `motion` (n, 2, p).
+def rim_slopes(outlines: Outlines, pieces: EdgePieces, swept: Floats, light: Floats, place: Ints) -> RimSlopes:
+    """Derivatives by p parameters, with each of which the edge from a point of the outlines sweeps `swept` (n, p).
 
-    They are of the share times the `light` (cells,) of a cell. `place` (cells,) is memory of -1 for each cell of the
-    stack, and is so again afterwards.
+    An edge (du, dv) whose middle moves with velocity (a, b) sweeps a dv - b du, pixels squared. The derivatives are of
+    the share times the `light` (cells,) of a cell. `place` (cells,) is memory of -1 for each cell of the stack, and is
+    so again afterwards.
     """
-    edges = outlines.points, outlines.following, motion
-    cells, first, slopes = _rim_slopes(*edges, pieces.edge, pieces.cell, pieces.length, light, place)
+    cells, first, slopes = _rim_slopes(swept, pieces.edge, pieces.cell, pieces.length, light, place)
     return RimSlopes(cells, outlines.roi[first], slopes)
 
 
 @compiled
 def _rim_slopes(
-    points: Floats,
-    following: Ints,
-    motion: Floats,
-    edge: Ints,
-    cell: Ints,
-    length: Floats,
-    light: Floats,
-    place: Ints,
+    swept: Floats, edge: Ints, cell: Ints, length: Floats, light: Floats, place: Ints
 ) -> tuple[Ints, Ints, Floats]:
     """Cells (m,), the first edge in each, (m,), and derivatives (m, p)."""
-    parameters, count = motion.shape[2], 0
+    parameters, count = swept.shape[1], 0
     for piece in range(len(cell)):
         if place[cell[piece]] < 0:
             place[cell[piece]] = count
             count += 1
     cells, first = np.empty(count, dtype=np.int64), np.full(count, -1)
-    slopes, swept = np.zeros((count, parameters)), np.empty(parameters)
-    before = -1
+    slopes = np.zeros((count, parameters))
     for piece in range(len(cell)):
         number, i = place[cell[piece]], edge[piece]
         if first[number] < 0:
             cells[number], first[number] = cell[piece], i
-        if i != before:
-            before, j = i, following[i]
-            # Half the edge, since the velocity at its middle is half the sum of both ends': over so short an edge it is
-            # constant.
-            du, dv = (points[j, 0] - points[i, 0]) / 2, (points[j, 1] - points[i, 1]) / 2
-            for parameter in range(parameters):
-                of_u = motion[i, 0, parameter] + motion[j, 0, parameter]
-                of_v = motion[i, 1, parameter] + motion[j, 1, parameter]
-                swept[parameter] = of_u * dv - of_v * du
         share = length[piece] * light[cell[piece]]
         for parameter in range(parameters):
-            slopes[number, parameter] += swept[parameter] * share
+            slopes[number, parameter] += swept[i, parameter] * share
     for number in range(count):
         place[cells[number]] = -1
     return cells, first, slopes
