@@ -1,9 +1,9 @@
 """Polygon rasterization: share of each pixel inside outlines, and its derivatives as the outlines move; exact.
 
 By Green's theorem the area of a pixel that a closed outline covers is a sum over the pieces of the outline in the pixel
-and to the left of it in its row. Each edge is cut where it crosses a line between pixels. A piece that falls by dv in a
-pixel adds dv times the share of the pixel to its right, and dv to all pixels further right. If the piece (du, dv) moves
-with velocity (a, b), the covered area of the pixel grows by a dv - b du, exactly.
+and to the left of it in its row. Each edge is cut where it crosses a line between pixels. A piece (du, dv) in a
+pixel takes from it dv times the share of the pixel to its right, and dv from all pixels further right. If the piece
+moves with velocity (a, b), the covered area of the pixel grows by a dv - b du, exactly.
 """
 
 import math
