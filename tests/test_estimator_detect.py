@@ -10,18 +10,6 @@ from estimator.spots.denoise import NEIGHBOURHOOD_RADIUS_PX, neighbourhood_mean
 from estimator.spots.detect import Spot, detect
 from estimator.spots.led_light import Ellipse, Readout, light_of
 from estimator.spots.sampling import LensBlur
-from estimator.spots.spot_pixels import (
-    above_half_level,
-    around_face,
-    boxes_around,
-    brightest,
-    distance2,
-    ellipse_spans,
-    median,
-    overlapping,
-    padded,
-    piece_sums,
-)
 
 SMALL = (400, 300, 1500.0)
 # A tenth of the full frame's width with the full frame's pixels.
@@ -291,33 +279,6 @@ def test_without_covariances_all_else_is_the_same() -> None:
     assert {**vars(spot), "covariance_px2": None} == {**vars(whole), "covariance_px2": None}
 
 
-@pytest.mark.parametrize("radius_px", [0.0, 0.9, 2.0, 3.7, 5.0, 12.5, 30.0, 200.0])
-def test_a_mask_is_padded_by_the_pixels_at_most_a_radius_from_it(radius_px: float) -> None:
-    """Against the distance of each pixel from each of the mask, squared: whole numbers. The mask touches a border."""
-    rng = np.random.default_rng(5)
-    for shape in [(1, 1), (1, 30), (30, 1), (25, 40)]:
-        mask = np.zeros(shape, dtype=bool)
-        mask.ravel()[rng.integers(0, mask.size, 3)] = True
-        at, pixels = np.argwhere(mask), np.argwhere(np.ones(shape, dtype=bool))
-        nearest2 = ((pixels[:, None] - at) ** 2).sum(axis=2).min(axis=1).reshape(shape)
-        near, nearby, _ = padded(mask, radius_px, radius_px + 3.0, 0.0)
-        np.testing.assert_array_equal(near, nearest2 <= radius_px**2)
-        np.testing.assert_array_equal(nearby, nearest2 <= (radius_px + 3.0) ** 2)
-        none, _, outside = padded(~mask, 0.0, 0.0, radius_px)
-        np.testing.assert_array_equal(none, ~mask)
-        np.testing.assert_array_equal(outside, near)
-
-
-def test_the_median_is_numpys() -> None:
-    """Of odd and even numbers of values, with none, some and all of them equal, in any order and in order."""
-    rng = np.random.default_rng(6)
-    for count in [1, 2, 3, 4, 5, 10, 101, 300, 1000, 4001]:
-        for most in [1, 2, 30, 10**9]:
-            values = rng.integers(0, most, count).astype(np.float64)
-            assert median(values) == median(np.sort(values)) == np.median(values)
-    assert np.isnan(median(np.full(3, np.nan)))
-
-
 @pytest.mark.parametrize("blur_px", [3, 12, 24])
 def test_the_support_contains_all_light_of_a_blurred_led(blur_px: int) -> None:
     """A disc seen at 60 deg and out of focus, by a uniform disc: its ellipse at half level is not where its light ends.
@@ -451,123 +412,6 @@ def test_a_neighbour_s_pixels_are_neither_light_nor_background() -> None:
     nearer, ring = (off_px <= 7) & (off_px <= other_px), (off_px > 7) & (off_px <= 10) & (other_px > 7)
     assert light.support.sum() == nearer.sum() < (off_px <= 7).sum()
     assert len(light.ring_off_e) == ring.sum()
-
-
-def test_a_point_is_as_far_from_an_ellipse_as_its_axes_say() -> None:
-    """Of a turned ellipse, whose ends are at 1; sums of a dozen products in another order differ by 1e-14."""
-    c, s = np.cos(0.7), np.sin(0.7)
-    axes, centre, semi_axes = np.array([[c, -s], [s, c]]), np.array([30.2, 28.6]), np.array([9.0, 4.0])
-    ellipse = Ellipse((30.2, 28.6), (c, s), (9.0, 4.0), (0.0, 0.0), (60.0, 60.0), 50, 1.0)
-    for padding_px in (0.0, 2.5):
-        form = ellipse.form(padding_px)
-        for k in (0, 1):
-            end = centre + axes[:, k] * (semi_axes[k] + padding_px)
-            assert distance2(form, *end.tolist()) == pytest.approx(1.0)
-        # The second rectangle cuts the ellipse on its right, the third is right of it.
-        for left, width in ((18, 25), (8, 25), (45, 12)):
-            spans = ellipse_spans(form, left, 15, width, 26)
-            assert (spans >= 0).all()
-            for column, row in np.ndindex(width, 26):
-                point = np.array([left + 0.5 + column, 15.5 + row])
-                expected = ((((point - centre) @ axes) / (semi_axes + padding_px)) ** 2).sum()
-                assert distance2(form, *point.tolist()) == pytest.approx(expected, abs=1e-12)
-                assert (spans[0, row] <= column < spans[1, row]) == (expected <= 1)
-
-
-def test_of_equally_bright_pixels_in_an_ellipse_the_first_is_the_brightest() -> None:
-    """By NumPy's argmax over whole numbers, of which many are equal; outside of the ellipse are brighter ones."""
-    rng = np.random.default_rng(7)
-    form = Ellipse((30.2, 28.6), (0.8, 0.6), (9.0, 4.0), (0.0, 0.0), (60.0, 60.0), 50, 1.0).form(0.0)
-    v, u = np.mgrid[:60, :60] + 0.5
-    inside = np.array([distance2(form, *at) <= 1 for at in zip(u.ravel(), v.ravel(), strict=True)]).reshape(60, 60)
-    for highest in (1, 2, 5, 1000):
-        image = np.where(inside, rng.integers(0, highest, (60, 60)), 2000).astype(np.float32)
-        row, column = np.unravel_index(np.argmax(np.where(inside, image, -1)), image.shape)
-        clipped = np.zeros((60, 60), dtype=bool)
-        clipped[20, 30] = True
-        assert not inside[20, 30]
-        assert brightest(image, clipped, 15, 15, 30, 30, form) == (row, column, False)
-        clipped[28, 33] = True
-        assert inside[28, 33]
-        assert brightest(image, clipped, 15, 15, 30, 30, form) == (row, column, True)
-
-
-def test_the_pixels_near_a_point_are_a_box_of_each_region_that_has_some() -> None:
-    """Against the distances of pixels' borders; ends are whole pixels towards the region's first one."""
-    points = np.array([(10.2, 8.7), (33.0, 21.5), (90.0, 90.0), (25.0, -2.0)])
-    regions = [(0, 0, 30, 20), (25, 10, 12, 30), (0, 60, 30, 8)]
-    expected = []
-    for u, v in points:
-        for region, (column, row, width, height) in enumerate(regions):
-            left, right = (int(np.clip(u + off - column, 0, width)) for off in (-6.0, 6.0))
-            top, bottom = (int(np.clip(v + off - row, 0, height)) for off in (-6.0, 6.0))
-            if left < right and top < bottom:
-                expected.append([region, left, top, right, bottom])
-    assert [box[0] for box in expected] == [0, 0, 1, 0]
-    np.testing.assert_array_equal(boxes_around(points, np.array(regions, dtype=float), 6.0), expected)
-
-
-def test_boxes_overlap_where_the_distances_of_their_centres_say_so() -> None:
-    rng = np.random.default_rng(8)
-    boxes = np.concatenate([rng.uniform(0, 100, (30, 2)), rng.uniform(2, 20, (30, 2))], axis=1)
-    apart = np.abs(boxes[:, None, :2] - boxes[:, :2]) < boxes[:, None, 2:] + boxes[:, 2:]
-    expected = np.argwhere(apart.all(axis=2) & ~np.eye(30, dtype=bool))
-    assert 0 < len(expected) < 30 * 29
-    np.testing.assert_array_equal(overlapping(boxes), expected)
-
-
-def pieces() -> list[Array]:
-    """Masks: discs and ellipses, whole and cut by a border, with a hole, a notch or a second piece, and steps aside."""
-    v, u = np.mgrid[:40, :50] + 0.5
-    masks = [np.hypot(u - at, (v - 20) * squeezed) <= 14 for at in (25, 9, 47) for squeezed in (1.0, 2.5)]
-    for column in (25, 11, 38):
-        masks.append(masks[0].copy())
-        masks[-1][20, column] = False
-    masks.append(masks[0] | (np.hypot(u - 47, v - 20) < 2))
-    masks.append(masks[0] | (np.hypot(u - 25, v - 38) < 2))
-    masks.append(masks[0] | ((v > 37) & (u > 30)))
-    # Rows that touch by a corner are one piece; those a pixel further apart are not.
-    masks += [((v < 20) & (u < 20)) | ((v > 20) & (u > aside) & (u < 40)) for aside in (20, 21)]
-    return masks
-
-
-@pytest.mark.parametrize("number", range(len(pieces())))
-def test_sums_over_a_piece_are_those_over_its_pixels(number: int) -> None:
-    """Pieces told without a search are found as one by OpenCV. A plateau of 100 e has its half level at 50 e."""
-    mask = pieces()[number]
-    row, column = np.nonzero(mask)
-    products = np.stack([np.ones_like(row), column, row, column**2, column * row, row**2]).sum(axis=1)
-    box = column.min(), row.min(), column.max(), row.max()
-    assert piece_sums(mask) == (tuple(products.tolist()), tuple(int(end) for end in box))
-
-    smooth = np.where(mask, 100.0, 49.0).astype(np.float32)
-    core, sums, solid = above_half_level(smooth, 0, 0, np.ones(mask.shape, dtype=bool), 0.0)
-    if mask.mean() > 0.25:  # so that the upper quartile is of the plateau
-        np.testing.assert_array_equal(core, mask)
-        assert sums == piece_sums(mask)
-        is_one = cv2.connectedComponents(mask.view(np.uint8), connectivity=8)[0] == 2
-        assert is_one if solid else number >= 6
-
-
-@pytest.mark.parametrize("number", range(len(pieces())))
-def test_a_face_is_padded_as_any_mask(number: int) -> None:
-    """Support and ring by `padded`, and the plane of the light inside by its own slopes: it follows one, without noise.
-
-    Rounding: products of float32, 1e-7 of the light, by levers of ten pixels and more.
-    """
-    face = pieces()[number]
-    v, u = np.mgrid[:40, :50] + 0.5
-    image = (1000.0 * (1 + 0.002 * (u - 25) - 0.003 * (v - 20))).astype(np.float32)
-    for margin_px, border_px in ((2.0, 2.0), (7.0, 0.0), (0.5, 4.3)):
-        support, ring, plane = around_face(image, 0, 0, face, margin_px, 3.0, border_px)
-        near, nearby, outside = padded(face, margin_px, margin_px + 3.0, border_px)
-        np.testing.assert_array_equal(support, near)
-        np.testing.assert_array_equal(ring, np.argwhere(nearby & ~near))
-        inside = ~outside
-        middle = u[inside].mean(), v[inside].mean()
-        level = 1 + 0.002 * (middle[0] - 25) - 0.003 * (middle[1] - 20)
-        np.testing.assert_allclose(plane[:2], middle, rtol=1e-12)
-        np.testing.assert_allclose(plane[2:], [0.002 / level, -0.003 / level], rtol=1e-4)
 
 
 @pytest.mark.parametrize("background_e", [0.0, 40.0])

@@ -15,14 +15,13 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from statistics import median
-from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.compiled import compact
 from estimator.errors import EstimationFailure
+from estimator.spots.boxes import Box, boxes_near, overlapping
 from estimator.spots.led_light import (
     MARGIN_PX,
     MIN_PIECE,
@@ -38,7 +37,7 @@ from estimator.spots.led_light import (
     light_of,
 )
 from estimator.spots.sampling import PIXEL_VARIANCE, SHARP, LensBlur, sampling_error, sampling_variance_px2
-from estimator.spots.spot_pixels import Piece, above_half_level, boxes_around, brightest, overlapping, piece_sums
+from estimator.spots.spot_pixels import Piece, above_half_level, brightest, piece_sums
 
 # Share of the brightest level: above ceiling and walls at 1/100 of an LED, below an LED at a quarter of it.
 THRESHOLD_OF_BRIGHTEST = 0.05
@@ -96,16 +95,6 @@ class Spot:
     touches_border: bool
     saturated: bool
     flux_e: float = math.nan
-
-
-class Box(NamedTuple):
-    """Pixels of a region, by its number: columns from `left` to before `right`, rows from `top` to before `bottom`."""
-
-    region: int
-    left: int
-    top: int
-    right: int
-    bottom: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,14 +193,6 @@ def _with_neighbours(ellipses: Sequence[Ellipse], denoise_radius_px: int) -> Ite
     for one, other in overlapping(boxes).tolist():
         others[one].append(ellipses[other])
     yield from zip(ellipses, others, strict=True)
-
-
-def boxes_near(readouts: Sequence[Readout], decoded_px: Pixels | None, near_px: float) -> list[Box]:
-    """Boxes of pixels of regions within `near_px` of pixels (n, 2) of the sensor; none without such."""
-    if decoded_px is None:
-        return []
-    regions = [(readout.column, readout.row, *readout.image_e.shape[::-1]) for readout in readouts]
-    return [Box(*values) for values in boxes_around(compact(decoded_px), compact(regions), near_px).tolist()]
 
 
 def brightest_of(images: Sequence[NDArray[np.float32]], boxes: Sequence[Box]) -> float:

@@ -25,7 +25,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.spots.detect import MAX_BLOB_OF_FRAME, Spot, boxes_near, brightest_of, levels_of
+from estimator.spots.boxes import boxes_near
+from estimator.spots.detect import MAX_BLOB_OF_FRAME, Spot, brightest_of, levels_of
 from estimator.spots.ellipse_fit import fit_ellipse
 from estimator.spots.glow import glow
 from estimator.spots.led_light import Readout
