@@ -33,6 +33,13 @@ def test_parameters_differ_where_chance_is_one_in_a_billion(
     assert differ(information, D * d, np.full(2, tolerance), more, freedom) == expected
 
 
+@pytest.mark.parametrize("rounding", [0.0, 1e-45, 1e-10])
+def test_an_led_without_information_reveals_nothing(rounding: float) -> None:
+    """What its amplitude and background make up for is subtracted: rounding errors are left, of a gradient too."""
+    information = np.stack([np.diag([4e5, 2e5]), rounding * np.eye(2)])
+    assert not differ(information, np.array([[10.0, 10.0], [1e-5, -1e-5]]), np.full(2, 3e-3), 0.0, 0)
+
+
 def test_what_moves_images_counts_by_its_square_and_unused_leds_and_shapes_do_not() -> None:
     """Each nuisance of one standard deviation alone, and then of three."""
     zero = Nuisances(np.zeros(7), np.zeros(4), np.zeros((2, 6)), np.zeros((3, 9)), np.zeros(6))

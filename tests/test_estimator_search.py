@@ -51,12 +51,13 @@ def test_a_step_that_takes_back_less_than_half_is_a_full_one() -> None:
 
 def test_a_step_of_a_third_of_a_standard_deviation_is_the_last_where_it_is_a_tenth_of_the_one_before() -> None:
     """A tenth of it is left then, less than of the step of a tenth that ends a search anyway."""
-    assert is_last(0.09**2, 0.0, 1.0)
-    assert is_last(0.3**2, 3.1**2, 0.9e-4)
-    assert not is_last(0.3**2, 2.9**2, 0.9e-4)
-    assert not is_last(0.32**2, 10.0**2, 0.9e-4)
-    assert not is_last(0.3**2, 3.1**2, 1.1e-4), "it moves an image"
-    assert not is_last(0.3**2, 0.0, 0.9e-4), "the first step"
+    assert is_last(0.09**2, 0.0, 1.0, are_large=False)
+    assert is_last(0.3**2, 3.1**2, 0.9e-4, are_large=True)
+    assert not is_last(0.3**2, 2.9**2, 0.9e-4, are_large=True)
+    assert not is_last(0.32**2, 10.0**2, 0.9e-4, are_large=True)
+    assert not is_last(0.3**2, 3.1**2, 1.1e-4, are_large=True), "it moves an image"
+    assert not is_last(0.3**2, 3.1**2, 0.9e-4, are_large=False), "weights are not settled"
+    assert not is_last(0.3**2, 0.0, 0.9e-4, are_large=True), "the first step"
 
 
 @pytest.mark.parametrize(("moved_px", "shortened"), [(0.5, True), (0.015, False)])

@@ -43,6 +43,7 @@ from estimator.methods.gravity_fit import agreement_of, ambiguous
 from estimator.methods.up2p import upright_pose
 from estimator.methods.variant import Estimate, Needs
 from estimator.pixels.camera_check import SHIFT_TOLERANCE_PX, camera_errors_by_pixels
+from estimator.pixels.elimination import MIN_INFORMATION_SHARE
 from estimator.pixels.initial import START_SIGMA_SHARE, Start, gravity_of, start_at_spots
 from estimator.pixels.led_model import (
     IMAGE_PARAMETERS,
@@ -304,7 +305,8 @@ def _differ(information: Floats, gradient: Floats, tolerance: Floats, more: floa
     By their information (n, k, k) and gradient (n, k), and a chi-square `more` of `freedom` degrees of freedom.
     """
     trace = np.trace(information, axis1=1, axis2=2)
-    informed = trace > 0  # the light of an LED whose readings determine no amplitude says nothing
+    # The light of an LED whose readings determine no amplitude says nothing.
+    informed = trace > MIN_INFORMATION_SHARE * trace.max(initial=0.0)
     D, g, trace, tolerance = information[informed], gradient[informed], trace[informed], tolerance[informed]
     spread = D + D @ D * tolerance[:, None, None] ** 2 + 1e-12 * trace[:, None, None] * np.eye(D.shape[1])
     total = np.einsum("ni,ni->", g, np.linalg.solve(spread, g[:, :, None])[:, :, 0]) + more

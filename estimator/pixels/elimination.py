@@ -20,7 +20,8 @@ from estimator.pixels.nuisances import LUMINAIRE_PARAMETERS, Gravity, Nuisances,
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-# Directions with less than this share of the largest information of an LED hold rounding errors alone.
+# Directions with less than this share of the largest information of an LED, and LEDs with less than this share of the
+# largest of all, hold rounding errors alone.
 MIN_INFORMATION_SHARE = 1e-13
 UNDETERMINED = "the LEDs in view do not determine a position"
 # Smallest diagonal element of the triangular factor, with columns of unit length, of a determined pose.

@@ -41,9 +41,9 @@ Fitted = tuple[PhotometricFit, Pose, Nuisances]
 MAX_STEPS = 40
 # Images that a step moves by less are next to those after it: a small share of the shift that `camera_check` tolerates.
 MAX_LAST_PX = 3e-4
-# A step of up to a third of a standard deviation, squared, is the last where it moves no image by more, and where it is
-# a tenth of the one before: a tenth of it is left.
-MAX_LAST_STEP2, MAX_LAST_RATIO2, MAX_LEFT_PX = 0.1, 0.01, 1e-4
+# A step of up to a third of a standard deviation, squared, is the last where it moves no image by more and is a tenth
+# of the one before: a tenth of it is left. In images with a smaller radius weights settle later than the pose.
+MAX_LAST_STEP2, MAX_LAST_RATIO2, MAX_LEFT_PX, MIN_LARGE_PX = 0.1, 0.01, 1e-4, 10.0
 # A search that ends by the number of its steps has converged if they are shorter than a standard deviation, squared.
 MAX_CIRCLE2 = 1.0
 # Points of a rim whose movement is looked at.
@@ -153,6 +153,7 @@ class Search:
         rims_px: Floats | None = None
         checked, moved_px, length2 = None, np.inf, 0.0
         damping, shortened, steps = self._first_damping, 0, 0
+        are_large = bool(pixels.radius_px.min() > MIN_LARGE_PX)
         for _ in range(MAX_STEPS):
             state = nuisances.state(pose, camera, priors)
             rendered = self._rendered(state)
@@ -205,7 +206,7 @@ class Search:
                 pose, nuisances = self._moved(accepted, step, factor)
                 rims_px = self._rims_px(nuisances.state(pose, camera, priors))
             before2, length2 = length2, step.step2 * factor**2
-            converged = is_last(length2, before2, moved_px) and short and damping == 0
+            converged = is_last(length2, before2, moved_px, are_large) and short and damping == 0
             converged &= priors.exact or moved_px < CONVERGED_PX
             if damping > 0:
                 damping *= DAMPING_RATIO ** (-1 if short else moved_px > 4 * pixels.max_move_px)
@@ -280,13 +281,15 @@ class Search:
         return state.project(points_m.reshape(-1, 3)).pixels.reshape(-1, RIM_POINTS, 2)
 
 
-def is_last(length2: float, before2: float, moved_px: float) -> bool:
-    """Whether a step leaves next to nothing: one of a length, squared, after another, 0 for none, in standard
-    deviations, that moved an image by `moved_px` at most.
+def is_last(length2: float, before2: float, moved_px: float, are_large: bool) -> bool:
+    """Whether a step leaves next to nothing: one of a length, squared, after another, 0 for none.
+
+    Lengths are in standard deviations. It moved an image by `moved_px` at most; `are_large` says whether images are
+    larger than MIN_LARGE_PX.
     """
     if length2 < CONVERGED_STEP2:
         return True
-    return moved_px < MAX_LEFT_PX and length2 < min(MAX_LAST_STEP2, MAX_LAST_RATIO2 * before2)
+    return are_large and moved_px < MAX_LEFT_PX and length2 < min(MAX_LAST_STEP2, MAX_LAST_RATIO2 * before2)
 
 
 def step_factor(step: Solution, before: Solution, factor: float) -> float:
