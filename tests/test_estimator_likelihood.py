@@ -13,6 +13,7 @@ from test_estimator_maximum_likelihood import frame_of
 from estimator.camera.pose import Pose
 from estimator.camera.projection import project
 from estimator.io.device import DeviceFrame
+from estimator.pixels.goodness_of_fit import excess_chi2
 from estimator.pixels.led_model import IMAGE_PARAMETERS, PROFILE_PARAMETERS, ImageState
 from estimator.pixels.led_pixels import (
     MAX_IMAGE_SIGMA_PX,
@@ -26,7 +27,6 @@ from estimator.pixels.likelihood import (
     COEFFICIENTS,
     Noise,
     PhotometricFit,
-    excess_chi2,
     fit_photometry,
     score,
 )

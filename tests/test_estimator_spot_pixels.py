@@ -6,7 +6,7 @@ import pytest
 from estimator_synthetic import Array
 
 from estimator.spots.boxes import boxes_around, overlapping
-from estimator.spots.led_light import Ellipse
+from estimator.spots.led_light import Ellipse, Readout, light_of
 from estimator.spots.spot_pixels import (
     above_half_level,
     around_face,
@@ -161,3 +161,44 @@ def test_a_face_is_padded_as_any_mask(number: int) -> None:
         level = 1 + 0.002 * (middle[0] - 25) - 0.003 * (middle[1] - 20)
         np.testing.assert_allclose(plane[:2], middle, rtol=1e-12)
         np.testing.assert_allclose(plane[2:], [0.002 / level, -0.003 / level], rtol=1e-4)
+
+
+@pytest.mark.parametrize("background_e", [0.0, 40.0])
+@pytest.mark.parametrize("amplitude_e", [0.5, 3.0, 30.0, 3000.0])
+def test_the_background_and_its_excess_variance_are_those_of_the_ring(background_e: float, amplitude_e: float) -> None:
+    """By NumPy's means, medians and variances; backgrounds with a structure have an excess."""
+    rng = np.random.default_rng(int(amplitude_e))
+    ellipse = Ellipse((30.0, 30.0), (1.0, 0.0), (4.2, 4.2), (0.0, 0.0), (60.0, 60.0), 50, 1.0)
+    v, u = np.mgrid[:60, :60] + 0.5
+    off_px = np.hypot(u - 30, v - 30)
+    mean = background_e * (1 + 0.5 * (u % 4 < 2)) + amplitude_e * (off_px < 4)
+    image = (rng.poisson(mean) + rng.normal(0, 2.0, mean.shape)).astype(np.float32)
+    light = light_of(Readout(0, 0, image, image, np.zeros(image.shape, bool), 4.0, 0.01), ellipse, [], 0)
+
+    electrons = image.astype(np.float64)
+    variance_e2 = np.maximum(electrons, 0) + 4.0 + (0.01 * np.maximum(electrons, 0)) ** 2
+    support, ring = off_px <= 6.2, (off_px > 6.2) & (off_px <= 9.2)
+    gate_e = 3 * np.sqrt(np.median(variance_e2[ring]) + 1)
+    even = ring & (abs(electrons - np.median(electrons[ring])) <= gate_e)
+    above_e = electrons - electrons[even].mean()
+    excess_e2 = electrons[even].var(ddof=1) - variance_e2[even].mean()
+    if excess_e2 <= 4 * np.sqrt(2 / even.sum()) * variance_e2[even].mean():
+        excess_e2 = 0.0
+    assert (excess_e2 > 0) == (background_e > 0)
+    variance_e2[support & (above_e <= gate_e)] += excess_e2
+    here = np.s_[light.top : light.top + light.support.shape[0], light.left : light.left + light.support.shape[1]]
+    np.testing.assert_array_equal(light.support, support[here])
+    np.testing.assert_allclose(light.signal_e, np.where(support, above_e, 0.0)[here], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(light.variance_e2, variance_e2[here], rtol=1e-9)
+    noise_e2 = variance_e2[support].sum()
+    assert light.sums.signal_to_noise == pytest.approx(above_e[support].sum() / np.sqrt(noise_e2), rel=1e-9)
+    offsets = np.stack([u[support] - light.sums.u, v[support] - light.sums.v])
+    covariance_px2 = (variance_e2[support] * offsets) @ offsets.T / light.sums.flux**2
+    np.testing.assert_allclose(light.covariance_px2(0), covariance_px2, rtol=1e-8, atol=1e-9 * covariance_px2.max())
+    moments_px2 = (above_e[support] * offsets) @ offsets.T / light.sums.flux
+    expected_px2 = moments_px2[0, 0], moments_px2[0, 1], moments_px2[1, 1]
+    np.testing.assert_allclose(light.sums.moments_px2(), expected_px2, rtol=1e-8, atol=1e-9 * abs(moments_px2).max())
+    for sigma, offset in zip(light.sums.moment_sigmas_px2(), offsets, strict=True):
+        moment = (above_e[support] * offset**2).sum() / light.sums.flux
+        expected = np.sqrt((variance_e2[support] * (offset**2 - moment) ** 2).sum()) / abs(light.sums.flux)
+        assert abs(sigma) == pytest.approx(expected, rel=1e-6)

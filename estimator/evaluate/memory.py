@@ -14,8 +14,8 @@ _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 def keep_freed_memory() -> bool:
     """Keep memory that is freed for the next frame, where the C library can (glibc); returns whether it does.
 
-    By default it goes back to the system, which clears the next frame's page by page: a fifth of the time of a frame of
-    LED regions. For a process of our own alone, since it holds for all that the process allocates.
+    By default it goes back to the system, which clears the next frame's page by page: a tenth of the time of a frame of
+    LED regions by `ml`. For a process of our own alone, since it holds for all that the process allocates.
     """
     try:
         mallopt = ctypes.CDLL(None).mallopt

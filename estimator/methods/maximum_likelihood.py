@@ -50,7 +50,7 @@ from estimator.pixels.led_model import (
     PRINCIPAL_POINT,
     PROFILE_PARAMETERS,
     SIZE_PARAMETER,
-    rims,
+    rims_of,
 )
 from estimator.pixels.led_pixels import LedPixels, LedsInView, gather_led_pixels, leds_in_view
 from estimator.pixels.likelihood import Noise, fit_photometry, score
@@ -380,7 +380,7 @@ def _shape_sigma_px(frame: DeviceFrame, priors: Priors, start: Start) -> float:
         return 0.0
     every_led = tuple(frame.leds.values())
     leds = [every_led[k] for k in located]
-    rims_m = rims(leds, RIM_POINTS)
+    rims_m = rims_of(leds, RIM_POINTS)
     state = start.nuisances.state(start.pose, frame.camera, priors).of(located)
     centres_m = np.array([led.position_m for led in leds]) + state.shifts_m
     points_m = np.concatenate([centres_m[:, None], centres_m[:, None] + rims_m], axis=1)

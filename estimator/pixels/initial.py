@@ -18,7 +18,7 @@ from estimator.pixels.led_model import (
     LOCAL_PARAMETERS,
     SIZE_PARAMETER,
     ImageState,
-    rims,
+    rims_of,
 )
 from estimator.pixels.nuisances import (
     NO_COMPONENTS,
@@ -131,7 +131,7 @@ def _sizes_of_spots(spots: Sequence[Correspondence], state: ImageState, priors: 
     sigma = priors.leds[:, SIZE]
     if not sigma.any():
         return np.zeros(len(spots))
-    rims_m = state.rims_m(rims([one.led for one in spots], COARSE_POINTS)) + (
+    rims_m = state.rims_m(rims_of([one.led for one in spots], COARSE_POINTS)) + (
         priors.positions_m[:, None] + state.shifts_m[:, None]
     )
     u, v = state.project(rims_m.reshape(-1, 3)).pixels.reshape(len(spots), COARSE_POINTS, 2).T

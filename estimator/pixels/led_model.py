@@ -140,7 +140,7 @@ def led_footprints(leds: Sequence[Led], state: ImageState) -> LedFootprints:
     """Footprints of LEDs under a state."""
     pose, camera = state.pose, state.camera
     centres_m = np.array([led.position_m for led in leds]) + state.shifts_m
-    rims_m = state.rims_m(rims(leds, COARSE_POINTS)) + centres_m[:, None]
+    rims_m = state.rims_m(rims_of(leds, COARSE_POINTS)) + centres_m[:, None]
     projected = state.project(rims_m.reshape(-1, 3))
     pixels = projected.pixels.reshape(len(leds), COARSE_POINTS, 2)
     from_above = centres_m[:, 2] <= pose.position_m[2]
@@ -170,7 +170,7 @@ def rim(led: Led, points: int) -> Floats:
     return np.asarray(led.half_width_m * _unit_rim(led.shape, points))
 
 
-def rims(leds: Sequence[Led], points: int) -> Floats:
+def rims_of(leds: Sequence[Led], points: int) -> Floats:
     """Polygons of n faces, (n, points, 3), each as by `rim`."""
     half_widths_m = np.array([led.half_width_m for led in leds])
     return np.asarray(half_widths_m[:, None, None] * np.array([_unit_rim(led.shape, points) for led in leds]))

@@ -9,6 +9,7 @@ from estimator.camera.pose import POSE_PARAMETERS, Pose
 from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame
 from estimator.pixels.elimination import Solution, solve, square_root
+from estimator.pixels.goodness_of_fit import excess_chi2
 from estimator.pixels.initial import CONVERGED_STEP2, tuned
 from estimator.pixels.led_model import (
     IMAGE_PARAMETERS,
@@ -19,10 +20,10 @@ from estimator.pixels.led_model import (
     TILT_PARAMETERS,
     ImageState,
     RenderedLeds,
-    rims,
+    rims_of,
 )
 from estimator.pixels.led_pixels import LedPixels
-from estimator.pixels.likelihood import Noise, PhotometricFit, excess_chi2, fit_photometry, score
+from estimator.pixels.likelihood import Noise, PhotometricFit, fit_photometry, score
 from estimator.pixels.nuisances import (
     PROFILE,
     SIZE,
@@ -137,7 +138,7 @@ class Search:
         self._first_damping = damping
         self._to_check = to_check
         # Of a large LED, a point of the rim moves more than the centre.
-        self._rims_m = rims(pixels.leds, RIM_POINTS)
+        self._rims_m = rims_of(pixels.leds, RIM_POINTS)
         self._centres_m = np.array([led.position_m for led in pixels.leds])
         self._origin_px = self._rims_px(pixels.state)
 
