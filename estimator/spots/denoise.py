@@ -44,11 +44,7 @@ def neighbourhood_mean(image: Image) -> Image:
     (Eq. 14), the adjusted intensity c - mu_S is the mean of the c_k, and c itself cancels. sigma_S is not used.
     Near the image's border the mean is over the neighbours inside the image.
     """
-    # Zeros outside the image do not change the sum, and the count omits them.
-    size = (NEIGHBOURHOOD_PX, NEIGHBOURHOOD_PX)
-    result = cv2.boxFilter(image, cv2.CV_32F, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
-    _turn_into_means(result, np.ascontiguousarray(image))
-    return np.asarray(result, dtype=np.float32)
+    return _neighbour_means(np.ascontiguousarray(image))
 
 
 def algorithm_1(image: Image) -> Image:
@@ -126,17 +122,30 @@ DENOISERS: dict[str, Denoiser] = {
 
 
 @compiled
-def _turn_into_means(sums: Image, image: Image) -> None:
-    """Turn sums over pixels and their neighbours inside the image into the neighbours' means."""
+def _neighbour_means(image: Image) -> Image:
+    """See `neighbourhood_mean`: sums down the columns move with the row, and those along it are of pairs of columns."""
     height, width = image.shape
-    columns = np.empty(width, dtype=np.float32)
+    result, outside = np.empty((height, width), dtype=np.float32), np.zeros(width, dtype=np.float32)
+    # Sums of 11 rows in double precision, with zeros beside the image, which the counts omit.
+    columns, pairs = np.zeros(width + NEIGHBOURHOOD_PX - 1), np.empty(width + NEIGHBOURHOOD_PX - 1)
+    inner, counts = columns[NEIGHBOURHOOD_RADIUS_PX : NEIGHBOURHOOD_RADIUS_PX + width], np.empty(width, np.float32)
     for column in range(width):
-        columns[column] = _count(column, width)
-    for row in range(height):
-        rows, line, line_sums = np.float32(_count(row, height)), image[row], sums[row]
+        counts[column] = _count(column, width)
+    for row in range(-NEIGHBOURHOOD_RADIUS_PX, height):
+        entering, leaving = row + NEIGHBOURHOOD_RADIUS_PX, row - NEIGHBOURHOOD_RADIUS_PX - 1
+        below, above = image[entering] if entering < height else outside, image[leaving] if leaving >= 0 else outside
         for column in range(width):
-            others = rows * columns[column] - np.float32(1)
-            line_sums[column] = (line_sums[column] - line[column]) / (others if others > 1 else np.float32(1))
+            inner[column] += np.float64(below[column]) - np.float64(above[column])
+        if row < 0:
+            continue
+        rows, own, means = np.float32(_count(row, height)), image[row], result[row]
+        for place in range(len(pairs) - 1):
+            pairs[place] = columns[place] + columns[place + 1]
+        for k in range(width):
+            total = pairs[k] + pairs[k + 2] + pairs[k + 4] + pairs[k + 6] + pairs[k + 8] + columns[k + 10]
+            others = rows * counts[k] - np.float32(1)
+            means[k] = (np.float32(total) - own[k]) / (others if others > 1 else np.float32(1))
+    return result
 
 
 @compiled
