@@ -8,6 +8,7 @@ from estimator_synthetic import Array
 from estimator.spots.boxes import boxes_around, overlapping
 from estimator.spots.led_light import Ellipse, Readout, light_of
 from estimator.spots.spot_pixels import (
+    LEVEL,
     above_half_level,
     around_face,
     brightest,
@@ -15,7 +16,7 @@ from estimator.spots.spot_pixels import (
     ellipse_spans,
     median,
     padded,
-    piece_sums,
+    pieces_of,
 )
 
 
@@ -28,12 +29,9 @@ def test_a_mask_is_padded_by_the_pixels_at_most_a_radius_from_it(radius_px: floa
         mask.ravel()[rng.integers(0, mask.size, 3)] = True
         at, pixels = np.argwhere(mask), np.argwhere(np.ones(shape, dtype=bool))
         nearest2 = ((pixels[:, None] - at) ** 2).sum(axis=2).min(axis=1).reshape(shape)
-        near, nearby, _ = padded(mask, radius_px, radius_px + 3.0, 0.0)
+        near, nearby = padded(mask, radius_px, radius_px + 3.0)
         np.testing.assert_array_equal(near, nearest2 <= radius_px**2)
         np.testing.assert_array_equal(nearby, nearest2 <= (radius_px + 3.0) ** 2)
-        none, _, outside = padded(~mask, 0.0, 0.0, radius_px)
-        np.testing.assert_array_equal(none, ~mask)
-        np.testing.assert_array_equal(outside, near)
 
 
 def test_the_median_is_numpys() -> None:
@@ -128,35 +126,56 @@ def pieces() -> list[Array]:
 def test_sums_over_a_piece_are_those_over_its_pixels(number: int) -> None:
     """Pieces told without a search are found as one by OpenCV. A plateau of 100 e has its half level at 50 e."""
     mask = pieces()[number]
-    row, column = np.nonzero(mask)
-    products = np.stack([np.ones_like(row), column, row, column**2, column * row, row**2]).sum(axis=1)
-    box = column.min(), row.min(), column.max(), row.max()
-    assert piece_sums(mask) == (tuple(products.tolist()), tuple(int(end) for end in box))
+    expected = piece(mask)
+    np.testing.assert_array_equal(pieces_of(mask.astype(np.int32), 2), [piece(mask & ~mask), expected])
 
     smooth = np.where(mask, 100.0, 49.0).astype(np.float32)
-    core, sums, solid = above_half_level(smooth, 0, 0, np.ones(mask.shape, dtype=bool), 0.0)
+    core, alone, solid = above_half_level(smooth, 0, 0, np.ones(mask.shape, dtype=bool), 0.0)
     if mask.mean() > 0.25:  # so that the upper quartile is of the plateau
         np.testing.assert_array_equal(core, mask)
-        assert sums == piece_sums(mask)
         is_one = cv2.connectedComponents(mask.view(np.uint8), connectivity=8)[0] == 2
         assert is_one if solid else number >= 6
+        np.testing.assert_array_equal(alone, expected if solid else piece(mask & ~mask))
+
+
+def piece(mask: Array) -> Array:
+    """Sums of 1, u, v, u^2, u v and v^2 over the pixels of a mask, and the box around them, by NumPy."""
+    row, column = np.nonzero(mask)
+    sums = np.stack([np.ones_like(row), column, row, column**2, column * row, row**2]).sum(axis=1)
+    first = column.min(initial=mask.shape[1]), row.min(initial=mask.shape[0])
+    return np.array([*sums, *first, column.max(initial=-1), row.max(initial=-1)])
+
+
+def test_pieces_are_told_apart_by_their_numbers() -> None:
+    """Of 0 to 4, the last of them without pixels, in runs that adjoin each other."""
+    numbers = np.random.default_rng(9).integers(0, 4, (20, 30)).astype(np.int32)
+    numbers[5, 3:20] = 2
+    found = pieces_of(numbers, 5)
+    for number in range(1, 5):
+        np.testing.assert_array_equal(found[number], piece(numbers == number))
+    np.testing.assert_array_equal(found[0], piece(numbers == 9))
 
 
 @pytest.mark.parametrize("number", range(len(pieces())))
 def test_a_face_is_padded_as_any_mask(number: int) -> None:
     """Support and ring by `padded`, and the plane of the light inside by its own slopes: it follows one, without noise.
 
+    A face without 20 pixels inside tells no plane.
+
     Rounding: products of float32, 1e-7 of the light, by levers of ten pixels and more.
     """
     face = pieces()[number]
     v, u = np.mgrid[:40, :50] + 0.5
     image = (1000.0 * (1 + 0.002 * (u - 25) - 0.003 * (v - 20))).astype(np.float32)
-    for margin_px, border_px in ((2.0, 2.0), (7.0, 0.0), (0.5, 4.3)):
+    for margin_px, border_px in ((2.0, 2.0), (7.0, 0.0), (0.5, 4.3), (2.0, 14.2)):
         support, ring, plane = around_face(image, 0, 0, face, margin_px, 3.0, border_px)
-        near, nearby, outside = padded(face, margin_px, margin_px + 3.0, border_px)
+        near, nearby = padded(face, margin_px, margin_px + 3.0)
         np.testing.assert_array_equal(support, near)
         np.testing.assert_array_equal(ring, np.argwhere(nearby & ~near))
-        inside = ~outside
+        inside = ~padded(~face, border_px, 0.0)[0]
+        if inside.sum() < 20:
+            assert plane == LEVEL
+            continue
         middle = u[inside].mean(), v[inside].mean()
         level = 1 + 0.002 * (middle[0] - 25) - 0.003 * (middle[1] - 20)
         np.testing.assert_allclose(plane[:2], middle, rtol=1e-12)

@@ -34,10 +34,13 @@ from estimator.spots.led_light import (
     Pair,
     Pixels,
     Readout,
+    centroid_on,
     light_of,
+    light_on,
+    surface_of,
 )
 from estimator.spots.sampling import PIXEL_VARIANCE, SHARP, LensBlur, sampling_error, sampling_variance_px2
-from estimator.spots.spot_pixels import Piece, above_half_level, brightest, piece_sums
+from estimator.spots.spot_pixels import Ints, Long, above_half_level, brightest, pieces_of
 
 # Share of the brightest level: above ceiling and walls at 1/100 of an LED, below an LED at a quarter of it.
 THRESHOLD_OF_BRIGHTEST = 0.05
@@ -258,35 +261,39 @@ def _ellipses(
         if not MIN_BLOB_PX <= area_px <= largest_px:
             small, large = small + (area_px < MIN_BLOB_PX), large + (area_px > largest_px)
             continue
-        core, sums, solid = above_half_level(smooth, left, top, blob.view(np.bool_), background_e)
-        pieces, alone = ([(core, sums)], True) if solid else _pieces(core)
-        ellipses += [_ellipse(*piece, left, top, stretch, alone) for piece in pieces]
+        core, piece, solid = above_half_level(smooth, left, top, blob.view(np.bool_), background_e)
+        numbers, pieces, alone = (core.view(np.uint8), [(1, piece)], True) if solid else _pieces(core)
+        ellipses += [_ellipse(numbers, *of_piece, left, top, stretch, alone) for of_piece in pieces]
     return ellipses, (small, large)
 
 
-def _pieces(core: Mask) -> tuple[list[tuple[Mask, Piece]], bool]:
-    """Pieces of a mask that count as LED images, with their sums, and whether there is no other piece."""
-    count, numbers = cv2.connectedComponents(core.view(np.uint8), connectivity=8)
-    own = np.array([1])
-    if count > 2:
-        areas = np.bincount(numbers.ravel())[1:]
-        own = np.flatnonzero(areas >= MIN_PIECE * areas.max()) + 1
-    pieces = [numbers == number for number in own.tolist()]
-    return [(piece, piece_sums(piece)) for piece in pieces], count == 2
-
-
-def _ellipse(piece: Mask, sums: Piece, left: int, top: int, stretch: float, alone: bool) -> Ellipse:
-    """Ellipse with the centroid and second moments of a piece by its sums; (left, top) is its mask's first pixel.
-
-    The mask has the size of the box around the piece's blob, which is its fringe if it is `alone` in it.
+def _pieces(core: Mask) -> tuple[Ints, list[tuple[int, Long]], bool]:
+    """Numbers of the pixels of a mask by piece, the pieces that count as LED images with theirs, and whether there is
+    no other piece.
     """
-    (count, of_u, of_v, of_uu, of_uv, of_vv), (first_column, first_row, last_column, last_row) = sums
+    count, labels = cv2.connectedComponents(core.view(np.uint8), connectivity=8)
+    numbers: Ints = np.asarray(labels, dtype=np.int32)
+    pieces = pieces_of(numbers, count)
+    areas = pieces[:, 0].tolist()
+    least = MIN_PIECE * max(areas)
+    return numbers, [(number, pieces[number]) for number in range(1, count) if areas[number] >= least], count == 2
+
+
+def _ellipse(
+    numbers: NDArray[np.integer], number: int, piece: Long, left: int, top: int, stretch: float, alone: bool
+) -> Ellipse:
+    """Ellipse with the centroid and second moments of a piece, which is the pixels with its number.
+
+    (left, top) is the first of the pixels. They are the box around the piece's blob, which is its fringe if it is
+    `alone` in it.
+    """
+    count, of_u, of_v, of_uu, of_uv, of_vv, first_column, first_row, last_column, last_row = piece.tolist()
     # Sums of whole numbers: exact before they are divided.
     uu, uv, vv = count * of_uu - of_u * of_u, count * of_uv - of_u * of_v, count * of_vv - of_v * of_v
     variances, axis = _principal_axes(uu / count**2, uv / count**2, vv / count**2)
     semi_axes_px = _semi_axes_px(variances, stretch)
     uses_core = semi_axes_px[0] > (LARGE_PX if stretch == 1.0 else SMALL_PX)
-    height, width = piece.shape
+    height, width = numbers.shape
     wider_px = max(first_column, first_row, width - last_column - 1, height - last_row - 1)
     return Ellipse(
         centre_px=(of_u / count + left + 0.5, of_v / count + top + 0.5),
@@ -297,7 +304,7 @@ def _ellipse(piece: Mask, sums: Piece, left: int, top: int, stretch: float, alon
         area_px=count,
         stretch=stretch,
         fringe_px=_fringe_px(wider_px, semi_axes_px[0]) if alone else 0.0,
-        core=piece[first_row : last_row + 1, first_column : last_column + 1] if uses_core else None,
+        core=numbers[first_row : last_row + 1, first_column : last_column + 1] == number if uses_core else None,
     )
 
 
@@ -404,15 +411,15 @@ def _measure(
     sharp_reach_px: int | None,
 ) -> _Measured | None:
     """Centroid and covariance of one spot; None if its signal-to-noise ratio is too small."""
-    light = light_of(readout, ellipse, others, denoise_radius_px)
-    if light.sums.signal_to_noise <= MIN_SIGNAL_TO_NOISE:
+    surface = surface_of(readout, ellipse, others, denoise_radius_px)
+    light = light_on(surface, readout) if with_covariance else None
+    sums = centroid_on(surface, readout) if light is None else light.sums
+    if sums.signal_to_noise <= MIN_SIGNAL_TO_NOISE:
         return None
-    height, width = light.support.shape
-    rectangle = light.left, light.top, width, height
-    row, column, saturated = brightest(readout.image_e, readout.clipped, *rectangle, ellipse.form(0.0))
-    if sharp_reach_px is not None and max(ellipse.semi_axes_px) <= TINY_PX:
+    row, column, saturated = brightest(readout.image_e, readout.clipped, *surface.rectangle, ellipse.form(0.0))
+    if light is not None and sharp_reach_px is not None and max(ellipse.semi_axes_px) <= TINY_PX:
         light = light.lit(sharp_reach_px)[0]
-    sums = light.sums
+        sums = light.sums
     height_px, width_px = readout.image_e.shape
     margin_px = MARGIN_PX + max(denoise_radius_px, ellipse.fringe_px)
     (left, top), (right, bottom) = ellipse.low_px, ellipse.high_px
@@ -420,7 +427,7 @@ def _measure(
     spot = Spot(
         u_px=sums.u + readout.column,
         v_px=sums.v + readout.row,
-        covariance_px2=light.covariance_px2(denoise_radius_px) if with_covariance else UNKNOWN,
+        covariance_px2=UNKNOWN if light is None else light.covariance_px2(denoise_radius_px),
         brightest_u_px=column + 0.5 + readout.column,
         brightest_v_px=row + 0.5 + readout.row,
         area_px=ellipse.area_px,

@@ -17,12 +17,18 @@ from numpy.typing import NDArray
 from estimator.spots.spot_pixels import (
     BACKGROUND_SIGMA,
     LEVEL,
+    Background,
     Form,
+    Noise,
+    Plane,
     around_ellipse,
     around_face,
+    background_of,
+    centroid_within,
     light_sums,
     light_within,
     median,
+    share_among,
 )
 
 Pixels = NDArray[np.float64]
@@ -39,7 +45,6 @@ SIGMA_OF_MEDIAN = 1.4826
 LIT_SHARE = 0.1
 # Pieces of a blob count as separate LED images from this share of the largest piece on, by area or by light.
 MIN_PIECE = 0.2
-NO_FORMS = np.empty((0, 5))
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +64,11 @@ class Readout:
     floor_e2: float = 0.0
     prnu: float = 0.0
     rounding_e2: float = 0.0
+
+    @property
+    def noise(self) -> Noise:
+        """A pixel's noise as `estimator.spots.spot_pixels` takes it."""
+        return self.floor_e2, self.prnu, self.rounding_e2
 
     def contiguous(self) -> "Readout":
         """The region with its images row by row in memory, as compiled loops take them."""
@@ -102,22 +112,23 @@ class Ellipse:
 
 
 class LightSums(NamedTuple):
-    """Sums over the pixels of an LED image: flux and centroid (u, v) of the signal, its sums times du^2, du dv and dv^2
-    about the centroid, and those of the pixels' variances times 1, du^2, du dv, dv^2, du^4 and dv^4.
+    """Sums over the pixels of an LED image: flux and centroid (u, v) of the signal, and the pixels' variances; then the
+    signal times du^2, du dv and dv^2 about the centroid, and the variances times du^2, du dv, dv^2, du^4 and dv^4. The
+    latter are NaN where they were not asked for.
     """
 
     flux: float
     u: float
     v: float
-    uu: float
-    uv: float
-    vv: float
     noise: float
-    noise_uu: float
-    noise_uv: float
-    noise_vv: float
-    noise_uuuu: float
-    noise_vvvv: float
+    uu: float = math.nan
+    uv: float = math.nan
+    vv: float = math.nan
+    noise_uu: float = math.nan
+    noise_uv: float = math.nan
+    noise_vv: float = math.nan
+    noise_uuuu: float = math.nan
+    noise_vvvv: float = math.nan
 
     @property
     def signal_to_noise(self) -> float:
@@ -228,8 +239,23 @@ class Light:
         return np.array([[np.einsum("ij,ij", of_u, along_u), mixed], [mixed, np.einsum("ij,ij", of_v, along_v)]])
 
 
-def light_of(readout: Readout, ellipse: Ellipse, others: list[Ellipse], denoise_radius_px: int) -> Light:
-    """Light in the ellipse and a margin; the background is that of a ring around them."""
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """The pixels that hold the light of an LED image, and its background.
+
+    They are a rectangle (left, top, width, height) of the region, and in it the `support` (height, width).
+    `illumination` is that by the lens, `ring_off_e` (n,) is how far pixels of the ring are from the background.
+    """
+
+    rectangle: tuple[int, int, int, int]
+    support: Mask
+    illumination: Plane
+    background: Background
+    ring_off_e: Pixels
+
+
+def surface_of(readout: Readout, ellipse: Ellipse, others: list[Ellipse], denoise_radius_px: int) -> Surface:
+    """The ellipse and a margin, without what is of the others; the background is that of a ring around them."""
 
     def margin_px(of: Ellipse) -> float:
         return MARGIN_PX + max(denoise_radius_px, of.fringe_px)
@@ -245,16 +271,33 @@ def light_of(readout: Readout, ellipse: Ellipse, others: list[Ellipse], denoise_
         face[row : row + ellipse.core.shape[0], column : column + ellipse.core.shape[1]] = ellipse.core
         paddings_px = own_px, RING_PX, SMOOTHING_PX // 2 + ellipse.fringe_px
         support, ring, illumination = around_face(readout.image_e, left, top, face, *paddings_px)
-    padded, bare = NO_FORMS, NO_FORMS
     if others:
         padded = np.array([other.form(margin_px(other)) for other in others])
         bare = np.array([other.form(0.0) for other in others])
-    shared = ellipse.form(own_px), padded, bare
-    noise = readout.floor_e2, readout.prnu, readout.rounding_e2
-    above_e, variance_e2, gate_e, off_e, sums = light_within(
-        readout.image_e, readout.raw_e, left, top, support, ring, illumination, *shared, *noise
-    )
-    return Light(left, top, support, above_e, variance_e2, gate_e, off_e, LightSums(*sums))
+        ring = share_among(support, ring, left, top, ellipse.form(own_px), padded, bare)
+    background, off_e = background_of(readout.image_e, readout.raw_e, left, top, ring, illumination, readout.noise)
+    return Surface((left, top, width, height), support, illumination, background, off_e)
+
+
+def light_of(readout: Readout, ellipse: Ellipse, others: list[Ellipse], denoise_radius_px: int) -> Light:
+    """Light on the `surface_of` an ellipse."""
+    return light_on(surface_of(readout, ellipse, others, denoise_radius_px), readout)
+
+
+def light_on(surface: Surface, readout: Readout) -> Light:
+    """Light on a surface of a region."""
+    left, top, *_ = surface.rectangle
+    on = left, top, surface.support, surface.illumination, surface.background
+    above_e, variance_e2, sums = light_within(readout.image_e, readout.raw_e, *on, readout.noise)
+    _, gate_e, _ = surface.background
+    return Light(left, top, surface.support, above_e, variance_e2, gate_e, surface.ring_off_e, LightSums(*sums))
+
+
+def centroid_on(surface: Surface, readout: Readout) -> LightSums:
+    """The sums of `light_on` a surface without moments."""
+    left, top, *_ = surface.rectangle
+    on = left, top, surface.support, surface.illumination, surface.background
+    return LightSums(*centroid_within(readout.image_e, readout.raw_e, *on, readout.noise))
 
 
 def _surroundings(ellipse: Ellipse, padding_px: float, shape: tuple[int, ...]) -> tuple[int, int, int, int]:
