@@ -22,7 +22,7 @@ from estimator.spots.denoise import (
     variance_stabilised,
 )
 from estimator.spots.led_light import Light, LightSums
-from estimator.spots.spot_pixels import light_sums
+from estimator.spots.light_loops import light_sums
 
 
 def test_each_pixel_becomes_the_mean_of_its_120_neighbours() -> None:

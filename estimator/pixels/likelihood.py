@@ -29,7 +29,7 @@ from estimator.compiled import compiled, compiled_sums
 from estimator.io.device import DeviceFrame
 from estimator.pixels.led_model import IMAGE_PARAMETERS, LOCAL_PARAMETERS, PROFILE_PARAMETERS, RenderedLeds
 from estimator.pixels.led_pixels import LedPixels
-from estimator.spots.spot_pixels import MAX_ROUNDING_SHARE
+from estimator.spots.light_loops import MAX_ROUNDING_SHARE
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -39,8 +39,9 @@ from estimator.spots.led_light import (
     light_on,
     surface_of,
 )
+from estimator.spots.light_loops import above_half_level, brightest
 from estimator.spots.sampling import PIXEL_VARIANCE, SHARP, LensBlur, sampling_error, sampling_variance_px2
-from estimator.spots.spot_pixels import Ints, Long, above_half_level, brightest, pieces_of
+from estimator.spots.shape_loops import Ints, Long, ellipse_spans, only_piece, pieces_of
 
 # Share of the brightest level: above ceiling and walls at 1/100 of an LED, below an LED at a quarter of it.
 THRESHOLD_OF_BRIGHTEST = 0.05
@@ -261,7 +262,8 @@ def _ellipses(
         if not MIN_BLOB_PX <= area_px <= largest_px:
             small, large = small + (area_px < MIN_BLOB_PX), large + (area_px > largest_px)
             continue
-        core, piece, solid = above_half_level(smooth, left, top, blob.view(np.bool_), background_e)
+        core = above_half_level(smooth, left, top, blob.view(np.bool_), background_e)
+        piece, solid = only_piece(core)
         numbers, pieces, alone = (core.view(np.uint8), [(1, piece)], True) if solid else _pieces(core)
         ellipses += [_ellipse(numbers, *of_piece, left, top, stretch, alone) for of_piece in pieces]
     return ellipses, (small, large)
@@ -416,14 +418,16 @@ def _measure(
     sums = centroid_on(surface, readout) if light is None else light.sums
     if sums.signal_to_noise <= MIN_SIGNAL_TO_NOISE:
         return None
-    row, column, saturated = brightest(readout.image_e, readout.clipped, *surface.rectangle, ellipse.form(0.0))
+    left, top, *_ = surface.rectangle
+    inside = ellipse_spans(ellipse.form(0.0), *surface.rectangle)
+    row, column, saturated = brightest(readout.image_e, readout.clipped, left, top, inside)
     if light is not None and sharp_reach_px is not None and max(ellipse.semi_axes_px) <= TINY_PX:
         light = light.lit(sharp_reach_px)[0]
         sums = light.sums
     height_px, width_px = readout.image_e.shape
     margin_px = MARGIN_PX + max(denoise_radius_px, ellipse.fringe_px)
-    (left, top), (right, bottom) = ellipse.low_px, ellipse.high_px
-    outside_px = max(-left, -top, right - width_px, bottom - height_px)
+    (first_u, first_v), (last_u, last_v) = ellipse.low_px, ellipse.high_px
+    outside_px = max(-first_u, -first_v, last_u - width_px, last_v - height_px)
     spot = Spot(
         u_px=sums.u + readout.column,
         v_px=sums.v + readout.row,

@@ -14,22 +14,20 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.spots.spot_pixels import (
+from estimator.spots.light_loops import (
     BACKGROUND_SIGMA,
     LEVEL,
     Background,
-    Form,
     Noise,
     Plane,
-    around_ellipse,
-    around_face,
     background_of,
     centroid_within,
+    fall_off,
     light_sums,
     light_within,
     median,
-    share_among,
 )
+from estimator.spots.shape_loops import Form, around_ellipse, around_face, share_among
 
 Pixels = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -67,7 +65,7 @@ class Readout:
 
     @property
     def noise(self) -> Noise:
-        """A pixel's noise as `estimator.spots.spot_pixels` takes it."""
+        """A pixel's noise as `estimator.spots.light_loops` takes it."""
         return self.floor_e2, self.prnu, self.rounding_e2
 
     def contiguous(self) -> "Readout":
@@ -99,7 +97,7 @@ class Ellipse:
     core: Mask | None = None
 
     def form(self, padding_px: float) -> Form:
-        """The padded ellipse as `estimator.spots.spot_pixels` takes it."""
+        """The padded ellipse as `estimator.spots.shape_loops` takes it."""
         (u, v), (c, s), (a, b) = self.centre_px, self.axis, self.semi_axes_px
         along, across = (a + padding_px) ** -2, (b + padding_px) ** -2
         return u, v, c * c * along + s * s * across, c * s * (along - across), s * s * along + c * c * across
@@ -270,7 +268,8 @@ def surface_of(readout: Readout, ellipse: Ellipse, others: list[Ellipse], denois
         column, row = int(ellipse.low_px[0]) - left, int(ellipse.low_px[1]) - top
         face[row : row + ellipse.core.shape[0], column : column + ellipse.core.shape[1]] = ellipse.core
         paddings_px = own_px, RING_PX, SMOOTHING_PX // 2 + ellipse.fringe_px
-        support, ring, illumination = around_face(readout.image_e, left, top, face, *paddings_px)
+        support, ring, inside = around_face(face, *paddings_px)
+        illumination = fall_off(readout.image_e, left, top, inside) if inside.any() else LEVEL
     if others:
         padded = np.array([other.form(margin_px(other)) for other in others])
         bare = np.array([other.form(0.0) for other in others])

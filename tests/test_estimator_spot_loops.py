@@ -7,14 +7,12 @@ from estimator_synthetic import Array
 
 from estimator.spots.boxes import boxes_around, overlapping
 from estimator.spots.led_light import Ellipse, Readout, light_of
-from estimator.spots.spot_pixels import (
-    LEVEL,
-    above_half_level,
+from estimator.spots.light_loops import LEVEL, above_half_level, brightest, fall_off, median
+from estimator.spots.shape_loops import (
     around_face,
-    brightest,
     distance2,
     ellipse_spans,
-    median,
+    only_piece,
     padded,
     pieces_of,
 )
@@ -74,13 +72,13 @@ def test_of_equally_bright_pixels_in_an_ellipse_the_first_is_the_brightest() -> 
     for highest in (1, 2, 5, 1000):
         image = np.where(inside, rng.integers(0, highest, (60, 60)), 2000).astype(np.float32)
         row, column = np.unravel_index(np.argmax(np.where(inside, image, -1)), image.shape)
-        clipped = np.zeros((60, 60), dtype=bool)
+        clipped, spans = np.zeros((60, 60), dtype=bool), ellipse_spans(form, 15, 15, 30, 30)
         clipped[20, 30] = True
         assert not inside[20, 30]
-        assert brightest(image, clipped, 15, 15, 30, 30, form) == (row, column, False)
+        assert brightest(image, clipped, 15, 15, spans) == (row, column, False)
         clipped[28, 33] = True
         assert inside[28, 33]
-        assert brightest(image, clipped, 15, 15, 30, 30, form) == (row, column, True)
+        assert brightest(image, clipped, 15, 15, spans) == (row, column, True)
 
 
 def test_the_pixels_near_a_point_are_a_box_of_each_region_that_has_some() -> None:
@@ -130,12 +128,12 @@ def test_sums_over_a_piece_are_those_over_its_pixels(number: int) -> None:
     np.testing.assert_array_equal(pieces_of(mask.astype(np.int32), 2), [piece(mask & ~mask), expected])
 
     smooth = np.where(mask, 100.0, 49.0).astype(np.float32)
-    core, alone, solid = above_half_level(smooth, 0, 0, np.ones(mask.shape, dtype=bool), 0.0)
     if mask.mean() > 0.25:  # so that the upper quartile is of the plateau
-        np.testing.assert_array_equal(core, mask)
-        is_one = cv2.connectedComponents(mask.view(np.uint8), connectivity=8)[0] == 2
-        assert is_one if solid else number >= 6
-        np.testing.assert_array_equal(alone, expected if solid else piece(mask & ~mask))
+        np.testing.assert_array_equal(above_half_level(smooth, 0, 0, np.ones(mask.shape, dtype=bool), 0.0), mask)
+    alone, solid = only_piece(mask)
+    is_one = cv2.connectedComponents(mask.view(np.uint8), connectivity=8)[0] == 2
+    assert is_one if solid else number >= 6
+    np.testing.assert_array_equal(alone, expected if solid else piece(mask & ~mask))
 
 
 def piece(mask: Array) -> Array:
@@ -168,11 +166,12 @@ def test_a_face_is_padded_as_any_mask(number: int) -> None:
     v, u = np.mgrid[:40, :50] + 0.5
     image = (1000.0 * (1 + 0.002 * (u - 25) - 0.003 * (v - 20))).astype(np.float32)
     for margin_px, border_px in ((2.0, 2.0), (7.0, 0.0), (0.5, 4.3), (2.0, 14.2)):
-        support, ring, plane = around_face(image, 0, 0, face, margin_px, 3.0, border_px)
+        support, ring, inside = around_face(face, margin_px, 3.0, border_px)
         near, nearby = padded(face, margin_px, margin_px + 3.0)
         np.testing.assert_array_equal(support, near)
         np.testing.assert_array_equal(ring, np.argwhere(nearby & ~near))
-        inside = ~padded(~face, border_px, 0.0)[0]
+        np.testing.assert_array_equal(inside, ~padded(~face, border_px, 0.0)[0])
+        plane = fall_off(image, 0, 0, inside)
         if inside.sum() < 20:
             assert plane == LEVEL
             continue
