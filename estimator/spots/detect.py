@@ -15,6 +15,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from statistics import median
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -101,8 +102,7 @@ class Spot:
     flux_e: float = math.nan
 
 
-@dataclass(frozen=True, eq=False)
-class _Measured:
+class _Measured(NamedTuple):
     """A spot before the correction for sampling, and the sums over its light."""
 
     spot: Spot
@@ -246,9 +246,8 @@ def _ellipses(
     mask = (smooth > threshold_e).view(np.uint8)
     # Finding contours is a hundred times faster than labelling a large image.
     outlines, nesting = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    outer = (
-        [outline for outline, (*_, parent) in zip(outlines, nesting[0], strict=True) if parent < 0] if outlines else []
-    )
+    parents = nesting[0, :, 3].tolist() if outlines else []
+    outer = [outline for outline, parent in zip(outlines, parents, strict=True) if parent < 0]
     ellipses = []
     small, large = 0, 0
     for outline in sorted(outer, key=len, reverse=True)[:MAX_BLOBS]:
@@ -264,30 +263,25 @@ def _ellipses(
             continue
         core = above_half_level(smooth, left, top, blob.view(np.bool_), background_e)
         piece, solid = only_piece(core)
-        numbers, pieces, alone = (core.view(np.uint8), [(1, piece)], True) if solid else _pieces(core)
-        ellipses += [_ellipse(numbers, *of_piece, left, top, stretch, alone) for of_piece in pieces]
+        pieces, alone = ([(core, piece)], True) if solid else _pieces(core)
+        ellipses += [_ellipse(*of_piece, left, top, stretch, alone) for of_piece in pieces]
     return ellipses, (small, large)
 
 
-def _pieces(core: Mask) -> tuple[Ints, list[tuple[int, Long]], bool]:
-    """Numbers of the pixels of a mask by piece, the pieces that count as LED images with theirs, and whether there is
-    no other piece.
-    """
+def _pieces(core: Mask) -> tuple[list[tuple[Mask, Long]], bool]:
+    """Pieces of a mask that count as LED images, with their pixels, and whether there is no other piece."""
     count, labels = cv2.connectedComponents(core.view(np.uint8), connectivity=8)
     numbers: Ints = np.asarray(labels, dtype=np.int32)
     pieces = pieces_of(numbers, count)
     areas = pieces[:, 0].tolist()
     least = MIN_PIECE * max(areas)
-    return numbers, [(number, pieces[number]) for number in range(1, count) if areas[number] >= least], count == 2
+    return [(numbers == number, pieces[number]) for number in range(1, count) if areas[number] >= least], count == 2
 
 
-def _ellipse(
-    numbers: NDArray[np.integer], number: int, piece: Long, left: int, top: int, stretch: float, alone: bool
-) -> Ellipse:
-    """Ellipse with the centroid and second moments of a piece, which is the pixels with its number.
+def _ellipse(mask: Mask, piece: Long, left: int, top: int, stretch: float, alone: bool) -> Ellipse:
+    """Ellipse with the centroid and second moments of a piece; (left, top) is the first pixel of its mask.
 
-    (left, top) is the first of the pixels. They are the box around the piece's blob, which is its fringe if it is
-    `alone` in it.
+    The mask has the size of the box around the piece's blob, which is its fringe if it is `alone` in it.
     """
     count, of_u, of_v, of_uu, of_uv, of_vv, first_column, first_row, last_column, last_row = piece.tolist()
     # Sums of whole numbers: exact before they are divided.
@@ -295,7 +289,7 @@ def _ellipse(
     variances, axis = _principal_axes(uu / count**2, uv / count**2, vv / count**2)
     semi_axes_px = _semi_axes_px(variances, stretch)
     uses_core = semi_axes_px[0] > (LARGE_PX if stretch == 1.0 else SMALL_PX)
-    height, width = numbers.shape
+    height, width = mask.shape
     wider_px = max(first_column, first_row, width - last_column - 1, height - last_row - 1)
     return Ellipse(
         centre_px=(of_u / count + left + 0.5, of_v / count + top + 0.5),
@@ -306,7 +300,7 @@ def _ellipse(
         area_px=count,
         stretch=stretch,
         fringe_px=_fringe_px(wider_px, semi_axes_px[0]) if alone else 0.0,
-        core=numbers[first_row : last_row + 1, first_column : last_column + 1] == number if uses_core else None,
+        core=mask[first_row : last_row + 1, first_column : last_column + 1] if uses_core else None,
     )
 
 

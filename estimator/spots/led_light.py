@@ -237,8 +237,7 @@ class Light:
         return np.array([[np.einsum("ij,ij", of_u, along_u), mixed], [mixed, np.einsum("ij,ij", of_v, along_v)]])
 
 
-@dataclass(frozen=True, eq=False)
-class Surface:
+class Surface(NamedTuple):
     """The pixels that hold the light of an LED image, and its background.
 
     They are a rectangle (left, top, width, height) of the region, and in it the `support` (height, width).
