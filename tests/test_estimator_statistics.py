@@ -161,6 +161,8 @@ COVARIANCES = [
     ([1, 0.5, 0, 0.5 + 1e-5, 1, 0, 0, 0, 1], False),
     ([1, 1, 0, 1, 1, 0, 0, 0, 1], False),
     ([1, 2, 0, 2, 1, 0, 0, 0, 1], False),
+    ([1, 2, 2, 2, 1, 2, 2, 2, 1], False),  # eigenvalues 5, -1, -1: the determinant is positive
+    ([1, 0.8, -0.8, 0.8, 1, 0.8, -0.8, 0.8, 1], False),  # all correlations of two are possible, that of three is not
     ([1, 0, 0, 0, -1, 0, 0, 0, 1], False),
     ([0, 0, 0, 0, 1, 0, 0, 0, 1], False),
     ([np.nan] * 9, False),
@@ -209,6 +211,12 @@ def test_a_covariance_whose_inverse_has_no_digits_is_refused() -> None:
     """
     for gap, good in ((4e-14, True), (2e-15, False), (0.0, False)):
         assert is_covariance([1, 1 - gap, 0, 1 - gap, 1, 0, 0, 0, 1]) == good
+    # Of three equal correlations r the smallest is 1 + 2 r. Units do not count.
+    for gap, good in ((1e-3, True), (1e-8, True), (4e-14, True), (-1e-8, False), (-1e-3, False)):
+        across = (gap - 1) / 2
+        matrix = np.array([[1, across, across], [across, 1, across], [across, across, 1]])
+        scale = np.array([1e-6, 1.0, 1e4])
+        assert is_covariance((scale[:, None] * matrix * scale).ravel().tolist()) == good
 
 
 @pytest.mark.parametrize("error_m", [0.0, 5e-324, 1e-170, 1e-161, 1e-100])

@@ -90,18 +90,29 @@ MIN_VARIANCE = 1e-60
 MAX_ASYMMETRY = 1e-6
 MIN_EIGENVALUE = 1e-14
 """Of the correlation matrix: with a smaller one, its inverse keeps less than two digits in double precision."""
+CLEAR_DETERMINANT = 1e-9
+"""Of the correlation matrix: far above MIN_EIGENVALUE and the determinant's rounding."""
 
 
 def is_covariance(values: Sequence[float]) -> bool:
     """Whether nine finite numbers, row by row, are a symmetric, positive definite 3 x 3 matrix."""
-    matrix = np.reshape(np.asarray(values, dtype=np.float64), (3, 3))
-    variances = np.diag(matrix)
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = numbers = [float(value) for value in values]
     # Also false for NaN.
-    if not (variances >= MIN_VARIANCE).all() or not np.abs(matrix).max() <= MAX_NUMBER:
+    if not all(abs(number) <= MAX_NUMBER for number in numbers):
         return False
-    correlations = matrix / np.sqrt(np.outer(variances, variances))
-    if np.abs(correlations - correlations.T).max() > MAX_ASYMMETRY:
+    if not (xx >= MIN_VARIANCE and yy >= MIN_VARIANCE and zz >= MIN_VARIANCE):
         return False
+    x, y, z = math.sqrt(xx), math.sqrt(yy), math.sqrt(zz)
+    of_yx, of_zx, of_zy = yx / (x * y), zx / (x * z), zy / (y * z)
+    if max(abs(of_yx - xy / (x * y)), abs(of_zx - xz / (x * z)), abs(of_zy - yz / (y * z))) > MAX_ASYMMETRY:
+        return False
+    # The eigenvalues' sum is 3. If all are positive, two of them have a product of 2.25 at most, which leaves the third
+    # the determinant over 2.25.
+    minor = 1 - of_yx * of_yx
+    determinant = minor - of_zx * of_zx - of_zy * of_zy + 2 * of_yx * of_zx * of_zy
+    if minor > 0 and determinant > CLEAR_DETERMINANT:
+        return True
+    correlations = np.array([[1.0, of_yx, of_zx], [of_yx, 1.0, of_zy], [of_zx, of_zy, 1.0]])
     return bool(np.linalg.eigvalsh(correlations).min() >= MIN_EIGENVALUE)
 
 
