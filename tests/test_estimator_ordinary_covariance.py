@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from estimator_correspondences import device, simulated
@@ -9,7 +10,7 @@ from estimator_synthetic import Array, grid, view_of
 
 from estimator.camera.pose import Pose
 from estimator.io.led_map import DiscLed
-from estimator.solvers.observations import Observations, centroid_images, observe, pose_slopes
+from estimator.solvers.observations import Observations, centroid_images, observe, pose_slopes, pose_vector
 from estimator.solvers.ordinary_covariance import ordinary_covariance
 
 TARGET = (3.0, 2.0, 3.0)
@@ -59,6 +60,25 @@ def test_residuals_that_eccentricity_explains_are_no_errors_of_the_map(share: fl
     ratio = np.trace(ordinary_covariance(made, TRUTH)) / np.trace(ordinary_covariance(small, TRUTH))
     # Most of it is the known movement by eccentricity, which nothing widens.
     assert ratio > 1.01 if widened else ratio == pytest.approx(1.0, rel=1e-9)
+
+
+def test_slopes_by_the_pose_are_those_of_differences() -> None:
+    """Of spots and position. Central differences of step h are off by h^2, 1e-10, and by rounding over h, 1e-11."""
+    made, h = observed(1.0), 1e-5
+    centre = LEDS.mean(axis=0)
+
+    def moved(x: Array) -> tuple[Array, Array]:
+        R_cam_world = cv2.Rodrigues(x[:3])[0]
+        pose = Pose(centre - R_cam_world.T @ x[3:], R_cam_world)
+        return centroid_images(pose, LEDS, np.zeros(len(LEDS)))[0], pose.position_m
+
+    x = pose_vector(made, TRUTH)
+    np.testing.assert_allclose(moved(x)[1], TRUTH.position_m, atol=1e-14)
+    of_spots, of_position = pose_slopes(made, TRUTH)
+    for k, step in enumerate(h * np.eye(6)):
+        (ahead, to), (behind, back) = moved(x + step), moved(x - step)
+        np.testing.assert_allclose(of_spots[:, :, k], (ahead - behind) / (2 * h), atol=1e-9)
+        np.testing.assert_allclose(of_position[:, k], (to - back) / (2 * h), atol=1e-9)
 
 
 def test_the_limit_is_one_in_a_million() -> None:

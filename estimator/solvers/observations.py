@@ -28,7 +28,6 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from estimator.camera.leveling import tilt_from_gravity, tilt_sigmas
 from estimator.camera.motion import seen_in_motion
@@ -251,8 +250,11 @@ def _in_plane(p_cam: Floats) -> Floats:
 
 
 def pose_vector(observations: Observations, pose: Pose) -> Floats:
-    """Parameters (6,) of a pose: a rotation vector, and the mean of the LEDs in camera axes, metres."""
-    vector = Rotation.from_matrix(pose.R_cam_world).as_rotvec()
+    """Parameters (6,) of a pose: a rotation vector, and the mean of the LEDs in camera axes, metres.
+
+    OpenCV gives no vector to a turn below 1e-5 rad, by which slopes change by their share of 1e-5.
+    """
+    vector = cv2.Rodrigues(pose.R_cam_world)[0].ravel()
     return np.concatenate([vector, pose.R_cam_world @ (observations.leds_m.mean(axis=0) - pose.position_m)])
 
 
