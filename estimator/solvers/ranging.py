@@ -10,15 +10,18 @@ away from it horizontally by r, the depth h of A is the larger root of
 which is r / |a - b| at e = 0. This step is not in the paper.
 """
 
+import math
 from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.compiled import compact, compiled
 from estimator.errors import EstimationFailure
 from estimator.io.camera import normalized
 
 Floats = NDArray[np.float64]
+Indices = NDArray[np.intp]
 PairLaw = Callable[[Floats, Floats, Floats], tuple[Floats, Floats]]
 """From angles alpha, beta (n,) and LED distances (n,) of n pairs to the two ranges of each pair, (n,) each."""
 
@@ -54,16 +57,10 @@ def led_ranges(level_px: Floats, K: Floats, leds_m: Floats, pair_law: PairLaw) -
     count = len(leds_m)
     if count < 2:
         raise EstimationFailure("ranging", "LEDs identified: 1, needed: 2")
-    rays = np.column_stack([normalized(level_px, K), np.ones(count)])
-    a, b = np.triu_indices(count, k=1)
-    separation = np.linalg.norm(rays[a] - rays[b], axis=1)
+    image, leds_m = normalized(level_px, K), compact(leds_m)
+    a, b, alpha, beta, separation, depth_a, depth_b = _triangles(compact(image), leds_m)
     # Division by zero gives a range that is not finite, which is refused below.
     with np.errstate(divide="ignore", invalid="ignore"):
-        depth_a, depth_b = _depths(rays[a], rays[b], leds_m[b] - leds_m[a])
-        to_a, to_b = rays[a] * depth_a[:, None], rays[b] * depth_b[:, None]
-        sides = [np.linalg.norm(side, axis=1) for side in (to_b - to_a, to_a, to_b)]
-        alpha = _angle(sides[0], sides[2], sides[1])
-        beta = _angle(sides[0], sides[1], sides[2])
         range_a, range_b = pair_law(alpha, beta, np.linalg.norm(leds_m[a] - leds_m[b], axis=1))
     level = leds_m[a, 2] == leds_m[b, 2]
     used = level | (np.isfinite(range_a) & np.isfinite(range_b) & (depth_a > 0) & (depth_b > 0))
@@ -77,25 +74,57 @@ def led_ranges(level_px: Floats, K: Floats, leds_m: Floats, pair_law: PairLaw) -
     return ranges_m
 
 
-def _depths(rays_a: Floats, rays_b: Floats, a_to_b_m: Floats) -> tuple[Floats, Floats]:
-    """Depths of both LEDs of n pairs, (n,) metres, from leveled rays (n, 3) at unit depth and offsets (n, 3) in world.
+@compiled
+def _triangles(image: Floats, leds_m: Floats) -> tuple[Indices, Indices, Floats, Floats, Floats, Floats, Floats]:
+    """Triangles of the camera and every pair a, b of n LEDs (n, 3), from their leveled image (n, 2) at unit depth.
 
-    NaN where no depth fits. The rays are known up to yaw: of the offset, the height and the horizontal length count.
+    Returns, for each pair, a and b, the angles alpha at b and beta at a, radians, the distance of the images, and the
+    depths of both LEDs, metres; NaN where no depth fits.
     """
-    across, image_b, height_m = (rays_a - rays_b)[:, :2], rays_b[:, :2], a_to_b_m[:, 2]
-    square = (across**2).sum(axis=1)
-    half = height_m * (across * image_b).sum(axis=1)
-    rest = height_m**2 * (image_b**2).sum(axis=1) - (a_to_b_m[:, :2] ** 2).sum(axis=1)
-    depth_a = (half + np.sqrt(half**2 - square * rest)) / square
+    count = len(image)
+    pairs = count * (count - 1) // 2
+    of_a, of_b = np.empty(pairs, dtype=np.intp), np.empty(pairs, dtype=np.intp)
+    alpha, beta, separation = np.empty(pairs), np.empty(pairs), np.empty(pairs)
+    depth_a, depth_b = np.empty(pairs), np.empty(pairs)
+    pair = 0
+    for a in range(count):
+        for b in range(a + 1, count):
+            h_a, h_b = _depths(image[a], image[b], leds_m[b] - leds_m[a])
+            along_x, along_y = image[b, 0] * h_b - image[a, 0] * h_a, image[b, 1] * h_b - image[a, 1] * h_a
+            base = math.sqrt(along_x**2 + along_y**2 + (h_b - h_a) ** 2)
+            side_a = abs(h_a) * math.sqrt(image[a, 0] ** 2 + image[a, 1] ** 2 + 1)
+            side_b = abs(h_b) * math.sqrt(image[b, 0] ** 2 + image[b, 1] ** 2 + 1)
+            of_a[pair], of_b[pair], depth_a[pair], depth_b[pair] = a, b, h_a, h_b
+            alpha[pair], beta[pair] = _angle(base, side_b, side_a), _angle(base, side_a, side_b)
+            separation[pair] = math.sqrt((image[a, 0] - image[b, 0]) ** 2 + (image[a, 1] - image[b, 1]) ** 2)
+            pair += 1
+    return of_a, of_b, alpha, beta, separation, depth_a, depth_b
+
+
+@compiled
+def _depths(image_a: Floats, image_b: Floats, a_to_b_m: Floats) -> tuple[float, float]:
+    """Depths of two LEDs, metres, from their leveled images (2,) at unit depth and their offset (3,) in the world.
+
+    NaN where no depth fits. The images are known up to yaw: of the offset, the height and the horizontal length count.
+    """
+    across_x, across_y = image_a[0] - image_b[0], image_a[1] - image_b[1]
+    east_m, north_m, height_m = a_to_b_m
+    square = across_x**2 + across_y**2
+    half = height_m * (across_x * image_b[0] + across_y * image_b[1])
+    rest = height_m**2 * (image_b[0] ** 2 + image_b[1] ** 2) - (east_m**2 + north_m**2)
+    depth_a = (half + math.sqrt(half**2 - square * rest)) / square
     return depth_a, depth_a + height_m
 
 
-def _angle(base: Floats, side: Floats, opposite: Floats) -> Floats:
+@compiled
+def _angle(base: float, side: float, opposite: float) -> float:
     """Angle between `base` and `side`, radians: Eq. 2 with the squares that its print lacks."""
     cosine = (base**2 + side**2 - opposite**2) / (2 * base * side)
-    return np.asarray(np.arccos(np.clip(cosine, -1, 1)))
+    if abs(cosine) > 1:  # by rounding, which NaN is not
+        cosine = math.copysign(1.0, cosine)
+    return math.acos(cosine)
 
 
-def _sums(index: NDArray[np.intp], values: Floats, count: int) -> Floats:
+def _sums(index: Indices, values: Floats, count: int) -> Floats:
     """Sums of `values` by index, (count,)."""
     return np.asarray(np.bincount(index, weights=values, minlength=count), dtype=np.float64)
