@@ -10,9 +10,8 @@ rolling shutter, whose motion the common fit does not know, or too few of its sp
 frames; the last is reported as ambiguous.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
@@ -24,7 +23,7 @@ from estimator.methods.camera_statement import Judged, contradicted_by, judged_b
 from estimator.methods.gravity_fit import agreement, agreement_of, judged_by
 from estimator.methods.variant import DeviceMethod, Estimate, Needs, Variant
 from estimator.solvers.device_equations import DeviceView
-from estimator.solvers.observations import MIN_CENTROID_SIGMA_PX, Observations, observe
+from estimator.solvers.observations import MIN_CENTROID_SIGMA_PX, Observations, observe, observe_once
 from estimator.solvers.robust_fit import Consensus
 from estimator.solvers.self_calibration import adjust
 from estimator.spots.correspondences import centroids_px, find_correspondences
@@ -51,20 +50,23 @@ class FittedFrame:
 
 def fit_frame(frame: DeviceFrame) -> FittedFrame:
     """Fit a frame by itself; raises EstimationFailure."""
-    return fit_correspondences(frame, find_correspondences(frame), partial(agreement_of, frame))
+    correspondences = find_correspondences(frame)
+    observations = observe_once(frame, correspondences)
+    return _fitted(frame, correspondences, observations, agreement_of(frame, observations))
 
 
-def fit_correspondences(
-    frame: DeviceFrame,
-    correspondences: Sequence[Correspondence],
-    agree: Callable[[Observations], Consensus] = agreement,
-) -> FittedFrame:
+def fit_correspondences(frame: DeviceFrame, correspondences: Sequence[Correspondence]) -> FittedFrame:
     """The same from identified spots; of the frame, camera, accelerometer, luminaires and datum are used."""
-    usable = has_pinhole_image(centroids_px(correspondences), frame.camera)
-    if usable.any():
-        correspondences = [one for one, use in zip(correspondences, usable, strict=True) if use]
     observations = observe(frame, correspondences)
-    agreed = agree(observations)
+    return _fitted(frame, correspondences, observations, agreement(observations))
+
+
+def _fitted(
+    frame: DeviceFrame, correspondences: Sequence[Correspondence], observations: Observations, agreed: Consensus
+) -> FittedFrame:
+    # Observations leave out the same spots.
+    usable = has_pinhole_image(centroids_px(correspondences), frame.camera)
+    correspondences = [one for one, use in zip(correspondences, usable, strict=True) if use]
     alone, model = judged_by(agreed), agreed.model
     # The last two: a camera that is not exact, or that nothing vouches for, counts in the covariance of a frame alone.
     unshared = observations.motion is not None or agreed.contradicted or agreed.unchecked_m2.any()
