@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from estimator.camera.intrinsics import intrinsic_slopes_px, with_errors
 from estimator.camera.pose import POSE_PARAMETERS, Pose
 from estimator.camera.projection import images_px, project
+from estimator.compiled import compact, compiled
 from estimator.io.camera import INTRINSICS, Camera
 from estimator.io.led_map import Led, Luminaire, MapDatum
 
@@ -165,6 +166,7 @@ class DeviceEquations:
             -1, 3
         )
         places = np.concatenate([*parts, self.led_places.ravel()])
+        self.map_is_exact = bool((places[len(INTRINSICS) + 2 :] < 0).all())
         self.present = places >= 0
         self.columns: Indices = places[self.present]
 
@@ -173,7 +175,7 @@ class DeviceEquations:
         covariance = self.view.covariance_px2 * self.unknowns.scales.get("spots", 1.0) ** 2
         slopes: Floats | None = None
         for k, led in enumerate(self.view.leds):
-            if self.unknowns.frames_of_led[led.id] > 1 or not led.light_sigmas_m().any():
+            if self.unknowns.frames_of_led[led.id] > 1 or not led.states_errors:
                 continue
             if slopes is None:
                 slopes = project(self.told_m, self.view.pose, self.view.camera).slopes[:, :, :3]
@@ -183,6 +185,8 @@ class DeviceEquations:
 
     def positions_m(self, common: Floats) -> Floats:
         """Positions (n, 3) of the LEDs, world metres, with the errors of the map."""
+        if self.map_is_exact:
+            return self.told_m
         positions_m = self.told_m.copy()
         for luminaire, member in self.luminaires:
             error = self.unknowns.values(self.unknowns.places("luminaire", luminaire.id, 6), common)
@@ -220,9 +224,11 @@ class DeviceEquations:
         seen = project(positions_m, pose, camera)
         by_camera = intrinsic_slopes_px(seen.p_cam, camera.normalized(seen.pixels), camera)
         own = np.concatenate([seen.slopes, by_camera[:, :, self.shot_places]], axis=2)
-        own = np.einsum("nij,njk->nik", self.whitening, own).reshape(2 * n, -1)
-        by_common = np.einsum("nij,njk->nik", self.whitening, self._by_common(seen.slopes, by_camera, common))
-        shared = by_common.reshape(2 * n, -1)[:, self.present]
+        own = (self.whitening @ own).reshape(2 * n, -1)
+        shared = np.zeros((2 * n, 0))
+        if len(self.columns):
+            by_common = self.whitening @ self._by_common(seen.slopes, by_camera, common)
+            shared = by_common.reshape(2 * n, -1)[:, self.present]
         gravity = 2 if self.with_gravity else 0
         below = np.zeros((gravity + len(self.shot_places), own.shape[1]))
         shared_below = np.zeros((len(below), len(self.present)))
@@ -274,9 +280,33 @@ def _centroids_px(positions_m: Floats, extent_m: Floats, pose: Pose, camera: Cam
 
     Their images are weighted by the irradiance of the lens, z / |X|^4 (`estimator.solvers.observations`).
     """
-    points_m = positions_m[:, None] + extent_m[:, None, None] * FACE
-    pixels, p_cam = images_px(points_m.reshape(-1, 3), pose, camera)
-    p_cam = p_cam.reshape(-1, 4, 3)
-    weights = p_cam[..., 2] / (p_cam**2).sum(axis=2) ** 2
-    weights /= weights.sum(axis=1, keepdims=True)
-    return np.asarray((weights[..., None] * pixels.reshape(-1, 4, 2)).sum(axis=1))
+    points_m = _face_points(compact(positions_m), extent_m)
+    return _face_means(*images_px(points_m, pose, camera))
+
+
+@compiled
+def _face_points(positions_m: Floats, extent_m: Floats) -> Floats:
+    """Four points of each face, (4n, 3), at the distances `extent_m` (n,) from the centres `positions_m` (n, 3)."""
+    points_m = np.empty((4 * len(positions_m), 3))
+    for i in range(len(positions_m)):
+        for k in range(4):
+            for axis in range(3):
+                points_m[4 * i + k, axis] = positions_m[i, axis] + extent_m[i] * FACE[k, axis]
+    return points_m
+
+
+@compiled
+def _face_means(pixels: Floats, p_cam: Floats) -> Floats:
+    """Means (n, 2) of the pixels of every four points, (4n, 2), in camera axes (4n, 3), weighted by irradiance."""
+    means = np.zeros((len(pixels) // 4, 2))
+    for i in range(len(means)):
+        total = 0.0
+        for k in range(4 * i, 4 * i + 4):
+            distance2 = p_cam[k, 0] ** 2 + p_cam[k, 1] ** 2 + p_cam[k, 2] ** 2
+            weight = p_cam[k, 2] / (distance2 * distance2)
+            total += weight
+            for axis in range(2):
+                means[i, axis] += weight * pixels[k, axis]
+        for axis in range(2):
+            means[i, axis] /= total
+    return means
