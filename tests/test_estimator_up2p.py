@@ -106,6 +106,20 @@ def displaced() -> Observations:
     return observed(3.0 * np.random.default_rng(13).standard_normal((9, 2)), np.full(9, 0.02), 0.05)
 
 
+def test_the_poses_by_two_spots_come_best_first() -> None:
+    """By the squared distances in pixels, of which none here reaches the limit: 3 deg, three sigma of the tilts."""
+    offsets = 3.0 * np.random.default_rng(13).standard_normal((9, 2))
+    seen = observed(offsets, np.full(9, 0.02), 1.0)
+    sums = [
+        float(((p_cam[:, :2] / p_cam[:, 2:] - seen.image) ** 2).sum())
+        for p_cam in (pose.in_camera(seen.leds_m) for pose in pair_poses(seen))
+    ]
+    assert len(sums) == 3
+    assert sums[0] < sums[1] < sums[2]
+    # A spot's error has a mean square of 18 px^2, and those of the widest pair, interpolated, add as much at most.
+    assert sums[0] * seen.camera.matrix()[0, 0] ** 2 < 9 * 2 * 18
+
+
 def test_gravity_counts_beside_errors_that_the_residuals_reveal() -> None:
     """Nine spots of a device that states no errors, displaced by 3 px, as by LEDs that are 3 mm off the map. They leave
     2 * 9 - 6 degrees of freedom to the size of their errors, and determine the tilt to 0.6 deg; the accelerometer reads

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from estimator.camera.leveling import MIN_ELEVATION_SINE
 from estimator.camera.pose import POSE_PARAMETERS, Pose, rotation
+from estimator.compiled import compact, compiled
 from estimator.errors import EstimationFailure
 from estimator.io.device import DeviceFrame
 from estimator.methods.camera_statement import Judged, over_frames
@@ -127,20 +128,46 @@ def pair_poses(observations: Observations) -> list[Pose]:
         generator = np.random.Generator(np.random.Philox(key=len(pairs)))
         pairs = [pairs[k] for k in generator.choice(len(pairs), MAX_PAIRS, replace=False)]
     gate = GATE_SIGMA * float(observations.tilt_sigma_rad.max()) + GATE_PX * observations.camera.pixel_angle_rad
-    chosen = np.array(pairs, dtype=np.int64).reshape(-1, 2)
-    of_pairs = zip((level @ Y_UP.T)[chosen], (observations.leds_m @ Y_UP.T)[chosen], strict=True)
-    found = [upright.Rt for level_up, leds_up in of_pairs for upright in poselib.up2p(level_up, leds_up)]
+    chosen, leds_up = np.array(pairs, dtype=np.int64).reshape(-1, 2), observations.leds_m @ Y_UP.T
+    of_pairs = zip((level @ Y_UP.T)[chosen], leds_up[chosen], strict=True)
+    found = [upright.Rt for level_up, leds_of_pair in of_pairs for upright in poselib.up2p(level_up, leds_of_pair)]
     if not found:
         return []
-    R, t = np.split(np.stack(found), [3], axis=2)
-    rotations, positions_m = tilt @ (Y_UP.T @ R @ Y_UP), (-R.transpose(0, 2, 1) @ t)[:, :, 0] @ Y_UP
-    # The eccentricity of centroids is far below the gate.
-    p_cam = (observations.leds_m - positions_m[:, None]) @ rotations.transpose(0, 2, 1)
-    depth = p_cam[:, :, 2]
-    image = p_cam[:, :, :2] / np.where(depth > 0, depth, 1.0)[:, :, None]
-    error2 = np.where(depth > 0, ((image - observations.still_image) ** 2).sum(axis=2), np.inf)
-    order = np.minimum(error2, gate**2).sum(axis=1).argsort(kind="stable")
-    return [Pose(positions_m[k], rotations[k]) for k in order[:MAX_PAIR_STARTS].tolist()]
+    solutions = np.array(found)
+    errors = _truncated_errors(solutions, tilt @ Y_UP.T, leds_up, compact(observations.still_image), gate**2)
+    poses = []
+    for k in errors.argsort(kind="stable")[:MAX_PAIR_STARTS].tolist():
+        R, t = solutions[k, :, :3], solutions[k, :, 3]
+        poses.append(Pose(-(R.T @ t) @ Y_UP, tilt @ (Y_UP.T @ R @ Y_UP)))
+    return poses
+
+
+@compiled
+def _truncated_errors(solutions: Floats, R_cam_level: Floats, leds_up: Floats, image: Floats, limit: float) -> Floats:
+    """Sums (m,) of the squared distances, each at most `limit`, of spots from the images by PoseLib's solutions.
+
+    `solutions` (m, 3, 4) map LEDs `leds_up` (n, 3), with a vertical y axis, to leveled axes of the same kind, and
+    `R_cam_level` (3, 3) these to the camera's. The spots are `image` (n, 2), normalized; the eccentricity of centroids
+    is far below the limit. An LED behind the camera counts with the limit.
+    """
+    errors = np.zeros(len(solutions))
+    to_camera = np.empty((3, 4))
+    for k in range(len(solutions)):
+        for row in range(3):
+            for column in range(4):
+                to_camera[row, column] = 0.0
+                for of in range(3):
+                    to_camera[row, column] += R_cam_level[row, of] * solutions[k, of, column]
+        (xx, xy, xz, x0), (yx, yy, yz, y0), (zx, zy, zz, z0) = to_camera[0], to_camera[1], to_camera[2]
+        for i in range(len(leds_up)):
+            x, y, z = leds_up[i, 0], leds_up[i, 1], leds_up[i, 2]
+            depth, error2 = zx * x + zy * y + zz * z + z0, limit
+            if depth > 0:
+                off_x = (xx * x + xy * y + xz * z + x0) / depth - image[i, 0]
+                off_y = (yx * x + yy * y + yz * z + y0) / depth - image[i, 1]
+                error2 = min(off_x * off_x + off_y * off_y, limit)
+            errors[k] += error2
+    return errors
 
 
 def upright_pose(observations: Observations) -> Pose | None:
