@@ -12,7 +12,7 @@ from estimator.camera.pose import Pose
 from estimator.errors import EstimationFailure
 from estimator.io.camera import Distortion
 from estimator.io.device import DeviceFrame
-from estimator.solvers.observations import centroid_images, corrected_for_eccentricity, observe
+from estimator.solvers.observations import centroid_images, corrected_for_eccentricity, observe, pose_slopes
 from estimator.solvers.reprojection import fit
 from estimator.spots.identify import Correspondence
 
@@ -213,6 +213,33 @@ def test_an_error_of_the_model_adds_to_the_variance_of_a_displacement() -> None:
     assert found.outlier_chi2()[7] == pytest.approx(9.0, rel=1e-3)
     error = 4 * observed.camera.pixel_angle_rad
     assert found.outlier_chi2(error)[7] == pytest.approx(9 / 17, rel=1e-3)
+
+
+def test_scores_and_redundancies_are_those_of_generalised_least_squares() -> None:
+    """P = C^-1 - C^-1 J (J^T C^-1 J)^-1 J^T C^-1 and q = P r as dense matrices, of five spots with elliptic errors.
+
+    At the minimum found J^T C^-1 r is not exactly zero: the sum is 1e-8 of itself from it, r some 1e-4 of its sigmas.
+    """
+    leds = grid(5, 1, 0.3, (3, 2, 2.7)) + np.array([[0, 0.3, 0], [0, 0, 0.1], [0, 0.2, 0], [0, -0.4, 0], [0, 0, 0]])
+    view = view_of((3, 2, 2.7), 2.0, 20, -10, 40)
+    rng = np.random.default_rng(8)
+    spots = []
+    for one in simulated(view, leds):
+        root = rng.normal(0, 0.3, (2, 2))
+        u, v = (one.spot.u_px, one.spot.v_px) + root @ rng.standard_normal(2)
+        spots.append(replace(one, spot=replace(one.spot, u_px=u, v_px=v, covariance_px2=root @ root.T)))
+    seen = observe(device(view, 1.0), spots).without_gravity()
+    found = fit(seen, Pose(np.array(view.position_m), view.R_cam_world))
+    precision = np.zeros((10, 10))
+    for k, whitening in enumerate(seen.whitening):
+        precision[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = whitening.T @ whitening
+    J, r = pose_slopes(seen, found.pose)[0].reshape(10, 6), (seen.images(found.pose)[0] - seen.image).ravel()
+    P = precision - precision @ J @ np.linalg.solve(J.T @ precision @ J, J.T @ precision)
+    scale = np.sqrt(np.diag(precision)).reshape(5, 2)
+    blocks = np.array([P[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] for k in range(5)])
+    in_sigmas = 1 / (scale[:, :, None] * scale[:, None, :])
+    np.testing.assert_allclose(found.spots_redundancy * in_sigmas, blocks * in_sigmas, atol=1e-9)
+    np.testing.assert_allclose(found.spots_score / scale, (P @ r).reshape(5, 2) / scale, atol=1e-3)
 
 
 def test_tilts_to_both_sides_of_180_deg_are_near() -> None:

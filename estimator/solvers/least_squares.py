@@ -38,8 +38,9 @@ def least_squares_minimum(
     for _ in range(max_steps):
         information, gradient = slopes.T @ slopes, slopes.T @ at
         held = damping * information.diagonal()
-        step = -np.linalg.solve(information + np.diag(held), gradient)
-        short = bool(np.linalg.norm(step) <= STEP_TOLERANCE * np.linalg.norm(x))
+        information.flat[:: len(x) + 1] += held
+        step = -np.linalg.solve(information, gradient)
+        short = bool(step @ step <= STEP_TOLERANCE**2 * (x @ x))
         promised = float(step @ (held * step) - step @ gradient)
         there = residuals(x + step)
         new_cost = float(there @ there)

@@ -205,8 +205,20 @@ def observe_once(
 
 def centroid_images(pose: Pose, leds_m: Floats, lift_m2: Floats) -> tuple[Floats, Floats]:
     """Centroids (n, 2) of the images of LEDs (n, 3) in the pinhole's image plane, and the LEDs' depths (n,), metres."""
-    p_cam = pose.in_camera(light_centres_m(leds_m, lift_m2, pose.position_m))
-    return _in_plane(p_cam), p_cam[:, 2]
+    return _images(compact(leds_m), compact(lift_m2), compact(pose.position_m), compact(pose.R_cam_world))
+
+
+@compiled
+def _images(leds_m: Floats, lift_m2: Floats, position_m: Floats, R_cam_world: Floats) -> tuple[Floats, Floats]:
+    """See `centroid_images`."""
+    p_cam = _light_centres(leds_m, lift_m2, position_m.reshape(1, 3))
+    depths_m = np.empty(len(p_cam))
+    for i in range(len(p_cam)):
+        x, y, z = p_cam[i, 0] - position_m[0], p_cam[i, 1] - position_m[1], p_cam[i, 2] - position_m[2]
+        for k in range(3):
+            p_cam[i, k] = R_cam_world[k, 0] * x + R_cam_world[k, 1] * y + R_cam_world[k, 2] * z
+        depths_m[i] = p_cam[i, 2]
+    return _in_plane(p_cam), depths_m
 
 
 def light_centres_m(leds_m: Floats, lift_m2: Floats, camera_m: Floats) -> Floats:

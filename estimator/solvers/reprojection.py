@@ -269,15 +269,13 @@ def _fit(observations: Observations, start: Pose, whitening: Floats, loss: Loss)
     if motion is not None:
         covariance_m2 = covariance_m2 + second_order.of_pose_vector(x, covariance)
     # At the minimum J^T C^-1 r with the shares of gravity and motion is zero, and so q = C^-1 r.
-    roots = whitening.reshape(2 * count, count, 2) if whitening.ndim == 2 else None
-    if roots is None:
-        score = np.einsum("nji,nj->ni", whitening, of_spots.reshape(-1, 2))
-        own = whitening.transpose(0, 2, 1) @ whitening
-        pulled = whitening.transpose(0, 2, 1) @ slope[: 2 * count].reshape(count, 2, -1)
+    if whitening.ndim == 3:
+        score, redundancy = _redundancy_each(compact(whitening), of_spots, slope, covariance)
     else:
+        roots = whitening.reshape(2 * count, count, 2)
         score = (whitening.T @ of_spots).reshape(-1, 2)
-        own = np.einsum("kia,kib->iab", roots, roots)
         pulled = (whitening.T @ slope[: 2 * count]).reshape(count, 2, -1)
+        redundancy = np.einsum("kia,kib->iab", roots, roots) - pulled @ covariance @ pulled.transpose(0, 2, 1)
     return Fit(
         pose=pose,
         cost=cost,
@@ -286,7 +284,7 @@ def _fit(observations: Observations, start: Pose, whitening: Floats, loss: Loss)
         covariance_m2=covariance_m2,
         position_slopes=of_position,
         spots_score=score,
-        spots_redundancy=own - pulled @ covariance @ pulled.transpose(0, 2, 1),
+        spots_redundancy=redundancy,
         log_determinant=float(np.linalg.slogdet(information)[1]),
         residuals=at_minimum,
         slopes=slope,
@@ -294,6 +292,34 @@ def _fit(observations: Observations, start: Pose, whitening: Floats, loss: Loss)
         velocity=x[POSE_PARAMETERS:],
         motion_chi2=float((at_minimum[2 * count + 2 :] ** 2).sum()),
     )
+
+
+@compiled
+def _redundancy_each(whitening: Floats, of_spots: Floats, slopes: Floats, covariance: Floats) -> tuple[Floats, Floats]:
+    """`spots_score` (n, 2) and `spots_redundancy` (n, 2, 2) of a `Fit` with a `whitening` (n, 2, 2) of each spot.
+
+    `of_spots` (2n,) are the whitened residuals of the spots, `slopes` (2n + m, k) those of all residuals by the
+    parameters, which have the `covariance` (k, k).
+    """
+    count, parameters = len(whitening), len(covariance)
+    score, redundancy = np.zeros((count, 2)), np.zeros((count, 2, 2))
+    pulled = np.empty((2, parameters))
+    for i in range(count):
+        for a in range(2):
+            for row in range(2):
+                score[i, a] += whitening[i, row, a] * of_spots[2 * i + row]
+            for k in range(parameters):
+                pulled[a, k] = 0.0
+                for row in range(2):
+                    pulled[a, k] += whitening[i, row, a] * slopes[2 * i + row, k]
+        for a in range(2):
+            for b in range(2):
+                for row in range(2):
+                    redundancy[i, a, b] += whitening[i, row, a] * whitening[i, row, b]
+                for k in range(parameters):
+                    for other in range(parameters):
+                        redundancy[i, a, b] -= pulled[a, k] * covariance[k, other] * pulled[b, other]
+    return score, redundancy
 
 
 def _robustly(residuals: Function, x0: Floats, jacobian: Function) -> tuple[Floats, Floats, float]:
