@@ -5,8 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from estimator_synthetic import Array
 
 import estimator as est
+from estimator.camera.pose import Pose
 from estimator.errors import EstimationFailure
 from estimator.evaluate.batch import estimate_dataset
 from estimator.io.shared import SharedResults
@@ -14,6 +16,7 @@ from estimator.methods.catalogue import VARIANTS, variant_named
 from estimator.methods.gravity_fit import agreement
 from estimator.methods.variant import DeviceMethod, Estimate, Variant
 from estimator.solvers.observations import Observations
+from estimator.solvers.ordinary_covariance import ordinary_covariance
 from estimator.solvers.robust_fit import Consensus
 from estimator.spots.correspondences import find_correspondences
 from estimator.spots.denoise import Image, neighbourhood_mean
@@ -143,3 +146,16 @@ def test_the_consensus_of_a_frame_is_found_once(synthetic_set: Path, monkeypatch
     alone = estimate_dataset(dataset, variants[1:2], lambda: None)
     for one, other in zip(rows[variants[1].name], alone[variants[1].name], strict=True):
         assert one.model_copy(update={"time_s": 0.0}) == other.model_copy(update={"time_s": 0.0})
+
+
+def test_the_covariance_of_a_pose_is_found_once(synthetic_set: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`pnp` has the pose of `ippe` or of `sqpnp`, which differ."""
+    dataset, calls = est.read_dataset(synthetic_set), []
+
+    def counted(observations: Observations, pose: Pose) -> Array:
+        calls.append(None)
+        return ordinary_covariance(observations, pose)
+
+    monkeypatch.setattr("estimator.methods.pnp.ordinary_covariance", counted)
+    estimate_dataset(dataset, [VARIANTS[name] for name in ("pnp", "ippe", "sqpnp")], lambda: None)
+    assert len(calls) == 2 * len(dataset.frames)

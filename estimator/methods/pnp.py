@@ -22,7 +22,7 @@ from estimator.io.camera import normalized
 from estimator.io.device import DeviceFrame
 from estimator.io.records import is_covariance
 from estimator.methods.variant import Estimate, Needs, Variant
-from estimator.solvers.observations import Observations, observe, observe_once
+from estimator.solvers.observations import observe, observe_once
 from estimator.solvers.ordinary_covariance import ordinary_covariance
 from estimator.solvers.shutter_motion import motion_prior
 from estimator.solvers.trilateration import check_pattern
@@ -56,13 +56,17 @@ def sqpnp(frame: DeviceFrame) -> Estimate:
 
 
 def _estimate(frame: DeviceFrame, methods: Sequence[int]) -> Estimate:
-    """The estimate from a frame's own spots; a method's candidates are found once for all variants of the frame."""
+    """The estimate from a frame's own spots; what variants of the frame compute alike is computed once."""
 
     def once(method: int, compute: Callable[[], Candidates]) -> Candidates:
         return frame.once(("pnp", weakref.ref(frame), method), compute)
 
     correspondences = find_correspondences(frame)
-    return _located(frame, correspondences, methods, once, partial(observe_once, frame, correspondences))
+    pose = _pose(frame, correspondences, methods, once)
+    # `pnp` has the pose of one of the others, to the bit, and with it the covariance.
+    key = "ordinary covariance", weakref.ref(frame), pose.position_m.tobytes(), pose.R_cam_world.tobytes()
+    covariance_m2 = frame.once(key, lambda: ordinary_covariance(observe_once(frame, correspondences), pose))
+    return _with_covariance(pose, covariance_m2)
 
 
 def fit_correspondences(
@@ -71,25 +75,25 @@ def fit_correspondences(
     methods: Sequence[int] = (cv2.SOLVEPNP_SQPNP, cv2.SOLVEPNP_IPPE),
 ) -> Estimate:
     """The estimate from identified spots by OpenCV `methods`; of the frame, the camera is used."""
-    return _located(frame, correspondences, methods, None, partial(observe, frame, correspondences))
+    pose = _pose(frame, correspondences, methods)
+    return _with_covariance(pose, ordinary_covariance(observe(frame, correspondences), pose))
 
 
-def _located(
-    frame: DeviceFrame,
-    correspondences: Sequence[Correspondence],
-    methods: Sequence[int],
-    once: Once | None,
-    observations: Callable[[], Observations],
-) -> Estimate:
+def _pose(
+    frame: DeviceFrame, correspondences: Sequence[Correspondence], methods: Sequence[int], once: Once | None = None
+) -> Pose:
+    """Pose by `pose_from_pixels`, with the turns undone that a gyroscope says of a rolling shutter."""
     pixels = pinhole_pixels(centroids_px(correspondences), frame.camera)
     if (prior := motion_prior(frame)) is not None:
         times_s = frame.camera.times_s(*centroids_px(correspondences).T)
         pixels = frame.camera.to_pixels(turned_back(frame.camera.normalized(pixels), prior.velocity, times_s))
-    pose = pose_from_pixels(led_positions_m(correspondences), pixels, frame.camera.matrix(), methods, once)
-    covariance_m2 = ordinary_covariance(observations(), pose)
-    return Estimate(
-        pose.position_m, covariance_m2=covariance_m2 if is_covariance(covariance_m2.ravel().tolist()) else None
-    )
+    return pose_from_pixels(led_positions_m(correspondences), pixels, frame.camera.matrix(), methods, once)
+
+
+def _with_covariance(pose: Pose, covariance_m2: Floats) -> Estimate:
+    """An estimate, without the covariance where that is none."""
+    stated = covariance_m2 if is_covariance(covariance_m2.ravel().tolist()) else None
+    return Estimate(pose.position_m, covariance_m2=stated)
 
 
 def position_from_pixels(leds_m: Floats, pixels: Floats, K: Floats, methods: Sequence[int]) -> Floats:
