@@ -127,7 +127,7 @@ class Linear:
     """A frame's equations with its own unknowns x and the common unknowns y at the places `columns`.
 
     `x = x0 - G y`, and left is `rows y = rest`; `own` (k, k) is the covariance of x for known y. The spots' residuals
-    and derivatives, whitened, come first among the rows.
+    and derivatives, whitened, come first among the rows. `residuals` are all before the step, (m,).
     """
 
     columns: Indices
@@ -136,6 +136,7 @@ class Linear:
     own: Floats
     rows: Floats
     rest: Floats
+    residuals: Floats
     projector: Floats
     """Of the residuals of the spots onto what the frame's own unknowns explain of them, (2n, 2n)."""
 
@@ -254,6 +255,7 @@ class DeviceEquations:
             own=inverse @ inverse.T,
             rows=shared - Q @ shared_in,
             rest=residuals - Q @ rest_in,
+            residuals=residuals,
             projector=spots @ spots.T,
         )
 

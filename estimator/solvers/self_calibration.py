@@ -241,9 +241,9 @@ class _Solution:
     def tests(self) -> list[Floats]:
         """Chi-square, of two degrees of freedom, of each frame's spots (n,) by the covariance of their residuals."""
         found = []
-        for frame, pose, shot, line in zip(self.frames, self.state.poses, self.state.shots, self.lines, strict=True):
+        for frame, line in zip(self.frames, self.lines, strict=True):
             n = len(frame.view.leds)
-            residuals = frame.residuals(pose, shot, self.state.common)[: 2 * n].reshape(n, 2)
+            residuals = line.residuals[: 2 * n].reshape(n, 2)
             rows = line.rows[: 2 * n]
             spread = np.eye(2 * n) - line.projector
             spread -= rows @ self.covariance[np.ix_(line.columns, line.columns)] @ rows.T
