@@ -7,6 +7,7 @@ from estimator_synthetic import Array, grid
 from estimator.errors import EstimationFailure
 from estimator.solvers.trilateration import (
     SHIFT_M,
+    extents,
     position_by_range_fit,
     position_by_shifted_leds,
     position_from_ranges,
@@ -38,6 +39,15 @@ def test_leds_on_one_line_are_refused() -> None:
     leds = TABLE_1[[0, 2, 3]]
     with pytest.raises(EstimationFailure, match="position: the LEDs are on one line"):
         position_from_ranges(leds, ranges_from(leds, np.array([0.6, 1.4, 0.0])))
+
+
+def test_extents_of_a_rectangle() -> None:
+    """Sides 4 and 2 m: four corners 2 and 1 m from the middle lines have roots of sums of squares of 4 and 2 m. They
+    depend on neither place nor order in memory.
+    """
+    corners = np.array([[0.0, 0, 3], [4, 0, 3], [4, 2, 3], [0, 2, 3]])
+    np.testing.assert_allclose(extents(corners), [4, 2, 0], atol=1e-12)
+    np.testing.assert_allclose(extents(corners[:, 1::-1] + 5), [4, 2], atol=1e-12)
 
 
 def test_two_leds_are_refused() -> None:

@@ -25,7 +25,7 @@ from estimator.methods.variant import Estimate, Needs, Variant
 from estimator.solvers.observations import observe, observe_once
 from estimator.solvers.ordinary_covariance import ordinary_covariance
 from estimator.solvers.shutter_motion import motion_prior
-from estimator.solvers.trilateration import check_pattern
+from estimator.solvers.trilateration import check_pattern, extents
 from estimator.spots.correspondences import centroids_px, find_correspondences, led_positions_m
 from estimator.spots.identify import Correspondence
 
@@ -138,8 +138,8 @@ def pose_from_pixels(
 
 def in_a_plane(leds_m: Floats) -> bool:
     """Whether a planar solver can be used for LEDs (n, 3)."""
-    length, _, depth = np.linalg.svd(leds_m - leds_m.mean(axis=0), compute_uv=False)
-    return bool(depth < MAX_PLANE_DEPTH * length)
+    length, _, depth = extents(leds_m)
+    return depth < MAX_PLANE_DEPTH * length
 
 
 def candidates(model: Floats, image: Floats, method: int, refined: bool) -> Candidates:

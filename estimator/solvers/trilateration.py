@@ -1,9 +1,12 @@
 """Trilateration: from distances to LEDs to the camera's position, and checks of the LEDs' geometry."""
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from estimator.compiled import compact
 from estimator.errors import EstimationFailure
 
 Floats = NDArray[np.float64]
@@ -107,8 +110,19 @@ def check_pattern(leds_m: Floats, needed: int, flat: bool) -> None:
 
 def on_one_line(points_m: Floats) -> bool:
     """Whether points (n, 2) or (n, 3) are on one line, within MIN_PATTERN_WIDTH of its length."""
-    length, width = np.linalg.svd(points_m - points_m.mean(axis=0), compute_uv=False)[:2]
-    return bool(width <= MIN_PATTERN_WIDTH * length)
+    length, width, *_ = extents(points_m)
+    return width <= MIN_PATTERN_WIDTH * length
+
+
+def extents(points_m: Floats) -> tuple[float, ...]:
+    """Singular values of points (n, k) about their mean, largest first: their length, width and depth times root n."""
+    return _extents(compact(points_m).tobytes(), points_m.shape[1])
+
+
+@lru_cache(maxsize=8)  # most variants of a frame ask for those of the same LEDs
+def _extents(packed: bytes, columns: int) -> tuple[float, ...]:
+    points_m = np.frombuffer(packed).reshape(-1, columns)
+    return tuple(np.linalg.svd(points_m - points_m.mean(axis=0), compute_uv=False).tolist())
 
 
 def determine_orientation(leds_m: Floats) -> bool:
