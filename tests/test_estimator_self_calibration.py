@@ -172,7 +172,7 @@ def test_slopes_by_every_unknown_are_differences_of_the_residuals(rng: np.random
     frame = DeviceEquations(view, unknowns)
     shot = 0.5 * np.array(SHOT)
     common = 0.3 * rng.standard_normal(unknowns.count)
-    line = frame.linear(view.pose, shot, common)
+    line = frame.linear(view.pose, shot, common, frame.residuals(view.pose, shot, common))
 
     def slope(pose_step: Array, shot_step: Array, common_step: Array, size: float) -> Array:
         ends = [

@@ -127,7 +127,7 @@ class Linear:
     """A frame's equations with its own unknowns x and the common unknowns y at the places `columns`.
 
     `x = x0 - G y`, and left is `rows y = rest`; `own` (k, k) is the covariance of x for known y. The spots' residuals
-    and derivatives, whitened, come first among the rows. `residuals` are all before the step, (m,).
+    and derivatives, whitened, come first among the rows.
     """
 
     columns: Indices
@@ -136,7 +136,6 @@ class Linear:
     own: Floats
     rows: Floats
     rest: Floats
-    residuals: Floats
     projector: Floats
     """Of the residuals of the spots onto what the frame's own unknowns explain of them, (2n, 2n)."""
 
@@ -217,8 +216,11 @@ class DeviceEquations:
         off = self.view.tilt_rad - pose.rig_angles(self.view.camera)[:2] - self.view.tilt_lever * bias
         return np.asarray(((off + np.pi) % (2 * np.pi) - np.pi) / self.tilt_sigma_rad)
 
-    def linear(self, pose: Pose, shot: Floats, common: Floats) -> Linear:
-        """The equations of a step from here, the frame's own unknowns eliminated; raises LinAlgError."""
+    def linear(self, pose: Pose, shot: Floats, common: Floats, residuals: Floats) -> Linear:
+        """The equations of a step from here, the frame's own unknowns eliminated; raises LinAlgError.
+
+        `residuals` are those here.
+        """
         view, n = self.view, len(self.view.leds)
         positions_m = self.positions_m(common)
         camera = self.camera(shot, common)
@@ -240,7 +242,6 @@ class DeviceEquations:
         below[gravity:, POSE_PARAMETERS:] = np.diag(1 / self.shot_sigma)
         own = np.vstack([own, below])
         shared = np.vstack([shared, shared_below[:, self.present]]) * self.unknowns.sigma[self.columns]
-        residuals = self.residuals(pose, shot, common)
         scale = np.linalg.norm(own, axis=0)
         if not (np.isfinite(own).all() and np.isfinite(residuals).all() and (scale > 0).all()):
             raise LinAlgError("the spots do not determine the pose")
@@ -255,7 +256,6 @@ class DeviceEquations:
             own=inverse @ inverse.T,
             rows=shared - Q @ shared_in,
             rest=residuals - Q @ rest_in,
-            residuals=residuals,
             projector=spots @ spots.T,
         )
 

@@ -169,7 +169,7 @@ class _Solution:
         shots = tuple(np.zeros(len(INTRINSICS)) for _ in views)
         common = np.array([start.get(name, (0.0, 0.0))[0] for name in self.unknowns.names]) / self.unknowns.sigma
         self.state = _State(tuple(view.pose for view in views), shots, common)
-        self.chi2 = self._cost(self.state)
+        self.residuals, self.chi2 = self._residuals(self.state)
         for _ in range(MAX_STEPS):
             promised = self._step()
             if promised < CONVERGED_CHI2:
@@ -183,19 +183,19 @@ class _Solution:
         """Degrees of freedom: observations less unknowns without a prior."""
         return sum(2 * len(f.view.leds) + 2 * f.with_gravity - POSE_PARAMETERS for f in self.frames)
 
-    def _cost(self, state: _State) -> float:
-        """Sum of squares; infinite where a spot has no image."""
-        total = float(state.common @ state.common)
-        for frame, pose, shot in zip(self.frames, state.poses, state.shots, strict=True):
-            total += float((frame.residuals(pose, shot, state.common) ** 2).sum())
-        return total if np.isfinite(total) else np.inf
+    def _residuals(self, state: _State) -> tuple[list[Floats], float]:
+        """Residuals of each frame and the sum of squares, infinite where a spot has no image."""
+        of_frames = zip(self.frames, state.poses, state.shots, strict=True)
+        residuals = [frame.residuals(pose, shot, state.common) for frame, pose, shot in of_frames]
+        total = float(state.common @ state.common) + sum(float((one**2).sum()) for one in residuals)
+        return residuals, total if np.isfinite(total) else np.inf
 
     def _equations(self) -> tuple[list[Linear], tuple[Floats, bool], Floats]:
         """Equations of the frames, and the factor and right side of the common unknowns' system."""
         state, count = self.state, self.unknowns.count
         lines = [
-            frame.linear(pose, shot, state.common)
-            for frame, pose, shot in zip(self.frames, state.poses, state.shots, strict=True)
+            frame.linear(pose, shot, state.common, residuals)
+            for frame, pose, shot, residuals in zip(self.frames, state.poses, state.shots, self.residuals, strict=True)
         ]
         normal, right = np.eye(count), -state.common
         for line in lines:
@@ -214,9 +214,9 @@ class _Solution:
         share = 1.0
         for _ in range(MAX_HALVINGS):
             state = self._moved(steps, common, share)
-            cost = self._cost(state)
+            residuals, cost = self._residuals(state)
             if cost <= self.chi2:
-                self.state, self.chi2 = state, cost
+                self.state, self.residuals, self.chi2 = state, residuals, cost
                 return promised
             share /= 2
         return 0.0
@@ -241,9 +241,9 @@ class _Solution:
     def tests(self) -> list[Floats]:
         """Chi-square, of two degrees of freedom, of each frame's spots (n,) by the covariance of their residuals."""
         found = []
-        for frame, line in zip(self.frames, self.lines, strict=True):
+        for frame, line, of_frame in zip(self.frames, self.lines, self.residuals, strict=True):
             n = len(frame.view.leds)
-            residuals = line.residuals[: 2 * n].reshape(n, 2)
+            residuals = of_frame[: 2 * n].reshape(n, 2)
             rows = line.rows[: 2 * n]
             spread = np.eye(2 * n) - line.projector
             spread -= rows @ self.covariance[np.ix_(line.columns, line.columns)] @ rows.T
