@@ -112,7 +112,7 @@ def _depths(image_a: Floats, image_b: Floats, a_to_b_m: Floats) -> tuple[float, 
     square = across_x**2 + across_y**2
     half = height_m * (across_x * image_b[0] + across_y * image_b[1])
     rest = height_m**2 * (image_b[0] ** 2 + image_b[1] ** 2) - (east_m**2 + north_m**2)
-    depth_a = (half + math.sqrt(half**2 - square * rest)) / square
+    depth_a = (half + np.sqrt(half**2 - square * rest)) / square
     return depth_a, depth_a + height_m
 
 
