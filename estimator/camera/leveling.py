@@ -1,5 +1,7 @@
 """Leveling by gravity: from an accelerometer reading to a level camera's pixels (Huynh & Yoo 2016, Eqs. 5 to 10)."""
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,10 +26,10 @@ def tilt_from_gravity(accelerometer_m_s2: tuple[float, float, float] | None) -> 
     if accelerometer_m_s2 is None:
         raise EstimationFailure("leveling", "the device has no accelerometer")
     x, y, z = accelerometer_m_s2
-    magnitude = float(np.linalg.norm(accelerometer_m_s2))
+    magnitude = math.hypot(x, y, z)
     if magnitude == 0:
         raise EstimationFailure("leveling", "the accelerometer reads no gravity")
-    return float(np.arctan2(y, z)), float(-np.arcsin(np.clip(x / magnitude, -1, 1)))
+    return math.atan2(y, z), -math.asin(min(max(x / magnitude, -1.0), 1.0))
 
 
 def tilt_sigmas(accelerometer: Accelerometer, tilt_y: float) -> Floats:

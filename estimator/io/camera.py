@@ -14,8 +14,13 @@ Floats = NDArray[np.float64]
 
 
 def normalized(pixels: Floats, K: Floats) -> Floats:
-    """Normalized image coordinates (n, 2), `K^-1 [u, v, 1]`, in units of the image distance, of pixels (n, 2)."""
-    return np.asarray((pixels - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T)
+    """Normalized image coordinates (n, 2), `K^-1 [u, v, 1]`, in units of the image distance, of pixels (n, 2).
+
+    `K` is upper triangular.
+    """
+    (fx, skew, _), (_, fy, _) = K[:2].tolist()
+    inverse = np.array([[1 / fx, -skew / (fx * fy)], [0.0, 1 / fy]])
+    return np.asarray((pixels - K[:2, 2]) @ inverse.T)
 
 
 def to_pixels(image: Floats, K: Floats) -> Floats:
