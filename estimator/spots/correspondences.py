@@ -83,7 +83,7 @@ def _denoised(frame: DeviceFrame, denoiser: Denoiser) -> tuple[Readout, ...]:
     else:
         means = frame.once(("means",), lambda: tuple(neighbourhood_mean(one.raw_e) for one in readouts))
         images = [denoiser.by_means(one.raw_e, mean) for one, mean in zip(readouts, means, strict=True)]
-    return tuple(replace(one, image_e=image) for one, image in zip(readouts, images, strict=True))
+    return tuple(one.denoised(image) for one, image in zip(readouts, images, strict=True))
 
 
 def _striped(frame: DeviceFrame) -> list[Spot]:

@@ -68,6 +68,10 @@ class Readout:
         """A pixel's noise as `estimator.spots.light_loops` takes it."""
         return self.floor_e2, self.prnu, self.rounding_e2
 
+    def denoised(self, image_e: NDArray[np.float32]) -> "Readout":
+        """The region with a denoised image."""
+        return Readout(self.row, self.column, image_e, self.raw_e, self.clipped, *self.noise)
+
     def contiguous(self) -> "Readout":
         """The region with its images row by row in memory, as compiled loops take them."""
         if self.image_e.flags.c_contiguous and self.raw_e.flags.c_contiguous and self.clipped.flags.c_contiguous:
