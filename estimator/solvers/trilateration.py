@@ -36,12 +36,12 @@ def position_from_ranges(leds_m: Floats, ranges_m: Floats) -> Floats:
     planar, heights_m = leds_m[:, :2], leds_m[:, 2]
     centre, ceiling_m = planar.mean(axis=0), heights_m.mean()
     offsets, above_m = planar - centre, heights_m - ceiling_m
-    height_m = 0.0
+    height_m, inverse = 0.0, np.linalg.pinv(2 * offsets)
     for _ in range(MAX_ROUNDS):
         ranges2 = ranges_m**2 - above_m * (2 * height_m + above_m)
         # With a and p measured from the LEDs' centre, |a|^2 - d^2 = 2 a . p - (|p|^2 + h^2). The last term is the same
         # for all LEDs and so orthogonal to the offsets a, which sum to zero: it does not change the solution.
-        solution, *_ = np.linalg.lstsq(2 * offsets, (offsets**2).sum(axis=1) - ranges2, rcond=None)
+        solution = inverse @ ((offsets**2).sum(axis=1) - ranges2)
         height_m2 = float((ranges2 - ((offsets - solution) ** 2).sum(axis=1)).mean())
         if height_m2 < 0:
             break

@@ -192,18 +192,25 @@ def _widen(near: Mask, row: int, first: int, last: int, halves: Ints) -> None:
 @compiled
 def padded(mask: Mask, radius_px: float, larger_px: float) -> tuple[Mask, Mask]:
     """Pixels at most a radius, and a larger one, from one of a mask."""
+    return _padded(mask, _spans_of(mask)[0], radius_px, larger_px)
+
+
+@compiled
+def _padded(mask: Mask, spans: Ints, radius_px: float, larger_px: float) -> tuple[Mask, Mask]:
+    """See `padded`; `spans` contain all pixels of the mask."""
     height, width = mask.shape
     near, nearby = np.zeros((height, width), dtype=np.bool_), np.zeros((height, width), dtype=np.bool_)
     halves, larger_halves = _half_chords(radius_px), _half_chords(larger_px)
     for row in range(height):
-        column = 0
-        while column < width:
-            first, own = column, mask[row, column]
-            while column < width and mask[row, column] == own:
+        line, column, last = mask[row], spans[0, row], spans[1, row]
+        while column < last:
+            first = column
+            while column < last and line[column]:
                 column += 1
-            if own:
-                _widen(near, row, first, column, halves)
-                _widen(nearby, row, first, column, larger_halves)
+            _widen(near, row, first, column, halves)
+            _widen(nearby, row, first, column, larger_halves)
+            while column < last and not line[column]:
+                column += 1
     return near, nearby
 
 
@@ -220,10 +227,9 @@ def _is_thick(mask: Mask, radius_px: float) -> bool:
     found = np.zeros(width, dtype=np.bool_)
     for row in range(height):
         up, line, down = wide[row, step:], wide[row + step], wide[row + 2 * step, step:]
-        left, right = line[:width], line[2 * step :]
+        left, own, right = line[:width], line[step:], line[2 * step :]
         for column in range(width):
-            own = line[column + step] & left[column] & right[column]
-            found[column] |= own & up[column] & down[column]
+            found[column] |= left[column] & own[column] & right[column] & up[column] & down[column]
     return bool(found.any())
 
 
@@ -262,7 +268,7 @@ def around_face(face: Mask, margin_px: float, ring_px: float, border_px: float) 
     height, width = face.shape
     spans, solid = _spans_of(face)
     if not solid:
-        support, outer = padded(face, margin_px, margin_px + ring_px)
+        support, outer = _padded(face, spans, margin_px, margin_px + ring_px)
         thick = _is_thick(face, border_px)
         inside = ~padded(~face, border_px, 0.0)[0] if thick else np.zeros((height, width), dtype=np.bool_)
         return support, _beside(support, outer), inside
