@@ -268,6 +268,14 @@ def test_an_led_between_two_surfaces_of_equal_share_has_a_centroid() -> None:
     assert np.hypot(spot.u_px - 60, spot.v_px - 50) < 0.1
 
 
+def test_an_led_image_in_the_angle_of_another_is_one_alone() -> None:
+    """Its area is a quarter of the other's: as a piece in the other's box it would count twice."""
+    v, u = np.mgrid[:150, :180] + 0.5
+    angle = (u > 20) & (v < 80) & ((u < 30) & (v > 20) | (u < 80) & (v > 70))
+    found = spots_of(np.where(angle | (np.hypot(u - 60, v - 40) < 9), 4000.0, 40.0))
+    assert sorted(spot.area_px for spot in found) == pytest.approx([254, 1100], rel=0.05)
+
+
 def test_without_covariances_all_else_is_the_same() -> None:
     """But for rounding: sums of a thousand pixels in another order, 1e-16 each, differ by 1e-14 of the largest."""
     v, u = np.mgrid[:100, :120] + 0.5

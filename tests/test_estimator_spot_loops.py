@@ -6,15 +6,15 @@ import pytest
 from estimator_synthetic import Array
 
 from estimator.spots.boxes import boxes_around, overlapping
-from estimator.spots.led_light import Ellipse, Readout, light_of
+from estimator.spots.led_light import Ellipse, Readout, centroid_on, light_of, surface_of
 from estimator.spots.light_loops import LEVEL, above_half_level, brightest, fall_off, median
 from estimator.spots.shape_loops import (
     around_face,
     distance2,
     ellipse_spans,
-    only_piece,
     padded,
     pieces_of,
+    pixels_of,
 )
 
 
@@ -121,37 +121,41 @@ def pieces() -> list[Array]:
 
 
 @pytest.mark.parametrize("number", range(len(pieces())))
-def test_sums_over_a_piece_are_those_over_its_pixels(number: int) -> None:
-    """Pieces told without a search are found as one by OpenCV. A plateau of 100 e has its half level at 50 e."""
+def test_pixels_above_half_level_are_the_plateau(number: int) -> None:
+    """A plateau of 100 e has its half level at 50 e, where the upper quartile is of it."""
     mask = pieces()[number]
-    expected = piece(mask)
-    np.testing.assert_array_equal(pieces_of(mask.astype(np.int32), 2), [piece(mask & ~mask), expected])
-
     smooth = np.where(mask, 100.0, 49.0).astype(np.float32)
-    if mask.mean() > 0.25:  # so that the upper quartile is of the plateau
+    if mask.mean() > 0.25:
         np.testing.assert_array_equal(above_half_level(smooth, 0, 0, np.ones(mask.shape, dtype=bool), 0.0), mask)
-    alone, solid = only_piece(mask)
-    is_one = cv2.connectedComponents(mask.view(np.uint8), connectivity=8)[0] == 2
-    assert is_one if solid else number >= 6
-    np.testing.assert_array_equal(alone, expected if solid else piece(mask & ~mask))
+
+
+def masks() -> list[Array]:
+    """Those of `pieces`, a comb, whose teeth the last row connects, none and all pixels, and noise of all densities."""
+    comb = np.zeros((9, 21), dtype=bool)
+    comb[:, ::2] = comb[8] = True
+    rng = np.random.default_rng(9)
+    noise = [rng.random(rng.integers(1, 30, 2)) < share for share in np.linspace(0.05, 0.95, 40)]
+    return [*pieces(), comb, comb[::-1], comb.T, comb & False, comb | True, *noise]
+
+
+@pytest.mark.parametrize("number", range(len(masks())))
+def test_pieces_of_a_mask_are_opencvs(number: int) -> None:
+    """In the order of their first pixels, with their sums, boxes and pixels."""
+    mask = masks()[number]
+    found, runs = pieces_of(mask)
+    count, labels = cv2.connectedComponents(mask.view(np.uint8), connectivity=8)
+    expected = sorted((labels == label for label in range(1, count)), key=lambda own: int(own.argmax()))
+    assert len(found) == len(expected)
+    for place, own in enumerate(expected):
+        np.testing.assert_array_equal(found[place], piece(own))
+        np.testing.assert_array_equal(pixels_of(runs, place, *mask.shape), own)
 
 
 def piece(mask: Array) -> Array:
     """Sums of 1, u, v, u^2, u v and v^2 over the pixels of a mask, and the box around them, by NumPy."""
     row, column = np.nonzero(mask)
     sums = np.stack([np.ones_like(row), column, row, column**2, column * row, row**2]).sum(axis=1)
-    first = column.min(initial=mask.shape[1]), row.min(initial=mask.shape[0])
-    return np.array([*sums, *first, column.max(initial=-1), row.max(initial=-1)])
-
-
-def test_pieces_are_told_apart_by_their_numbers() -> None:
-    """Of 0 to 4, the last of them without pixels, in runs that adjoin each other."""
-    numbers = np.random.default_rng(9).integers(0, 4, (20, 30)).astype(np.int32)
-    numbers[5, 3:20] = 2
-    found = pieces_of(numbers, 5)
-    for number in range(1, 5):
-        np.testing.assert_array_equal(found[number], piece(numbers == number))
-    np.testing.assert_array_equal(found[0], piece(numbers == 9))
+    return np.array([*sums, column.min(), row.min(), column.max(), row.max()])
 
 
 @pytest.mark.parametrize("number", range(len(pieces())))
@@ -191,7 +195,8 @@ def test_the_background_and_its_excess_variance_are_those_of_the_ring(background
     off_px = np.hypot(u - 30, v - 30)
     mean = background_e * (1 + 0.5 * (u % 4 < 2)) + amplitude_e * (off_px < 4)
     image = (rng.poisson(mean) + rng.normal(0, 2.0, mean.shape)).astype(np.float32)
-    light = light_of(Readout(0, 0, image, image, np.zeros(image.shape, bool), 4.0, 0.01), ellipse, [], 0)
+    readout = Readout(0, 0, image, image, np.zeros(image.shape, bool), 4.0, 0.01)
+    light = light_of(readout, ellipse, [], 0)
 
     electrons = image.astype(np.float64)
     variance_e2 = np.maximum(electrons, 0) + 4.0 + (0.01 * np.maximum(electrons, 0)) ** 2
@@ -208,6 +213,8 @@ def test_the_background_and_its_excess_variance_are_those_of_the_ring(background
     np.testing.assert_array_equal(light.support, support[here])
     np.testing.assert_allclose(light.signal_e, np.where(support, above_e, 0.0)[here], rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(light.variance_e2, variance_e2[here], rtol=1e-9)
+    without_moments = centroid_on(surface_of(readout, ellipse, [], 0), readout)
+    np.testing.assert_allclose(without_moments[:4], light.sums[:4], rtol=1e-12)
     noise_e2 = variance_e2[support].sum()
     assert light.sums.signal_to_noise == pytest.approx(above_e[support].sum() / np.sqrt(noise_e2), rel=1e-9)
     offsets = np.stack([u[support] - light.sums.u, v[support] - light.sums.v])

@@ -42,7 +42,7 @@ from estimator.spots.led_light import (
 )
 from estimator.spots.light_loops import above_half_level, brightest
 from estimator.spots.sampling import PIXEL_VARIANCE, SHARP, LensBlur, sampling_error, sampling_variance_px2
-from estimator.spots.shape_loops import Ints, Long, ellipse_spans, only_piece, pieces_of
+from estimator.spots.shape_loops import ellipse_spans, pieces_of, pixels_of
 
 # Share of the brightest level: above ceiling and walls at 1/100 of an LED, below an LED at a quarter of it.
 THRESHOLD_OF_BRIGHTEST = 0.05
@@ -252,38 +252,39 @@ def _ellipses(
     small, large = 0, 0
     for outline in sorted(outer, key=len, reverse=True)[:MAX_BLOBS]:
         left, top, width, height = cv2.boundingRect(outline)
-        blob = np.ascontiguousarray(mask[top : top + height, left : left + width])
+        blob = np.ascontiguousarray(mask[top : top + height, left : left + width]).view(np.bool_)
         if len(outer) > 1:
-            column, row = outline[0, 0]
-            count, labels = cv2.connectedComponents(blob, connectivity=8)
-            blob = (labels == labels[row - top, column - left]).view(np.uint8) if count > 2 else blob
-        area_px = cv2.countNonZero(blob)
+            column, row = outline[0, 0].tolist()
+            blob = _piece_at(blob, row - top, column - left)
+        area_px = cv2.countNonZero(blob.view(np.uint8))
         if not MIN_BLOB_PX <= area_px <= largest_px:
             small, large = small + (area_px < MIN_BLOB_PX), large + (area_px > largest_px)
             continue
-        core = above_half_level(smooth, left, top, blob.view(np.bool_), background_e)
-        piece, solid = only_piece(core)
-        pieces, alone = ([(core, piece)], True) if solid else _pieces(core)
-        ellipses += [_ellipse(*of_piece, left, top, stretch, alone) for of_piece in pieces]
+        core = above_half_level(smooth, left, top, blob, background_e)
+        pieces, runs = pieces_of(core)
+        least_px, alone = MIN_PIECE * int(pieces[:, 0].max()), len(pieces) == 1
+        for number, piece in enumerate(pieces.tolist()):
+            if piece[0] >= least_px:
+                own = core if alone else pixels_of(runs, number, height, width)
+                ellipses.append(_ellipse(own, piece, left, top, stretch, alone))
     return ellipses, (small, large)
 
 
-def _pieces(core: Mask) -> tuple[list[tuple[Mask, Long]], bool]:
-    """Pieces of a mask that count as LED images, with their pixels, and whether there is no other piece."""
-    count, labels = cv2.connectedComponents(core.view(np.uint8), connectivity=8)
-    numbers: Ints = np.asarray(labels, dtype=np.int32)
-    pieces = pieces_of(numbers, count)
-    areas = pieces[:, 0].tolist()
-    least = MIN_PIECE * max(areas)
-    return [(numbers == number, pieces[number]) for number in range(1, count) if areas[number] >= least], count == 2
+def _piece_at(mask: Mask, row: int, column: int) -> Mask:
+    """The piece of a mask that one of its pixels is in."""
+    pieces, runs = pieces_of(mask)
+    if len(pieces) == 1:
+        return mask
+    here = (runs[:, 0] == row) & (runs[:, 1] <= column) & (column < runs[:, 2])
+    return pixels_of(runs, int(runs[here, 3][0]), *mask.shape)
 
 
-def _ellipse(mask: Mask, piece: Long, left: int, top: int, stretch: float, alone: bool) -> Ellipse:
+def _ellipse(mask: Mask, piece: Sequence[int], left: int, top: int, stretch: float, alone: bool) -> Ellipse:
     """Ellipse with the centroid and second moments of a piece; (left, top) is the first pixel of its mask.
 
     The mask has the size of the box around the piece's blob, which is its fringe if it is `alone` in it.
     """
-    count, of_u, of_v, of_uu, of_uv, of_vv, first_column, first_row, last_column, last_row = piece.tolist()
+    count, of_u, of_v, of_uu, of_uv, of_vv, first_column, first_row, last_column, last_row = piece
     # Sums of whole numbers: exact before they are divided.
     uu, uv, vv = count * of_uu - of_u * of_u, count * of_uv - of_u * of_v, count * of_vv - of_v * of_v
     variances, axis = _principal_axes(uu / count**2, uv / count**2, vv / count**2)

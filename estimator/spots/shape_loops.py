@@ -53,47 +53,80 @@ def _spans_of(mask: Mask) -> tuple[Ints, bool]:
 
 
 @compiled
-def only_piece(mask: Mask) -> tuple[Long, bool]:
-    """The piece of a mask's pixels if it is one, as far as `_spans_of` tells, and whether it is."""
-    height, width = mask.shape
-    spans, solid = _spans_of(mask)
-    (piece,) = _no_pieces(1, height, width)
-    if solid:
-        for row in range(height):
-            _add_run(piece, row, spans[0, row], spans[1, row])
-    return piece, solid
+def pieces_of(mask: Mask) -> tuple[Long, Ints]:
+    """Pieces (k, 10) of a mask, in the order of their first pixels, and its runs (n, 4).
 
-
-@compiled
-def pieces_of(numbers: Ints, count: int) -> Long:
-    """Pieces (count, 10) of the pixels (rows, columns) with each number below a count; none of number 0."""
-    height, width = numbers.shape
-    pieces = _no_pieces(count, height, width)
-    for row in range(height):
-        line, column = numbers[row], 0
-        while column < width:
-            first, number = column, line[column]
-            while column < width and line[column] == number:
-                column += 1
-            if number > 0:
-                _add_run(pieces[number], row, first, column)
-    return pieces
-
-
-@compiled
-def _no_pieces(count: int, height: int, width: int) -> Long:
-    """Pieces (count, 10) without pixels, of a mask of this size."""
+    Pixels of a piece are connected, also by a corner. A run is a row, the first column, the one behind the last, and
+    the number of its piece.
+    """
+    runs = _runs_of(mask)
+    # Of each run one before it that it is connected to, or itself (Rosenfeld and Pfaltz 1966, with runs for pixels).
+    root, above, row_begins = np.arange(len(runs)), 0, 0
+    for k in range(len(runs)):
+        if k > 0 and runs[k, 0] > runs[k - 1, 0]:
+            above, row_begins = row_begins if runs[k, 0] == runs[k - 1, 0] + 1 else k, k
+        while above < row_begins and runs[above, 2] < runs[k, 1]:
+            above += 1
+        other = above
+        while other < row_begins and runs[other, 1] <= runs[k, 2]:
+            a, b = _first(root, other), _first(root, k)
+            root[max(a, b)] = min(a, b)
+            other += 1
+    count = 0
+    for k in range(len(runs)):
+        first = _first(root, k)
+        if first == k:
+            runs[k, 3] = count
+            count += 1
+        runs[k, 3] = runs[first, 3]
     pieces = np.zeros((count, 10), dtype=np.int64)
-    pieces[:, 6], pieces[:, 7], pieces[:, 8:] = width, height, -1
-    return pieces
+    pieces[:, 6], pieces[:, 7], pieces[:, 8:] = mask.shape[1], mask.shape[0], -1
+    for k in range(len(runs)):
+        _add_run(pieces[runs[k, 3]], runs[k, 0], runs[k, 1], runs[k, 2])
+    return pieces, runs
+
+
+@compiled
+def _runs_of(mask: Mask) -> Ints:
+    """Runs (n, 4) of the pixels of a mask, row by row; the last value is left open."""
+    height, width = mask.shape
+    runs, count = np.empty((height * (width // 2 + 1), 4), dtype=np.int32), 0
+    for row in range(height):
+        line, column = mask[row], 0
+        while column < width:
+            first = column
+            while column < width and line[column]:
+                column += 1
+            runs[count, 0], runs[count, 1], runs[count, 2] = row, first, column
+            count += first < column
+            while column < width and not line[column]:
+                column += 1
+    return runs[:count]
+
+
+@compiled
+def _first(root: Long, run: int) -> int:
+    """First of the runs connected to a run, as far as known; the way there becomes shorter."""
+    while root[run] != run:
+        root[run] = root[root[run]]
+        run = root[run]
+    return run
+
+
+@compiled
+def pixels_of(runs: Ints, number: int, height: int, width: int) -> Mask:
+    """Mask (height, width) of the runs of a piece, by its number."""
+    mask = np.zeros((height, width), dtype=np.bool_)
+    for k in range(len(runs)):
+        if runs[k, 3] == number:
+            mask[runs[k, 0], runs[k, 1] : runs[k, 2]] = True
+    return mask
 
 
 @compiled
 def _add_run(piece: Long, row: int, first: int, last: int) -> None:
     """Add the pixels of a row from a first column to before a last one to a piece."""
     size = last - first
-    if size <= 0:
-        return
     sum_u = (first + last - 1) * size // 2
     piece[0] += size
     piece[1] += sum_u
