@@ -30,7 +30,7 @@ from target import Targets, alternating_s, peer, ratio
 
 import estimator.spots.correspondences
 from estimator.evaluate.batch import estimate_burst, estimate_dataset, estimate_frame
-from estimator.evaluate.memory import keep_freed_memory
+from estimator.evaluate.process import prepare_process
 from estimator.io.dataset import Dataset, read_dataset, read_frame
 from estimator.io.device import DeviceFrame
 from estimator.io.shared import SharedResults
@@ -220,14 +220,14 @@ def extracted(frame: DeviceFrame, sep: Any) -> list[object]:
 def main() -> None:
     """Measure and print; exits with 1 where a ratio falls short."""
     cv2.setNumThreads(1)
-    keep_freed_memory()  # as `estimator run` and its workers do
+    prepare_process()  # as `estimator run` and its workers do
     targets, folders = Targets(), [Path(one) for one in sys.argv[1:]]
     for folder in folders:
         first = folder == folders[0]
         all_variants(targets, folder, MAX_ALL_VARIANTS if first else None)
         detection_beside_peers(targets, folder, held=first)
     fit_beside_peers(targets, read_dataset(folders[0]))
-    with ProcessPoolExecutor(WORKERS, get_context("spawn"), keep_freed_memory) as pool:
+    with ProcessPoolExecutor(WORKERS, get_context("spawn"), prepare_process) as pool:
         list(pool.map(read_dataset, WORKERS * folders[:1]))  # modules are loaded
         for folder in folders:
             print(f"\n{folder}: {len(read_dataset(folder).frames)} frames")

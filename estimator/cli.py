@@ -92,14 +92,14 @@ def run(
     """
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    from estimator.evaluate.memory import keep_freed_memory
+    from estimator.evaluate.process import prepare_process
     from estimator.evaluate.run import write_run
     from estimator.io.estimates import estimates_path
     from estimator.io.sweep import read_sweep
 
     if workers < 1:
         raise InputError(f"--workers {workers}: is not 1 or more")
-    keep_freed_memory()
+    prepare_process()
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     bar = Progress(*columns, console=progress_console())
     task = bar.add_task("frames", total=None)

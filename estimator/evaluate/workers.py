@@ -28,7 +28,7 @@ from estimator.evaluate.batch import (
     estimate_frames,
     in_order,
 )
-from estimator.evaluate.memory import keep_freed_memory
+from estimator.evaluate.process import prepare_process
 from estimator.io.dataset import Dataset, FrameRecord, read_device
 from estimator.methods.registry import Registry
 from estimator.methods.variant import Variant
@@ -152,7 +152,7 @@ def _start(names: Sequence[str], threads: int) -> None:
     global _worker_variants
     threading.Thread(target=_exit_with_parent, daemon=True).start()
     cv2.setNumThreads(threads)
-    keep_freed_memory()
+    prepare_process()
     registry = Registry.read()
     _worker_variants = [registry.named(name) for name in names]
 

@@ -1,14 +1,17 @@
-"""Memory that a process which estimates keeps from frame to frame."""
+"""Memory that a process which estimates keeps from frame to frame, and threads that it does not use."""
 
 import subprocess
 import sys
 
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
+
+from estimator.evaluate.process import use_one_blas_thread
 
 PAGE_FAULTS = """
 import resource, sys
 import numpy as np
-from estimator.evaluate.memory import KEPT_BYTES, LARGE_BYTES, keep_freed_memory
+from estimator.evaluate.process import KEPT_BYTES, LARGE_BYTES, keep_freed_memory
 
 if "keep" in sys.argv and not keep_freed_memory():
     sys.exit(77)
@@ -42,3 +45,12 @@ def test_a_frame_uses_the_memory_of_the_one_before() -> None:
 def test_without_it_the_system_clears_each_frame_s_pages_again() -> None:
     """The premise: where this fails, `keep_freed_memory` is of no use any more."""
     assert page_faults() > 41
+
+
+def test_linear_algebra_runs_in_one_thread() -> None:
+    """That of NumPy and that of SciPy, which have a library each in most installations."""
+    with threadpool_limits(limits=2, user_api="blas"):
+        use_one_blas_thread()
+        threads = [one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas"]
+    assert threads
+    assert set(threads) == {1}
