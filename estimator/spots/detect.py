@@ -126,11 +126,10 @@ def detect(
     a brighter light elsewhere does not hide them; without them, or if nothing was read out there, it is the image's
     maximum. `any_square` says that LEDs may be square: the ellipse for the centroid then encloses the square.
     `lens` says how sharp LED images are, `crosstalk` which share of a pixel's electrons its four neighbours collect.
-    `denoise_radius_px` is the radius of the box that the denoiser averaged over,
-    0 for raw images, whose centroids alone are corrected for sampling. Denoised images may be measured without
-    covariances, which take a sixth of the time. An LED image that may be cut by the border of
-    its region is reported and flagged. Raises EstimationFailure, which says what was seen in place of LEDs, if there is
-    none at all.
+    `denoise_radius_px` is the radius of the box that the denoiser averaged over, 0 for raw images, whose centroids
+    alone are corrected for sampling. Denoised images may be measured without covariances. An LED image that may be cut
+    by the border of its region is reported and flagged. Raises EstimationFailure, which says what was seen in place of
+    LEDs, if there is none at all.
     """
     readouts = [readout.contiguous() for readout in readouts]
     size = (SMOOTHING_PX, SMOOTHING_PX)
