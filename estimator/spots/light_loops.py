@@ -245,7 +245,7 @@ def light_within(
 def centroid_within(
     image_e: Image, raw_e: Image, left: int, top: int, support: Mask, plane: Plane, background: Background, noise: Noise
 ) -> tuple[float, float, float, float]:
-    """Flux, centroid (u, v) and the sum of the variances by `light_within`, in two thirds of its time, without images."""
+    """Flux, centroid (u, v) and the sum of variances by `light_within`, without images, in two thirds of its time."""
     height, width = support.shape
     (background_e, gate_e, excess_e2), (floor_e2, prnu, _) = background, noise
     flux, u, v, of_noise = 0.0, 0.0, 0.0, 0.0
