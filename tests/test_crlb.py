@@ -51,9 +51,7 @@ def renderer() -> Renderer:
 
 
 def light_of(renderer: Renderer, led_ids: Sequence[int]) -> Render:
-    return lambda posed, changes: [
-        [patch for patch in patches if patch.led_id in led_ids] for patches in renderer.led_slopes(posed, changes)
-    ]
+    return lambda posed, changes: [led for led in renderer.led_slopes(posed, changes) if led.led_id in led_ids]
 
 
 def alone(camera: Camera) -> Mounted:

@@ -15,7 +15,7 @@ from vlcrender.rendering.bayer import MosaicRenderer
 from vlcrender.rendering.face_motions import moved
 from vlcrender.rendering.led_coverage import coverage_of_led
 from vlcrender.rendering.led_radiance import LedImage, face_of_led
-from vlcrender.rendering.led_slopes import led_slopes
+from vlcrender.rendering.led_slopes import led_motions
 from vlcrender.rendering.renderer import Renderer
 from vlcrender.scene.loader import Scene
 from vlcrender.sensor.radiometry import Silicon
@@ -45,16 +45,16 @@ def agree(
     angle = STEP_PX / 1500
     steps = [2.0 * angle] * 3 + [angle] * 3
     changes = [(posed.at(moved(POSE, i, step)), posed.at(moved(POSE, i, -step))) for i, step in enumerate(steps)]
-    base, *slopes = renderer.led_slopes(posed, changes, regions)
-    assert len(base) >= 1
-    for of_change, cameras in zip(slopes, changes, strict=True):
+    leds = renderer.led_slopes(posed, changes, regions)
+    assert len(leds) >= 1
+    for number, cameras in enumerate(changes):
         after, before = ({p.led_id: p for p in renderer.led_patches(each, regions, POSE)} for each in cameras)
-        for slope in of_change:
-            one, other = after[slope.led_id], before[slope.led_id]
-            assert one.roi == other.roi == slope.roi
+        for led in leds:
+            one, other, slope = after[led.led_id], before[led.led_id], led.within(led.roi)[1 + number]
+            assert one.roi == other.roi == led.roi
             difference = one.electrons_per_s - other.electrons_per_s
             assert np.linalg.norm(difference) > 0
-            assert np.linalg.norm(slope.electrons_per_s - difference) < tolerance * np.linalg.norm(difference)
+            assert np.linalg.norm(slope - difference) < tolerance * np.linalg.norm(difference)
 
 
 @pytest.mark.parametrize(
@@ -100,7 +100,8 @@ def test_a_part_changes_as_its_quarters_together(split: int) -> None:
     images = {0: LedImage(leds, 0, posed, face, 1.0, 1.0, 1.0, None)}
     step_m = 2.0 * STEP_PX / 1500
     changes = [(posed.at(moved(POSE, 0, step_m)), posed.at(moved(POSE, 0, -step_m)))]
-    coarse, fine = (next(led_slopes(leds, posed, changes, images, {0: n}))[1][0].edges for n in (split, 2 * split))
+    (_, once), (_, twice) = (next(led_motions(leds, posed, changes, images, {0: n})) for n in (split, 2 * split))
+    coarse, fine = (next(motion.slopes(images[0])).edges for motion in (once, twice))
     assert coarse is not None
     assert fine is not None
     np.testing.assert_array_equal([coarse.rows, coarse.columns], [fine.rows, fine.columns])

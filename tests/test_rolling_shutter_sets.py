@@ -9,6 +9,7 @@ import numpy as np
 import OpenEXR
 import pytest
 from conftest import copy_of
+from numpy.typing import NDArray
 from test_rolling_shutter import MOTION, ROLLING, plan_of, rolling
 
 import vlcrender as vr
@@ -22,8 +23,8 @@ from vlcrender.dataset.world.true_world import gyro_rad_s
 from vlcrender.modulation.exposure import LineGains
 from vlcrender.modulation.transmission import led_waves
 from vlcrender.rendering.crlb import position_bound_m2
-from vlcrender.rendering.expected_image import LedPatch
 from vlcrender.rendering.led_slopes import Cameras
+from vlcrender.rendering.moving_led import MovingLed
 from vlcrender.rendering.renderer import Renderer
 
 
@@ -284,17 +285,11 @@ def test_the_bound_of_striped_leds_is_that_of_their_lit_lines(tmp_path: Path) ->
             changes: Sequence[Cameras],
             gains: LineGains = gains,
             renderer: Renderer = renderer,
-        ) -> tuple[tuple[LedPatch, ...], ...]:
-            return tuple(
-                tuple(
-                    replace(
-                        patch,
-                        electrons_per_s=patch.electrons_per_s * gains[patch.led_id][patch.row : patch.roi.end_row],
-                    )
-                    for patch in patches
-                )
-                for patches in renderer.led_slopes(posed, changes)
-            )
+        ) -> list[MovingLed]:
+            def lit(led: MovingLed, gain: NDArray[np.float64]) -> MovingLed:
+                return replace(led, pixels=lambda roi: led.within(roi) * gain[roi.row : roi.end_row])
+
+            return [lit(led, gains[led.led_id]) for led in renderer.led_slopes(posed, changes)]
 
         variance = RegionImage(Roi.of_sensor(mounted.camera), pixels(tmp_path / f"set/expected/{number:06d}.exr"))
         distance_m = float(np.median(np.linalg.norm(plan.scene.leds.centers_m - row.position_m, axis=1)))

@@ -13,8 +13,10 @@ from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.roi import LedRegions, Roi
 from vlcrender.rendering.crosstalk import REACH_PX, shared_patch, with_crosstalk
 from vlcrender.rendering.expected_image import ExpectedImage, ExpectedRegion, Gain, Gains, Halo, Image, LedPatch
+from vlcrender.rendering.halo import LightOfLed, SourceOfLight
 from vlcrender.rendering.led_slopes import Cameras
 from vlcrender.rendering.led_view import During, read_out
+from vlcrender.rendering.moving_led import MovingLed
 from vlcrender.rendering.renderer import Renderer
 from vlcrender.scene.leds import Leds
 from vlcrender.scene.loader import Scene
@@ -41,9 +43,10 @@ def _padded(patch: LedPatch | None, roi: Roi, dtype: Any) -> NDArray[Any]:
 
 
 def select_colours(images: Sequence[NDArray[Any]], mosaic: str, roi: Roi) -> NDArray[Any]:
-    """For each pixel of a region, the image of the pixel's colour. `images`: (rows, columns), for each of COLOURS."""
-    colours = colour_of_pixels(mosaic, roi)[None]
-    selected: NDArray[Any] = np.take_along_axis(np.stack(images), colours, axis=0)[0]
+    """For each pixel of a region, that of the pixel's colour. `images`: (..., rows, columns), for each of COLOURS."""
+    stacked = np.stack(images)
+    colours = np.expand_dims(colour_of_pixels(mosaic, roi), tuple(range(stacked.ndim - 2)))
+    selected: NDArray[Any] = np.take_along_axis(stacked, colours, axis=0)[0]
     return selected
 
 
@@ -115,16 +118,31 @@ class MosaicRenderer:
 
     def led_slopes(
         self, posed: PosedCamera, changes: Sequence[Cameras], regions: LedRegions | None = None
-    ) -> tuple[tuple[LedPatch, ...], ...]:
+    ) -> tuple[MovingLed, ...]:
         """As `Renderer.led_slopes`."""
         of_cameras = [zip(*map(self._of_colours, cameras), strict=True) for cameras in changes]
-        of_colours = [
-            renderer.led_slopes(of_colour, of_changes, regions)
+        by_id: list[dict[int, MovingLed]] = [
+            {led.led_id: led for led in renderer.led_slopes(of_colour, of_changes, regions)}
             for renderer, of_colour, of_changes in zip(
                 self.of_colours, self._of_colours(posed), zip(*of_cameras, strict=True), strict=True
             )
         ]
-        return tuple(self._with_crosstalk(self._patches(same), posed) for same in zip(*of_colours, strict=True))
+        seen = []
+        for led_id in dict.fromkeys(led_id for of_colour in by_id for led_id in of_colour):
+            same = [of_colour.get(led_id) for of_colour in by_id]
+            found = [led for led in same if led is not None]
+            leading = same[COLOURS.index("green")] or found[0]
+            roi = reduce(Roi.union, (led.roi for led in found))
+            led = replace(leading, roi=roi, pixels=partial(self._select_moving, same, leading.changes))
+            sensor = Roi.of_sensor(posed.camera)
+            seen.append(led.with_crosstalk(self.crosstalk, sensor) if self.crosstalk else led)
+        return tuple(seen)
+
+    def _select_moving(self, of_colours: Sequence[MovingLed | None], changes: int, roi: Roi) -> NDArray[np.float64]:
+        """For each pixel of a region, one LED's light of the pixel's colour and its changes."""
+        dark = np.zeros((1 + changes, *roi.shape))
+        light = [dark if led is None else led.within(roi) for led in of_colours]
+        return select_colours(light, self.mosaic, roi)
 
     def _with_crosstalk(self, patches: tuple[LedPatch, ...], posed: PosedCamera) -> tuple[LedPatch, ...]:
         if not self.crosstalk:
@@ -135,8 +153,8 @@ class MosaicRenderer:
         """The camera as light of each colour sees it (lateral colour)."""
         return tuple(replace(posed, camera=posed.camera.for_colour(c)) for c in range(len(COLOURS)))
 
-    def halo_of(self, camera: Camera) -> Callable[[Sequence[LedPatch], Roi], NDArray[np.float64]] | None:
-        """As `Renderer.halo_of`, of patches under the mosaic: each colour's light is that of its pixels, times 4 or 2.
+    def halo_of(self, camera: Camera) -> Callable[[Sequence[SourceOfLight], Roi], NDArray[np.float64]] | None:
+        """As `Renderer.halo_of`, of light under the mosaic: each colour's light is that of its pixels, times 4 or 2.
 
         The halo is too wide to tell that from the light that all pixels have under the colour's filter.
         """
@@ -144,17 +162,20 @@ class MosaicRenderer:
         return None if of_colour is None else partial(self._mosaic_halo, of_colour)
 
     def _mosaic_halo(
-        self, of_colour: Callable[[Sequence[LedPatch], Roi], NDArray[np.float64]], patches: Sequence[LedPatch], roi: Roi
+        self,
+        of_colour: Callable[[Sequence[SourceOfLight], Roi], NDArray[np.float64]],
+        sources: Sequence[SourceOfLight],
+        roi: Roi,
     ) -> NDArray[np.float64]:
         colours = colour_of_pixels(self.mosaic, Roi(0, 0, 2, 2))
         halos = []
         for colour in range(len(COLOURS)):
             factor = colours.size / np.count_nonzero(colours == colour)
             light = [
-                replace(
-                    p, electrons_per_s=p.electrons_per_s * factor * (colour_of_pixels(self.mosaic, p.roi) == colour)
+                LightOfLed(
+                    p.led_id, p.roi, p.electrons_per_s * factor * (colour_of_pixels(self.mosaic, p.roi) == colour)
                 )
-                for p in patches
+                for p in sources
             ]
             halos.append(of_colour(light, roi))
         return select_colours(halos, self.mosaic, roi)

@@ -29,7 +29,7 @@ other groups are part of the background.
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,11 +39,22 @@ from vlcrender.camera.intrinsics import Pose
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.rig import Mounted
 from vlcrender.camera.roi import LedRegions, RegionImage, Roi, led_regions
-from vlcrender.rendering.expected_image import Gains, LedPatch, gain_in
+from vlcrender.rendering.expected_image import Gains
 from vlcrender.rendering.face_motions import FACE_NUMBERS, OWN, face_motions, moved
+from vlcrender.rendering.halo import LightOfLed, SourceOfLight
 from vlcrender.rendering.led_coverage import intersections_with_plane
 from vlcrender.rendering.led_radiance import face_of_led
 from vlcrender.rendering.led_slopes import Cameras
+from vlcrender.rendering.moving_led import MovingLed
+from vlcrender.rendering.seen_pixels import SeenPixels
+from vlcrender.rendering.triangles import (
+    PIXELS_AT_ONCE,
+    ColumnsOf,
+    all_columns,
+    marginal,
+    triangle_of,
+    triangle_of_tiles,
+)
 from vlcrender.rendering.uncertainty import (
     MapLevers,
     Uncertainty,
@@ -60,13 +71,11 @@ STEP_PX = 1e-3
 1e-9 of it, and terms of the third order, (1e-3 px / focal length)^2, are smaller."""
 MAX_CONDITION = 1e12
 """Condition number of the information, in units of the steps, above which a direction holds only rounding errors."""
-PIXELS_AT_ONCE = 100_000
-"""Pixels whose slopes are reduced together: bounds the memory for an LED as large as the image."""
 
-Render = Callable[[PosedCamera, Sequence[Cameras]], Sequence[Sequence[LedPatch]]]
-"""`led_slopes` of a renderer: the patches of some LEDs at a camera, and their changes with each change of it."""
-HaloOf = Callable[[Sequence[LedPatch], Roi], Array]
-"""The halo of some patches in a region of the sensor, electrons a second."""
+Render = Callable[[PosedCamera, Sequence[Cameras]], Sequence[MovingLed]]
+"""`led_slopes` of a renderer: some LEDs at a camera, and how they change with each change of it."""
+HaloOf = Callable[[Sequence[SourceOfLight], Roi], Array]
+"""The halo of some light in a region of the sensor, electrons a second."""
 
 
 def position_bound_m2(
@@ -82,9 +91,9 @@ def position_bound_m2(
 ) -> Array | None:
     """Bound of the covariance of a camera's position, (3, 3), m2, world; None where the frame does not determine it.
 
-    mounted: the camera on its rig. main: the pose of `main`, to which the accelerometer is fixed. render: patches of
-    the LEDs and their changes, electrons a second. variance_e2: the regions read out, with the
-    variance of each pixel, inf for pixels without information (saturated ones). distance_m: from the camera to the
+    mounted: the camera on its rig. main: the pose of `main`, to which the accelerometer is fixed. render: light of the
+    LEDs and its changes, electrons a second. variance_e2: the regions read out, with the variance of each pixel, inf
+    for pixels without information (saturated ones). distance_m: from the camera to the
     LEDs, roughly. tilt_sigmas_deg: standard deviations of the accelerometer on tilt_x and tilt_y; 0 means that both
     tilts are known. overscan: whether LEDs count beyond the sensor. halo_of: halos of a lens with glare.
     """
@@ -98,9 +107,8 @@ class FrameSlopes:
 
     mounted: Mounted
     main: Pose
-    at_pose: Sequence[LedPatch]
-    changes: Sequence[Mapping[int, LedPatch]]
-    """For each unknown of the pose, by LED id, the change of a patch from a step to one side to a step to the other."""
+    seen: Sequence[MovingLed]
+    """The LEDs, and by each unknown of the pose their change from a step to one side to a step to the other."""
     steps: tuple[float, ...]
     """Steps of x, y, z in metres and tilt_x, tilt_y, yaw in radians."""
     exposure_s: float
@@ -135,11 +143,10 @@ class FrameSlopes:
             return mounted.posed(moved(main, unknown, step))
 
         cameras = [(after(i, step), after(i, -step)) for i, step in enumerate(steps[:unknowns])]
-        at_pose, *changed = render(mounted.posed(main), cameras)
-        if not at_pose:
+        seen = render(mounted.posed(main), cameras)
+        if not seen:
             return None
-        changes = [{patch.led_id: patch for patch in patches} for patches in changed]
-        return cls(mounted, main, at_pose, changes, steps, exposure_s, variance_e2, overscan, halo_of)
+        return cls(mounted, main, seen, steps, exposure_s, variance_e2, overscan, halo_of)
 
     def exposed(self, variance_e2: Sequence[RegionImage], gains: Gains | None = None) -> "FrameSlopes":
         """The slopes of one exposure of the same view: with the variance of its pixels, and known gains of LEDs by id.
@@ -147,18 +154,10 @@ class FrameSlopes:
         Gains belong to lines of the sensor, not to the images that move. Of a lens with glare they have to be 1.
         """
 
-        def lit(patch: LedPatch) -> LedPatch:
-            if gains is None or patch.led_id not in gains:
-                return patch
-            gain = gain_in(gains[patch.led_id], patch.roi)
-            return replace(patch, electrons_per_s=patch.electrons_per_s * gain)
-
-        return replace(
-            self,
-            at_pose=[lit(patch) for patch in self.at_pose],
-            changes=[{led: lit(patch) for led, patch in change.items()} for change in self.changes],
-            variance_e2=variance_e2,
-        )
+        lit = self.seen
+        if gains is not None:
+            lit = [led.times(gains[led.led_id]) if led.led_id in gains else led for led in self.seen]
+        return replace(self, seen=lit, variance_e2=variance_e2)
 
     def exact_bound_m2(self, tilt_sigmas_deg: tuple[float, float]) -> Array | None:
         """Bound of the position, (3, 3), m2, where lens and map are known; None where it is not determined."""
@@ -170,14 +169,34 @@ class FrameSlopes:
         information = np.zeros((6, 6))
         for box in self._boxes():
             for common, inside, weight in self._parts(box):
-                slopes = np.empty((6, common.rows, common.columns))
-                for slope, change, step in zip(slopes, self.changes, self.steps, strict=True):
-                    np.multiply(self._of(common, change, inside), self.exposure_s, out=slope)
-                    slope /= 2 * step
-                nuisances = [self._light(common, patch) for patch in inside]
-                nuisances.append(np.ones((common.rows, common.columns)))
-                information += _marginal(slopes, np.stack(nuisances), weight)
+                columns = partial(self._columns_of_pose, inside)
+                rows = self._rows(common, weight, 6 + len(inside) + 1, columns)
+                information += marginal(rows[:6], rows[6:])
         return information
+
+    def _columns_of_pose(self, inside: Sequence[MovingLed], tile: Roi) -> tuple[Array, list[int]]:
+        """Of some pixels, slopes by the pose and by brightness and level, electrons, and the numbers of these columns:
+        6, one for each of `inside`, and one.
+        """
+        lit = [number for number, led in enumerate(inside) if led.roi.overlaps(tile)]
+        columns = np.zeros((6 + len(lit) + 1, *tile.shape))
+        if self.halo_of is not None:
+            for unknown in range(6):
+                columns[unknown] = self._halo(inside, 1 + unknown, tile)
+            for column, number in zip(columns[6:], lit, strict=False):
+                column[:] = self._halo([inside[number]], 0, tile)
+        for column, number in zip(columns[6:], lit, strict=False):
+            roi = inside[number].roi.intersection(tile)
+            here, (light, *changes) = tile.slices(roi), inside[number].pixels(roi)
+            column[here] += light
+            column *= self.exposure_s
+            for slope, change in zip(columns, changes, strict=False):
+                slope[here] += change
+        for slope, step in zip(columns, self.steps, strict=False):
+            slope *= self.exposure_s
+            slope /= 2 * step
+        columns[-1] = 1.0
+        return columns, [*range(6), *(6 + number for number in lit), 6 + len(inside)]
 
     def hybrid_bound_m2(
         self, tilt_sigmas_deg: tuple[float, float], leds: Leds, uncertainty: Uncertainty
@@ -196,7 +215,7 @@ class FrameSlopes:
     ) -> Array | None:
         """`hybrid_bound_m2` from the place and linear shape of each LED's image, for any `uncertainty`."""
         index_of = {int(led_id): i for i, led_id in enumerate(leds.ids)}
-        indices = np.array(sorted({index_of[patch.led_id] for patch in self.at_pose}))
+        indices = np.array(sorted({index_of[led.led_id] for led in self.seen}))
         place = {int(i): number for number, i in enumerate(indices)}
         levers = MapLevers(uncertainty, leds, indices)
         motions = face_motions(self.mounted, self.main, leds, indices)
@@ -221,7 +240,7 @@ class FrameSlopes:
                 effects = [block_diag(*own[places]), shared[places].reshape(-1, nuisances + 6)]
                 with_own = factor @ np.concatenate(effects, axis=1)
                 priors = np.eye(OWN * len(of_box), with_own.shape[1])
-                rows.append(_triangle(np.concatenate([priors, with_own]))[len(priors) :, len(priors) :])
+                rows.append(triangle_of(np.concatenate([priors, with_own]))[len(priors) :, len(priors) :])
         tilts = tilt_covariance_rad2(self.mounted, self.main, tilt_sigmas_deg, uncertainty.mounting_rad)
         free = [0, 1, 2, 5]
         if tilts.any():
@@ -230,7 +249,7 @@ class FrameSlopes:
             prior[:, [nuisances + 3, nuisances + 4]] = np.linalg.inv(np.linalg.cholesky(tilts)) * self.steps[3]
             rows.append(prior)
         columns = [*range(nuisances), *(nuisances + i for i in free)]
-        triangle = _triangle(np.concatenate(rows)[:, columns])[nuisances:, nuisances:]
+        triangle = triangle_of(np.concatenate(rows)[:, columns])[nuisances:, nuisances:]
         if len(triangle) < len(free) or not np.isfinite(triangle).all():
             return None
         if np.linalg.cond(triangle) ** 2 > MAX_CONDITION:
@@ -250,19 +269,33 @@ class FrameSlopes:
         information: dict[int, Array] = {}
         for box in self._boxes():
             for common, inside, weight in self._parts(box):
-                nuisances = [self._light(common, patch) for patch in inside]
-                nuisances.append(np.ones((common.rows, common.columns)))
-                for patch in inside:
-                    i = index_of[patch.led_id]
-                    by_position = np.stack([self._slope(common, unknown, patch) for unknown in range(2)])
-                    shifts = self.shift_slopes(common, leds, i, by_position)
-                    part = _marginal(shifts, np.stack(nuisances), weight)
+                free = len(inside) + 1
+                columns = partial(self._columns_of_places, inside, leds, index_of)
+                rows = self._rows(common, weight, free + 2 * len(inside), columns)
+                for number, led in enumerate(inside):
+                    i = index_of[led.led_id]
+                    part = marginal(rows[free + 2 * number : free + 2 * number + 2], rows[:free])
                     information[i] = information.get(i, np.zeros((2, 2))) + part
         return {
             i: np.asarray(np.linalg.inv(of_led), dtype=np.float64)
             for i, of_led in information.items()
             if np.isfinite(of_led).all() and np.linalg.cond(of_led) < MAX_CONDITION
         }
+
+    def _columns_of_places(
+        self, inside: Sequence[MovingLed], leds: Leds, index_of: Mapping[int, int], tile: Roi
+    ) -> tuple[Array, list[int]]:
+        """Of some pixels, slopes by brightness and level, and by a shift along u and v of each of `inside`; and the
+        numbers of these columns.
+        """
+        lit = [number for number, led in enumerate(inside) if led.roi.overlaps(tile)]
+        columns = np.ones((3 * len(lit) + 1, *tile.shape))
+        shifts = columns[len(lit) + 1 :].reshape(len(lit), 2, *tile.shape)
+        for light, shift, number in zip(columns, shifts, lit, strict=False):
+            light[:], by_position = self._light_and_slopes(tile, inside[number])
+            shift[:] = self.shift_slopes(tile, leds, index_of[inside[number].led_id], by_position)
+        free = len(inside) + 1
+        return columns, [*lit, len(inside), *(free + 2 * number + axis for number in lit for axis in range(2))]
 
     def lever(self) -> Array:
         """Jacobian of the camera's position to the unknowns of the pose of `main`, (3, 6)."""
@@ -276,37 +309,46 @@ class FrameSlopes:
     def _boxes(self) -> tuple[Roi, ...]:
         """The pixels of each group of LEDs whose margins overlap."""
         with_margin = LedRegions(kind="leds", margin_px=MARGIN_PX, overscan=self.overscan)
-        return led_regions((patch.roi for patch in self.at_pose), self.mounted.camera, with_margin)
+        return led_regions((led.roi for led in self.seen), self.mounted.camera, with_margin)
 
-    def _parts(self, box: Roi) -> Iterator[tuple[Roi, list[LedPatch], Array]]:
-        """What the regions read out show of a box: pixels, LEDs in them, and 1 / variance of each pixel."""
-        for roi, variance in self.variance_e2:
-            if roi.overlaps(box):
-                common = roi.intersection(box)
-                inside = [patch for patch in self.at_pose if common.overlaps(patch.roi)]
-                yield common, inside, 1 / variance[roi.slices(common)].astype(np.float64)
+    def _parts(self, box: Roi) -> Iterator[tuple[Roi, list[MovingLed], RegionImage]]:
+        """What the regions read out show of a box: pixels, LEDs in them, and the variance of each pixel of a region."""
+        for region in self.variance_e2:
+            if region.roi.overlaps(box):
+                common = region.roi.intersection(box)
+                yield common, [led for led in self.seen if common.overlaps(led.roi)], region
 
-    def _of(self, roi: Roi, patches: Mapping[int, LedPatch], leds: Sequence[LedPatch]) -> Array:
-        """Light of some LEDs in a region, electrons a second: of those in `patches` (by id) that `leds` names."""
-        found = [patches[led.led_id] for led in leds if led.led_id in patches]
-        image = np.zeros((roi.rows, roi.columns))
-        if self.halo_of is not None:
-            for sign in (1.0, -1.0):  # a halo is that of light, which is positive
-                light = [replace(p, electrons_per_s=np.maximum(sign * p.electrons_per_s, 0.0)) for p in found]
-                image += sign * self.halo_of(light, roi)
-        for patch in found:
-            if roi.overlaps(patch.roi):
-                both = roi.intersection(patch.roi)
-                image[roi.slices(both)] += patch.electrons_per_s[patch.roi.slices(both)]
+    def _rows(self, common: Roi, variance: RegionImage, width: int, columns_of: ColumnsOf) -> Array:
+        """Numbers of some pixels over their standard deviation, (width, pixels), or fewer with the same products."""
+
+        def scaled(tile: Roi) -> tuple[Array, list[int]]:
+            columns, which = columns_of(tile)
+            weight = 1 / variance.image[variance.roi.slices(tile)].astype(np.float64)
+            return columns.reshape(len(columns), -1) * np.sqrt(weight).ravel(), which
+
+        # a halo is of whole images: it is not made for each tile
+        at_once = self.halo_of is not None or common.pixels <= PIXELS_AT_ONCE
+        return all_columns(common, width, scaled) if at_once else triangle_of_tiles(common, width, scaled)
+
+    def _halo(self, leds: Sequence[MovingLed], change: int, roi: Roi) -> Array | float:
+        """The halo of the light of some LEDs in a region, electrons a second, or the change of this number of it."""
+        if self.halo_of is None:
+            return 0.0
+        image = np.zeros(roi.shape)
+        for sign in (1.0, -1.0):  # a halo is that of light, which is positive
+            light = [LightOfLed(led.led_id, led.roi, np.maximum(sign * led.within(led.roi)[change], 0)) for led in leds]
+            image += sign * self.halo_of(light, roi)
         return image
 
-    def _light(self, roi: Roi, led: LedPatch) -> Array:
-        """Light of one LED in a region, electrons."""
-        return self._of(roi, {led.led_id: led}, [led]) * self.exposure_s
-
-    def _slope(self, roi: Roi, unknown: int, led: LedPatch) -> Array:
-        """Slope of one LED's light in a region by an unknown of the pose, electrons per m or radian."""
-        return self._of(roi, self.changes[unknown], [led]) * self.exposure_s / (2 * self.steps[unknown])
+    def _light_and_slopes(self, roi: Roi, led: MovingLed) -> tuple[Array, Array]:
+        """Light of one LED in a region, electrons, and its slopes by the camera's x and y, (2, rows, columns)."""
+        light, *by_position = led.within(roi)[:3]
+        light = (self._halo([led], 0, roi) + light) * self.exposure_s
+        slopes = [
+            (self._halo([led], 1 + unknown, roi) + change) * self.exposure_s / (2 * self.steps[unknown])
+            for unknown, change in enumerate(by_position)
+        ]
+        return light, np.stack(slopes)
 
     def _box_factor(
         self, box: Roi, leds: Leds, index_of: Mapping[int, int], uncertainty: Uncertainty
@@ -316,62 +358,75 @@ class FrameSlopes:
         Columns of F, (at most 6 k, 6 k): the FACE_NUMBERS of each LED. Brightness, background and the gradients of
         luminance are eliminated.
         """
-        of_box = sorted({index_of[patch.led_id] for _, inside, _ in self._parts(box) for patch in inside})
+        of_box = sorted({index_of[led.led_id] for _, inside, _ in self._parts(box) for led in inside})
         k = len(of_box)
         total = np.zeros((0, 2 * k + FACE_NUMBERS * k))
-        for common, inside, weight in self._parts(box):
-            total = np.concatenate([total, self._part_factor(common, inside, weight, leds, index_of, of_box)])
+        for common, inside, variance in self._parts(box):
+            total = np.concatenate([total, self._part_factor(common, inside, variance, leds, index_of, of_box)])
         total[:, : 2 * k] *= np.repeat(uncertainty.led_gradients[of_box], 2)
         priors = np.eye(2 * k, total.shape[1])
-        return _triangle(np.concatenate([priors, total]))[2 * k :, 2 * k :], of_box
+        return triangle_of(np.concatenate([priors, total]))[2 * k :, 2 * k :], of_box
 
     def _part_factor(
         self,
         common: Roi,
-        inside: Sequence[LedPatch],
-        weight: Array,
+        inside: Sequence[MovingLed],
+        variance: RegionImage,
         leds: Leds,
         index_of: Mapping[int, int],
         of_box: Sequence[int],
     ) -> Array:
         """Factor of the information of some pixels about gradients (2 k) and faces (6 k), without other unknowns."""
         k, free = len(of_box), len(inside) + 1
-        factor = np.zeros((0, free + 2 * k + FACE_NUMBERS * k))
-        rows_at_once = max(1, PIXELS_AT_ONCE // common.columns)
-        for start in range(0, common.rows, rows_at_once):
-            band = Roi(common.row + start, common.column, min(rows_at_once, common.rows - start), common.columns)
-            columns = np.zeros((factor.shape[1], band.rows, band.columns))
-            columns[len(inside)] = 1.0
-            gradients, faces = columns[free : free + 2 * k], columns[free + 2 * k :]
-            for number, patch in enumerate(inside):
-                columns[number] = self._light(band, patch)
-                i = index_of[patch.led_id]
-                led = of_box.index(i)
-                x, y, rim_x, rim_y = self._on_face(band, leds, i)
-                radius = leds.half_widths_m[i]
-                if leds.diffusers[i] is None:
-                    gradients[2 * led : 2 * led + 2] = columns[number] * np.clip(np.stack([x, y]) / radius, -1, 1)
-                by_shift = [-self._slope(band, unknown, patch) for unknown in range(2)]
-                faces[FACE_NUMBERS * led : FACE_NUMBERS * (led + 1)] = [
-                    slope * arm for arm in (1.0, rim_x, rim_y) for slope in by_shift
-                ]
-            rows = (columns * np.sqrt(weight[common.slices(band)])).reshape(len(columns), -1).T
-            factor = _triangle(np.concatenate([factor, rows]))
-        # The part that is orthogonal to brightness and background, as in `_marginal`.
+        places = [of_box.index(index_of[led.led_id]) for led in inside]
+        columns = partial(self._columns_of_faces, inside, places, leds, index_of, k)
+        factor = triangle_of(self._rows(common, variance, free + 2 * k + FACE_NUMBERS * k, columns).T)
+        # The part that is orthogonal to brightness and background, as in `marginal`.
         basis, lengths, _ = np.linalg.svd(factor[:, :free], full_matrices=False)
         basis = basis[:, lengths > 1e-9 * lengths.max()]
         rest = factor[:, free:]
         orthogonal: Array = rest - basis @ (basis.T @ rest)
         return orthogonal
 
-    def _on_face(self, roi: Roi, leds: Leds, i: int) -> tuple[Array, Array, Array, Array]:
+    def _columns_of_faces(
+        self,
+        inside: Sequence[MovingLed],
+        places: Sequence[int],
+        leds: Leds,
+        index_of: Mapping[int, int],
+        k: int,
+        tile: Roi,
+    ) -> tuple[Array, list[int]]:
+        """Of some pixels, slopes by brightness and level, by the gradients and by the faces of k LEDs, of which
+        `places` are the numbers of those inside; and the numbers of these columns.
+        """
+        first, columns, which = len(inside) + 1, [np.ones(tile.shape)], [len(inside)]
+        seen = SeenPixels(self.mounted.posed(self.main), tile)
+        for number, (place, led) in enumerate(zip(places, inside, strict=True)):
+            if not led.roi.overlaps(tile):
+                continue
+            light, by_position = self._light_and_slopes(tile, led)
+            i = index_of[led.led_id]
+            x, y, rim_x, rim_y = self._on_face(seen, leds, i)
+            columns.append(light)
+            which.append(number)
+            if leds.diffusers[i] is None:
+                columns.extend(light * np.clip(np.stack([x, y]) / leds.half_widths_m[i], -1, 1))
+                which.extend(range(first + 2 * place, first + 2 * place + 2))
+            by_shift = -by_position
+            columns.extend(slope * arm for arm in (1.0, rim_x, rim_y) for slope in by_shift)
+            face = first + 2 * k + FACE_NUMBERS * place
+            which.extend(range(face, face + FACE_NUMBERS))
+        return np.stack(columns), which
+
+    def _on_face(self, seen: SeenPixels, leds: Leds, i: int) -> tuple[Array, Array, Array, Array]:
         """Of each pixel's centre, the point (x, y) on an LED's plane and the point of the rim next to it, from the
         face's centre, m.
 
         An LED's light changes at the rim, however far the lens blurs the change.
         """
         face = face_of_led(leds, i)
-        x, y = intersections_with_plane(self.mounted.posed(self.main), face.center_m, *roi.centers_px())
+        x, y = seen.on_plane(seen.roi, face.center_m)
         return x, y, *face.shape.nearest_on_rim(x, y)
 
     def shift_slopes(self, roi: Roi, leds: Leds, i: int, by_position: Array) -> Array:
@@ -390,28 +445,6 @@ class FrameSlopes:
             x0, y0 = intersections_with_plane(posed, center_m, u - du, v - dv)
             slopes.append(-((x1 - x0) * by_position[0] + (y1 - y0) * by_position[1]))
         return np.stack(slopes)
-
-
-def _triangle(rows: Array) -> Array:
-    """R of the rows' QR decomposition: R' R = rows' rows, without forming the product."""
-    triangle: Array = np.asarray(np.linalg.qr(rows, mode="r"))
-    return triangle
-
-
-def _marginal(slopes: Array, nuisances: Array, weight: Array) -> Array:
-    """Information about the pose with unknown nuisance parameters: the Schur complement, (6, 6).
-
-    slopes: (6, rows, columns), nuisances: (n, rows, columns), derivatives of the image; weight: 1 / variance.
-    """
-    scale = np.sqrt(weight).ravel()
-    pose_part = slopes.reshape(len(slopes), -1) * scale
-    nuisance_part = nuisances.reshape(len(nuisances), -1) * scale
-    # The part of each slope that is orthogonal to all nuisances.
-    basis, lengths, _ = np.linalg.svd(nuisance_part.T, full_matrices=False)
-    basis = basis[:, lengths > 1e-9 * lengths.max()]
-    orthogonal = pose_part - (pose_part @ basis) @ basis.T
-    product: Array = orthogonal @ orthogonal.T
-    return product
 
 
 def _position_covariance(information: Array, tilt_sigmas: Array, steps: Sequence[float], lever: Array) -> Array | None:

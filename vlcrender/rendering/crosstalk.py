@@ -47,7 +47,7 @@ def shared(image: NDArray[Any], share: float) -> NDArray[Any]:
     that pixels of a mosaic have neighbours of the right colours.
     """
     rows, columns = map(_mirrored, image.shape)
-    return _of_padded(image[np.ix_(rows, columns)], share)
+    return of_padded(image[np.ix_(rows, columns)], share)
 
 
 def _mirrored(size: int) -> NDArray[np.int64]:
@@ -57,18 +57,23 @@ def _mirrored(size: int) -> NDArray[np.int64]:
     return np.concatenate([[1], np.arange(size), [size - 2]])
 
 
-def _of_padded(wide: NDArray[Any], share: float) -> NDArray[Any]:
-    """The pixels of an image without its outermost rows and columns, after crosstalk."""
-    neighbours = wide[:-2, 1:-1] + wide[2:, 1:-1] + wide[1:-1, :-2] + wide[1:-1, 2:]
-    mixed: NDArray[Any] = wide.dtype.type(1 - share) * wide[1:-1, 1:-1] + wide.dtype.type(share / 4) * neighbours
+def of_padded(wide: NDArray[Any], share: float) -> NDArray[Any]:
+    """The pixels of images (..., rows, columns) without their outermost rows and columns, after crosstalk."""
+    neighbours = wide[..., :-2, 1:-1] + wide[..., 2:, 1:-1] + wide[..., 1:-1, :-2] + wide[..., 1:-1, 2:]
+    mixed: NDArray[Any] = wide.dtype.type(1 - share) * wide[..., 1:-1, 1:-1] + wide.dtype.type(share / 4) * neighbours
     return mixed
 
 
+def reached(roi: Roi, sensor: Roi) -> Roi:
+    """The pixels that the light of a region reaches; light that leaves the sensor is lost."""
+    grown = roi.padded(REACH_PX)
+    return grown.intersection(sensor) if sensor.contains(roi) else grown
+
+
 def shared_patch(patch: Patch, share: float, sensor: Roi) -> Patch:
-    """A patch after crosstalk, one pixel larger on each side; light that leaves the sensor is lost."""
-    grown = patch.roi.padded(REACH_PX)
-    light = _of_padded(np.pad(patch.electrons_per_s, 2 * REACH_PX), share)
-    inside = grown.intersection(sensor) if sensor.contains(patch.roi) else grown
+    """A patch after crosstalk, one pixel larger on each side."""
+    grown, inside = patch.roi.padded(REACH_PX), reached(patch.roi, sensor)
+    light = of_padded(np.pad(patch.electrons_per_s, 2 * REACH_PX), share)
     return replace(
         patch,
         row=inside.row,

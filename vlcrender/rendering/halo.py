@@ -53,6 +53,15 @@ class SourceOfLight(Protocol):
 
 
 @dataclass(frozen=True)
+class LightOfLed:
+    """A part of one LED's light, or a change of it, as `SourceOfLight`."""
+
+    led_id: int
+    roi: Roi
+    electrons_per_s: Array
+
+
+@dataclass(frozen=True)
 class HaloGrid:
     """Nodes over a sensor: node (i, j) is at the pixel position v = (i - BORDER_NODES) step, u = (j - ...) step."""
 

@@ -68,6 +68,23 @@ class CoverageBlocks:
         )
         return float((rows[:, None] * columns * self.whole).sum() + self.parts.sum())
 
+    def within(self, inner: Roi, roi: Roi) -> Array:
+        """Coverage of a part of the region, (rows, columns)."""
+        (top, bottom), (left, right) = (
+            (inside.start // BLOCK_PX, -(-inside.stop // BLOCK_PX)) for inside in roi.slices(inner)
+        )
+        number = np.cumsum(self.mixed).reshape(self.mixed.shape) - 1
+        blocks = np.zeros((bottom - top, right - left, BLOCK_PX, BLOCK_PX))
+        blocks[self.whole[top:bottom, left:right]] = 1.0
+        mixed = self.mixed[top:bottom, left:right]
+        blocks[mixed] = self.parts[number[top:bottom, left:right][mixed]]
+        pixels = blocks.swapaxes(1, 2).reshape((bottom - top) * BLOCK_PX, (right - left) * BLOCK_PX)
+        rows, columns = roi.slices(inner)
+        return pixels[
+            rows.start - top * BLOCK_PX : rows.stop - top * BLOCK_PX,
+            columns.start - left * BLOCK_PX : columns.stop - left * BLOCK_PX,
+        ]
+
     def reduce(self, light: NDArray[Any]) -> None:
         """Multiply the light of pixels covered whole, (rows, columns), by their coverage."""
         for number, lit in enumerate(self.whole | self.mixed):
@@ -103,6 +120,17 @@ class LedCoverage:
         coverage = np.ones(self.roi.shape)
         self.reduce(coverage)
         return coverage
+
+    def within(self, roi: Roi) -> "LedCoverage":
+        """The coverage of a part of the region, pixel by pixel."""
+        inside, profile = self.roi.slices(roi), self.profile
+        pixels = self.pixels
+        return replace(
+            self,
+            roi=roi,
+            pixels=pixels.within(roi, self.roi) if isinstance(pixels, CoverageBlocks) else pixels[inside],
+            profile=profile if isinstance(profile, float) else profile[inside],
+        )
 
     @property
     def area_px(self) -> float:
@@ -317,7 +345,11 @@ def intersections_with_plane(posed: PosedCamera, center_m: Array, u: Array, v: A
 
     center_m: (3,), world. Rays that do not go up meet the plane beyond BEYOND_HORIZON_M.
     """
-    x, y, z = posed.ray_world(u, v)
+    return met_by_rays(posed, center_m, *posed.ray_world(u, v))
+
+
+def met_by_rays(posed: PosedCamera, center_m: Array, x: Array, y: Array, z: Array) -> tuple[Array, Array]:
+    """`intersections_with_plane` of rays from a camera, in directions (x, y, z) of the world."""
     position_m = posed.pose.position_m
     upward = z > 1e-9
     all_upward = bool(upward.all())

@@ -48,6 +48,12 @@ class LedEdges:
         factor = image[self.rows - roi.row, self.columns - roi.column]
         return replace(self, excess=self.excess * factor[:, None, None])
 
+    def within(self, roi: Roi) -> "LedEdges":
+        """The edges in a region."""
+        down = (self.rows >= roi.row) & (self.rows < roi.end_row)
+        inside = down & (self.columns >= roi.column) & (self.columns < roi.end_column)
+        return LedEdges(self.rows[inside], self.columns[inside], self.excess[inside])
+
 
 def edges_of_led(posed: PosedCamera, face: LedFace, image: LedCoverage, split: int) -> LedEdges:
     """The edge pixels of an LED's image, in split x split parts; `split` is a power of 2.

@@ -7,7 +7,7 @@ it lights.
 
 import itertools
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -30,6 +30,7 @@ from vlcrender.rendering.led_coverage import (
 )
 from vlcrender.rendering.led_edges import LedEdges, edges_of_led
 from vlcrender.rendering.occlusion import LitRegion, Occlusion
+from vlcrender.rendering.seen_pixels import SeenPixels
 from vlcrender.scene.diffuser import Diffuser
 from vlcrender.scene.leds import Leds
 
@@ -63,6 +64,8 @@ class LedImage:
     visible_fraction: float
     imaged_fraction: float
     edges: LedEdges | None
+    seen: SeenPixels | None = None
+    """What its pixels see, where that is known."""
 
     @property
     def roi(self) -> Roi:
@@ -77,7 +80,7 @@ class LedImage:
     @property
     def weight(self) -> Array:
         """Relative illumination of each pixel."""
-        return _weight(self.posed, self.roi)
+        return _weight(self.posed, self.roi) if self.seen is None else self.seen.weight(self.roi)
 
     @property
     def beam(self) -> Array | float:
@@ -90,6 +93,23 @@ class LedImage:
         """Light of a pixel that the face covers whole, over that of the LED's luminance and its profile."""
         full: Array = self.clear * self.weight * self.beam
         return full
+
+    def on_plane(self, origin_m: Array, du: float = 0.0, dv: float = 0.0) -> tuple[Array, Array]:
+        """The points of the LED's plane that pixels see at (du, dv) from their centres, m from a point of it."""
+        if self.seen is not None:
+            return self.seen.on_plane(self.roi, origin_m, du, dv)
+        u, v = self.roi.centers_px()
+        return intersections_with_plane(self.posed, origin_m, u + du, v + dv)
+
+    def within(self, roi: Roi, seen: SeenPixels) -> "LedImage":
+        """The part of the image in a region, whose pixels are among those of `seen`."""
+        return replace(
+            self,
+            seen=seen,
+            face=self.face.within(roi),
+            clear=self.clear if isinstance(self.clear, float) else self.clear[self.roi.slices(roi)],
+            edges=self.edges and self.edges.within(roi),
+        )
 
     def light(self, unit: float, precision: type[np.floating] = np.float64) -> NDArray[np.floating]:
         """Light of each pixel, (rows, columns): `unit` in one that the LED fills at its mean luminance on the axis."""
@@ -104,6 +124,16 @@ class LedImage:
             luminance = luminance * (profile if isinstance(profile, float) else profile[band])
             light[band] = unit * coverage[band] * relative_illumination(camera, u, v[band]) * luminance
         return light
+
+
+def light_of_part(image: LedImage, diffuser: Diffuser, unit: float) -> Array:
+    """`LedImage.light` of a part of an LED's image behind a diffuser: a kernel's launch takes longer."""
+    height_m = float(image.leds.centers_m[image.index, 2])
+    foot_m = np.array([0.0, 0.0, height_m])
+    nodes = _pixel_nodes(image.posed, image.roi, height_m, diffuser)
+    total: Array = sum((diffuser.at(*image.on_plane(foot_m, du, dv)) for du, dv in nodes), np.zeros(()))
+    light: Array = unit * image.coverage * image.weight * (total / len(nodes))
+    return light
 
 
 def light_of_diffusers(

@@ -8,8 +8,9 @@ from projected points, so that slopes by different unknowns agree in what they s
 determine depend on small differences between them.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import repeat
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,57 +45,110 @@ class LedSlope:
     edges: LedEdges | None
 
 
-def led_slopes(
+@dataclass(frozen=True)
+class PlaneMotion:
+    """How the points of an LED's plane that its pixels see move, and its luminance by direction changes, by each change
+    of a camera: at three by three pixels of the image, between which they are interpolated.
+    """
+
+    u_px: Array
+    v_px: Array
+    at_nodes: Array
+    """(changes, 2 or 3, 3, 3): by x and y, m, and of the luminance by direction unless it is even."""
+
+    @classmethod
+    def of_image(cls, changes: Sequence[Cameras], image: LedImage) -> "PlaneMotion":
+        """The motion of an image's whole plane."""
+        origin_m, order = _origin_m(image.leds, image.index), _order(image.leds, image.index)
+        u, v = (_nodes(at.ravel()) for at in image.roi.centers_px())
+
+        def seen_by(camera: PosedCamera) -> Array:
+            at = u[None, :], v[:, None]
+            of_plane = intersections_with_plane(camera, origin_m, *at)
+            return np.stack(of_plane if _is_even(order) else [*of_plane, beam(camera, order, *at)])
+
+        return cls(u, v, np.stack([seen_by(after) - seen_by(before) for after, before in changes]))
+
+    def within(self, roi: Roi) -> Iterator[Array]:
+        """By each change, in the pixels of a region, (2 or 3, rows, columns)."""
+        u, v = roi.centers_px()
+        of_u, of_v = _quadratic(self.u_px, u[0]), _quadratic(self.v_px, v[:, 0])
+        for of_change in self.at_nodes:
+            # not `@`: the last bits of a matrix product may depend on threads and processor
+            yield np.einsum("vi,ciu->cvu", of_v, np.einsum("cij,uj->ciu", of_change, of_u))
+
+
+@dataclass(frozen=True)
+class LedMotion:
+    """How one LED's image changes: what the pieces of its rim sweep, and what moves inside."""
+
+    plane: PlaneMotion | None
+    """None for a face of even luminance."""
+    split: int
+    """Parts across an edge pixel that the blur needs, 1 for no split."""
+    roi: Roi
+    """The whole image."""
+    u: Array
+    v: Array
+    """Positions of the pieces' middles, (m,), pixels from the image's first."""
+    swept: Array
+    """Light over that of the LED's luminance that each piece sweeps by each change, (changes, m)."""
+
+    def slopes(self, image: LedImage) -> Iterator[LedSlope]:
+        """The changes of an image or of a part of it, one for each pair of cameras: after minus before.
+
+        The occluded share of a pixel counts as constant.
+        """
+        roi, split, swept = image.roi, self.split, self.swept
+        u, v = self.u + float(self.roi.column - roi.column), self.v + float(self.roi.row - roi.row)
+        inside = (u >= 0) & (u < roi.columns) & (v >= 0) & (v < roi.rows)
+        if not inside.all():
+            u, v, swept = u[inside], v[inside], swept[:, inside]
+        within: Iterable[Array | float] = repeat(0.0, len(swept))
+        if self.plane is not None:
+            within = _within(self.plane, image)
+        if not len(u):
+            yield from (LedSlope(np.broadcast_to(by_face, roi.shape), None) for by_face in within)
+            return
+        full = image.full
+        column, row = ((at * split).astype(np.int64) for at in (u, v))
+        cells = row // split * roi.columns + column // split
+        pixels, number = np.unique(cells, return_inverse=True) if split > 1 else (cells, cells)
+        rows, columns = pixels // roi.columns, pixels % roi.columns
+        parts = (number * split + row % split) * split + column % split
+        for by_piece, by_face in zip(swept, within, strict=True):
+            by_rim, edges = np.bincount(cells, by_piece, roi.pixels).reshape(roi.shape), None
+            if split > 1:
+                of_parts = np.bincount(parts, by_piece, len(pixels) * split**2).reshape(-1, split, split) * split**2
+                excess = of_parts - by_rim[rows, columns][:, None, None]
+                edges = LedEdges(rows + roi.row, columns + roi.column, excess).times(full, roi)
+            yield LedSlope(full * by_rim + by_face, edges)
+
+
+def led_motions(
     leds: Leds,
     posed: PosedCamera,
     changes: Sequence[Cameras],
     images: Mapping[int, LedImage],
     splits: Mapping[int, int],
-) -> Iterator[tuple[int, list[LedSlope]]]:
-    """Of each image, by the LED's index, its changes, one for each pair of cameras: after minus before.
+) -> Iterator[tuple[int, LedMotion]]:
+    """Of each image, by the LED's index, how it changes with some small changes of the camera.
 
-    images: at `posed`; splits: of these LEDs, parts across an edge pixel that the blur needs, 1 for no split. The
-    occluded share of a pixel counts as constant.
+    images: at `posed`; splits: `LedMotion.split` of these LEDs.
     """
     rims = _rims(posed, changes, [face_of_led(leds, i) for i in images], [image.roi for image in images.values()])
     for (i, image), rim in zip(images.items(), rims, strict=True):
-        yield i, _slopes_of_led(leds, posed, changes, i, image, splits[i], rim)
-
-
-def _slopes_of_led(
-    leds: Leds,
-    posed: PosedCamera,
-    changes: Sequence[Cameras],
-    i: int,
-    image: LedImage,
-    split: int,
-    rim: tuple[Array, Array],
-) -> list[LedSlope]:
-    roi, light = image.roi, leds.diffusers[i] or leds.profile(i)
-    u, v, swept = _swept(*rim, split)
-    inside = (u >= 0) & (u < roi.columns) & (v >= 0) & (v < roi.rows) & np.isfinite(swept).all(axis=0)
-    if not inside.all():
-        u, v, swept = u[inside], v[inside], swept[:, inside]
-    if light is not None:
-        x, y = intersections_with_plane(posed, _origin_m(leds, i), u + roi.column, v + roi.row)
-        swept = swept * light.at(x, y)
-    full = image.full
-    column, row = ((at * split).astype(np.int64) for at in (u, v))
-    cells = row // split * roi.columns + column // split
-    of_rim = [np.bincount(cells, by_piece, roi.pixels).reshape(roi.rows, roi.columns) for by_piece in swept]
-    edges: list[LedEdges | None] = [None] * len(changes)
-    if split > 1:
-        pixels, number = np.unique(cells, return_inverse=True)
-        rows, columns = pixels // roi.columns, pixels % roi.columns
-        parts = (number * split + row % split) * split + column % split
-        for k, (by_piece, mean) in enumerate(zip(swept, of_rim, strict=True)):
-            of_parts = np.bincount(parts, by_piece, len(pixels) * split**2).reshape(-1, split, split) * split**2
-            excess = of_parts - mean[rows, columns][:, None, None]
-            edges[k] = LedEdges(rows + roi.row, columns + roi.column, excess).times(full, roi)
-    return [
-        LedSlope(full * by_rim + inside, of_edges)
-        for by_rim, inside, of_edges in zip(of_rim, _within(posed, changes, leds, i, image), edges, strict=True)
-    ]
+        roi, light = image.roi, leds.diffusers[i] or leds.profile(i)
+        u, v, swept = _swept(*rim, splits[i])
+        inside = (u >= 0) & (u < roi.columns) & (v >= 0) & (v < roi.rows) & np.isfinite(swept).all(axis=0)
+        if not inside.all():
+            u, v, swept = u[inside], v[inside], swept[:, inside]
+        if light is not None:
+            x, y = intersections_with_plane(posed, _origin_m(leds, i), u + roi.column, v + roi.row)
+            swept = swept * light.at(x, y)
+        even = light is None and _is_even(_order(leds, i))
+        plane = None if even else PlaneMotion.of_image(changes, image)
+        yield i, LedMotion(plane, splits[i], roi, u, v, swept)
 
 
 def _rims(
@@ -170,33 +224,18 @@ def _subdivided(line: Array, parts: int) -> Array:
     return between.reshape(*line.shape[:-1], -1)
 
 
-def _within(
-    posed: PosedCamera, changes: Sequence[Cameras], leds: Leds, i: int, image: LedImage
-) -> Sequence[Array | float]:
-    """Change of each pixel's light inside the face, where its luminance moves behind the pixel; 0 for an even face."""
-    light, order = leds.diffusers[i] or leds.profile(i), _order(leds, i)
-    if light is None and abs(order - 1.0) < 1e-12:
-        return [0.0] * len(changes)
-    origin_m = _origin_m(leds, i)
-    u, v = image.roi.centers_px()
-    (u_nodes, of_u), (v_nodes, of_v) = _nodes(u[0]), _nodes(v[:, 0])
+def _within(motion: PlaneMotion, image: LedImage) -> Iterator[Array]:
+    """By each change, that of each pixel's light inside the face, whose luminance moves behind the pixel."""
+    leds, i = image.leds, image.index
+    light = leds.diffusers[i] or leds.profile(i)
     slope_x, slope_y, value = np.zeros(()), np.zeros(()), np.ones(())
     if light is not None:
-        x, y = intersections_with_plane(posed, origin_m, u, v)
+        x, y = image.on_plane(_origin_m(leds, i))
         (slope_x, slope_y), value = light.slopes(x, y), light.at(x, y)
-
-    def at_nodes(camera: PosedCamera) -> Array:
-        x, y = intersections_with_plane(camera, origin_m, u_nodes[None, :], v_nodes[:, None])
-        return np.stack([x, y, beam(camera, order, u_nodes[None, :], v_nodes[:, None])])
-
-    found, lit, by_direction = [], image.coverage * image.weight, image.beam
-    for after, before in changes:
-        # not `@`: the last bits of a matrix product may depend on threads and processor
-        across = np.einsum("cij,uj->ciu", at_nodes(after) - at_nodes(before), of_u)
-        dx, dy, dbeam = np.einsum("vi,ciu->cvu", of_v, across)
-        of_light = slope_x * dx + slope_y * dy
-        found.append(lit * (by_direction * of_light + value * dbeam))
-    return found
+    lit, by_direction = image.coverage * image.weight, image.beam
+    for dx, dy, *dbeam in motion.within(image.roi):
+        change = by_direction * (slope_x * dx + slope_y * dy)
+        yield lit * (change + value * dbeam[0] if dbeam else change)
 
 
 def _order(leds: Leds, i: int) -> float:
@@ -212,8 +251,19 @@ def _origin_m(leds: Leds, i: int) -> Array:
     return center
 
 
-def _nodes(at: Array) -> tuple[Array, Array]:
-    """Three nodes along pixel positions (n,), and the weights of quadratic interpolation between them, (n, 3)."""
+def _is_even(order: float) -> bool:
+    """Whether a camera sees the same luminance from all directions."""
+    return abs(order - 1.0) < 1e-12
+
+
+def _nodes(at: Array) -> Array:
+    """Three nodes along pixel positions (n,)."""
     middle, half = (at[0] + at[-1]) / 2, max((at[-1] - at[0]) / 2, 0.5)
-    t = (at - middle) / half
-    return middle + half * np.array([-1.0, 0.0, 1.0]), np.stack([t * (t - 1) / 2, 1 - t * t, t * (t + 1) / 2], axis=1)
+    nodes: Array = middle + half * np.array([-1.0, 0.0, 1.0])
+    return nodes
+
+
+def _quadratic(nodes: Array, at: Array) -> Array:
+    """Weights of quadratic interpolation between three nodes at some positions (n,), (n, 3)."""
+    t = (at - nodes[1]) / (nodes[2] - nodes[1])
+    return np.stack([t * (t - 1) / 2, 1 - t * t, t * (t + 1) / 2], axis=1)

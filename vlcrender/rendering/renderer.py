@@ -26,13 +26,15 @@ from vlcrender.rendering.background import Background, BackgroundRegion
 from vlcrender.rendering.crosstalk import REACH_PX, shared_patch, with_crosstalk
 from vlcrender.rendering.electron_rates import ElectronRates
 from vlcrender.rendering.expected_image import ExpectedImage, ExpectedRegion, Image, LedPatch, SpecularReflection
-from vlcrender.rendering.halo import GlareHalo, glare_halo, halo_of_sources
+from vlcrender.rendering.halo import GlareHalo, SourceOfLight, glare_halo, halo_of_sources
 from vlcrender.rendering.led_blur import LedBlur, led_blur
 from vlcrender.rendering.led_radiance import LedImage, led_images, light_of_diffusers
-from vlcrender.rendering.led_slopes import Cameras, led_slopes
+from vlcrender.rendering.led_slopes import Cameras, led_motions
 from vlcrender.rendering.led_view import During, LedBand, LedView, cut, patch_rois, read_out, union_of
+from vlcrender.rendering.moving_led import MovingLed
 from vlcrender.rendering.occlusion import Occlusion
 from vlcrender.rendering.readout import Knot, LinePoses, RollingPoses, image_at_own_line
+from vlcrender.rendering.seen_pixels import LatestPixels
 from vlcrender.rendering.specular_reflection import blurred, specular_reflections
 from vlcrender.scene.leds import Leds
 from vlcrender.scene.loader import Scene
@@ -174,25 +176,21 @@ class Renderer:
 
     def led_slopes(
         self, posed: PosedCamera, changes: Sequence[Cameras], regions: LedRegions | None = None
-    ) -> tuple[tuple[LedPatch, ...], ...]:
-        """`led_patches`, and for each small change of the camera the changes of their light, to first order.
+    ) -> tuple[MovingLed, ...]:
+        """The LEDs of `led_patches`, and how their light changes with each small change of the camera, to first order.
 
         changes: cameras (after, before). The lens's blur and what is occluded count as constant.
         """
-        view, leds, led_rate = self._still(posed, regions), self.scene.leds, self._rates(posed.camera).led
-        patches = self._patches(view, np.float64)
+        view, leds = self._still(posed, regions), self.scene.leds
         images = {i: view.bands[0].images[0][i] for i in view.patch_rois}
-        changed: list[list[LedPatch]] = [[] for _ in changes]
         splits = {i: view.blurs.kernel(i).split for i in images}
-        for patch, (i, slopes) in zip(patches, led_slopes(leds, posed, changes, images, splits), strict=True):
-            roi, kernel, rate = images[i].roi, view.blurs.kernel(i), led_rate * float(leds.luminances_cd_m2[i])
-            for slope, of_change in zip(slopes, changed, strict=True):
-                edges = [] if slope.edges is None else [slope.edges]
-                light = cut(
-                    kernel.spread(rate * slope.change, roi, edges, rate), roi.padded(kernel.radius_px), patch.roi
-                )
-                of_change.append(replace(patch, electrons_per_s=light))
-        return tuple(self._with_crosstalk(one, posed) for one in (patches, *changed))
+        seen, latest = [], LatestPixels(posed)
+        for i, motion in led_motions(leds, posed, changes, images, splits):
+            rate = self._rates(posed.camera).led * float(leds.luminances_cd_m2[i])
+            led = MovingLed.of_image(images[i], motion, view.blurs.kernel(i), rate, view.patch_rois[i], latest)
+            sensor = Roi.of_sensor(posed.camera)
+            seen.append(led.with_crosstalk(self._crosstalk, sensor) if self._crosstalk else led)
+        return tuple(seen)
 
     def _still(self, posed: PosedCamera, regions: LedRegions | None, blurred_at: Pose | None = None) -> "LedView":
         """The view of a camera at rest."""
@@ -209,7 +207,7 @@ class Renderer:
             return tuple(patches)
         return tuple(shared_patch(patch, self._crosstalk, Roi.of_sensor(posed.camera)) for patch in patches)
 
-    def halo_of(self, camera: Camera) -> Callable[[Sequence[LedPatch], Roi], Array] | None:
+    def halo_of(self, camera: Camera) -> Callable[[Sequence[SourceOfLight], Roi], Array] | None:
         """The function from patches of `led_patches` to their halo in a region of the sensor, electrons a second.
 
         None for a lens without glare.

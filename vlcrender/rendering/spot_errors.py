@@ -66,7 +66,7 @@ class SpotErrors:
         "luminaire_xy", "luminaire_z", "luminaire_tilt", "luminaire_yaw", "led_xy", "led_z", "led_gradient", "datum" and
         "scale".
         """
-        whole = {patch.led_id for patch in slopes.at_pose if patch.visible_fraction >= WHOLE}
+        whole = {led.led_id for led in slopes.seen if led.visible_fraction >= WHOLE}
         noise = {i: c for i, c in slopes.spot_covariances_px2(leds).items() if int(leds.ids[i]) in whole}
         indices = np.array(sorted(noise), dtype=np.int64)
         n = len(indices)
