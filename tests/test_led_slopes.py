@@ -65,9 +65,10 @@ def agree(
         {**LED, "face_gradient": [0.3, -0.2], "face_falloff": 0.7},
         {**SQUARE, "face_gradient": [0.2, 0.3]},
         {**LED, "half_power_deg": 8.0},
+        {**LED, "half_power_deg": 8.0, "face_gradient": [0.3, -0.2]},
         {**LED, "position_m": [1.53, 1.49, 2.5]},
     ],
-    ids=["disc", "square", "uneven disc", "uneven square", "beam", "cut by the border"],
+    ids=["disc", "square", "uneven disc", "uneven square", "beam", "uneven beam", "cut by the border"],
 )
 def test_slopes_of_one_led(led: dict[str, Any]) -> None:
     agree(Renderer(scene_of(led=[led], bake=COARSE)), Camera(**CAMERA))
