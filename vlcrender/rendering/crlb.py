@@ -93,9 +93,9 @@ def position_bound_m2(
 
     mounted: the camera on its rig. main: the pose of `main`, to which the accelerometer is fixed. render: light of the
     LEDs and its changes, electrons a second. variance_e2: the regions read out, with the variance of each pixel, inf
-    for pixels without information (saturated ones). distance_m: from the camera to the
-    LEDs, roughly. tilt_sigmas_deg: standard deviations of the accelerometer on tilt_x and tilt_y; 0 means that both
-    tilts are known. overscan: whether LEDs count beyond the sensor. halo_of: halos of a lens with glare.
+    for pixels without information (saturated ones). distance_m: from the camera to the LEDs, roughly. tilt_sigmas_deg:
+    standard deviations of the accelerometer on tilt_x and tilt_y; 0 means that both tilts are known. overscan: whether
+    LEDs count beyond the sensor. halo_of: halos of a lens with glare.
     """
     slopes = FrameSlopes.rendered(mounted, main, render, exposure_s, variance_e2, distance_m, overscan, halo_of)
     return None if slopes is None else slopes.exact_bound_m2(tilt_sigmas_deg)
@@ -153,7 +153,6 @@ class FrameSlopes:
 
         Gains belong to lines of the sensor, not to the images that move. Of a lens with glare they have to be 1.
         """
-
         lit = self.seen
         if gains is not None:
             lit = [led.times(gains[led.led_id]) if led.led_id in gains else led for led in self.seen]
@@ -168,9 +167,9 @@ class FrameSlopes:
         """Information of the pose in the pixels, (6, 6), per m and radian, where lens and map are known."""
         information = np.zeros((6, 6))
         for box in self._boxes():
-            for common, inside, weight in self._parts(box):
+            for common, inside, variance in self._parts(box):
                 columns = partial(self._columns_of_pose, inside)
-                rows = self._rows(common, weight, 6 + len(inside) + 1, columns)
+                rows = self._rows(common, variance, 6 + len(inside) + 1, columns)
                 information += marginal(rows[:6], rows[6:])
         return information
 
@@ -268,10 +267,10 @@ class FrameSlopes:
         index_of = {int(led_id): i for i, led_id in enumerate(leds.ids)}
         information: dict[int, Array] = {}
         for box in self._boxes():
-            for common, inside, weight in self._parts(box):
+            for common, inside, variance in self._parts(box):
                 free = len(inside) + 1
                 columns = partial(self._columns_of_places, inside, leds, index_of)
-                rows = self._rows(common, weight, free + 2 * len(inside), columns)
+                rows = self._rows(common, variance, free + 2 * len(inside), columns)
                 for number, led in enumerate(inside):
                     i = index_of[led.led_id]
                     part = marginal(rows[free + 2 * number : free + 2 * number + 2], rows[:free])
