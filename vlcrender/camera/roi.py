@@ -72,12 +72,6 @@ class Roi:
         for start in range(0, self.rows, rows):
             yield slice(start, start + rows)
 
-    def tiles(self, size_px: int) -> Iterator["Roi"]:
-        """The region cut into tiles of at most size_px x size_px pixels, row by row."""
-        for row in range(self.row, self.end_row, size_px):
-            for column in range(self.column, self.end_column, size_px):
-                yield self.intersection(type(self)(row, column, size_px, size_px))
-
     def padded(self, by_px: int) -> "Roi":
         """The region with `by_px` more pixels on each side."""
         return Roi(self.row - by_px, self.column - by_px, self.rows + 2 * by_px, self.columns + 2 * by_px)

@@ -4,7 +4,7 @@ Of pixels in rows and unknowns in columns, R of the QR decomposition holds all t
 products, which lose the digits of what is hardly determined. Triangles of tiles are reduced together to that of all.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +44,7 @@ def triangle_of_tiles(roi: Roi, width: int, columns_of: ColumnsOf) -> Array:
     """The triangle of `all_columns`, (width, at most width), from tiles: of each only the unknowns that it shows."""
     factor, triangles = np.zeros((0, width)), []
     with threadpool_limits(limits=1, user_api="blas"):  # a second thread spends as much time, and spares none
-        for tile in roi.tiles(TILE_PX):
+        for tile in _tiles(roi):
             columns, which = columns_of(tile)
             triangle = triangle_of(columns.T)
             wide = np.zeros((len(triangle), width))
@@ -53,6 +53,12 @@ def triangle_of_tiles(roi: Roi, width: int, columns_of: ColumnsOf) -> Array:
             if len(triangles) == TRIANGLES_AT_ONCE:
                 factor, triangles = triangle_of(np.concatenate([factor, *triangles])), []
         return triangle_of(np.concatenate([factor, *triangles])).T
+
+
+def _tiles(roi: Roi) -> Iterator[Roi]:
+    for row in range(roi.row, roi.end_row, TILE_PX):
+        for column in range(roi.column, roi.end_column, TILE_PX):
+            yield roi.intersection(Roi(row, column, TILE_PX, TILE_PX))
 
 
 def marginal(pose_part: Array, nuisance_part: Array) -> Array:
