@@ -93,9 +93,8 @@ def _part_of_diffuser(
     latest: LatestPixels,
     roi: Roi,
 ) -> Array:
+    """`MovingLed.pixels` of an LED behind a diffuser."""
     reach = roi.padded(kernel.radius_px)
-    if not reach.overlaps(image.roi):
-        return np.zeros((1 + len(motion.swept), *roi.shape))
     inside = image.roi.intersection(reach)
     part = image.within(inside, latest.around(inside))
     return _blurred(part, light_of_part(part, diffuser, rate), motion, kernel, rate, roi)

@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class SeenPixels:
-    """The pixels of a region, for parts of it."""
+    """What the pixels of a region see, told for parts of it; found when it is asked for first."""
 
     posed: PosedCamera
     roi: Roi
