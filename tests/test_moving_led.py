@@ -78,6 +78,14 @@ def test_an_led_is_dark_beyond_its_image_and_has_the_gain_of_each_line() -> None
     assert led.within(Roi(290, 390, 10, 10)).shape == (3, 10, 10)
 
 
+def test_an_led_held_in_memory_is_the_same() -> None:
+    led = leds_of(Renderer(panelled(diffuser=True, frame=False, bake=COARSE)), Camera(**CAMERA))[0]
+    held = led.held()
+    assert (held.led_id, held.roi) == (led.led_id, led.roi)
+    for part in PARTS:
+        np.testing.assert_array_equal(held.within(part), led.within(part))
+
+
 def test_coverage_of_a_part_of_a_large_image() -> None:
     """An image in blocks of 16 pixels, at places that no block begins or ends at."""
     leds = panelled(diffuser=True, frame=False, bake=COARSE).leds

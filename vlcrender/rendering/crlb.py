@@ -146,6 +146,8 @@ class FrameSlopes:
         seen = render(mounted.posed(main), cameras)
         if not seen:
             return None
+        if halo_of is not None:
+            seen = [led.held() for led in seen]  # each halo is of whole images
         return cls(mounted, main, seen, steps, exposure_s, variance_e2, overscan, halo_of)
 
     def exposed(self, variance_e2: Sequence[RegionImage], gains: Gains | None = None) -> "FrameSlopes":
@@ -333,9 +335,12 @@ class FrameSlopes:
         """The halo of the light of some LEDs in a region, electrons a second, or the change of this number of it."""
         if self.halo_of is None:
             return 0.0
-        image = np.zeros(roi.shape)
+        image, whole = np.zeros(roi.shape), [led.pixels(led.roi)[change] for led in leds]
         for sign in (1.0, -1.0):  # a halo is that of light, which is positive
-            light = [LightOfLed(led.led_id, led.roi, np.maximum(sign * led.within(led.roi)[change], 0)) for led in leds]
+            light = [
+                LightOfLed(led.led_id, led.roi, np.maximum(sign * pixels, 0.0))
+                for led, pixels in zip(leds, whole, strict=True)
+            ]
             image += sign * self.halo_of(light, roi)
         return image
 

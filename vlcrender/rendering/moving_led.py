@@ -65,6 +65,10 @@ class MovingLed:
             light[:, *roi.slices(inside)] = self.pixels(inside)
         return light
 
+    def held(self) -> "MovingLed":
+        """The LED with all its pixels in memory."""
+        return replace(self, pixels=partial(_part, self.pixels(self.roi), self.roi))
+
     def times(self, gain: Gain) -> "MovingLed":
         """The LED with a gain of its light, which belongs to the lines of the sensor: it does not move."""
         return replace(self, pixels=lambda roi: self.pixels(roi) * gain_in(gain, roi))
