@@ -41,12 +41,9 @@ from vlcrender.camera.rig import Mounted
 from vlcrender.camera.roi import LedRegions, RegionImage, Roi, led_regions
 from vlcrender.rendering.expected_image import Gains
 from vlcrender.rendering.face_motions import FACE_NUMBERS, OWN, face_motions, moved
-from vlcrender.rendering.halo import LightOfLed, SourceOfLight
-from vlcrender.rendering.led_coverage import intersections_with_plane
-from vlcrender.rendering.led_radiance import face_of_led
 from vlcrender.rendering.led_slopes import Cameras
 from vlcrender.rendering.moving_led import MovingLed
-from vlcrender.rendering.seen_pixels import SeenPixels
+from vlcrender.rendering.pixel_slopes import HaloOf, PixelSlopes
 from vlcrender.rendering.triangles import (
     PIXELS_AT_ONCE,
     ColumnsOf,
@@ -74,8 +71,6 @@ MAX_CONDITION = 1e12
 
 Render = Callable[[PosedCamera, Sequence[Cameras]], Sequence[MovingLed]]
 """`led_slopes` of a renderer: some LEDs at a camera, and how they change with each change of it."""
-HaloOf = Callable[[Sequence[SourceOfLight], Roi], Array]
-"""The halo of some light in a region of the sensor, electrons a second."""
 
 
 def position_bound_m2(
@@ -160,6 +155,10 @@ class FrameSlopes:
             lit = [led.times(gains[led.led_id]) if led.led_id in gains else led for led in self.seen]
         return replace(self, seen=lit, variance_e2=variance_e2)
 
+    @cached_property
+    def _pixels(self) -> PixelSlopes:
+        return PixelSlopes(self.mounted, self.main, self.steps, self.exposure_s, self.halo_of)
+
     def exact_bound_m2(self, tilt_sigmas_deg: tuple[float, float]) -> Array | None:
         """Bound of the position, (3, 3), m2, where lens and map are known; None where it is not determined."""
         return _position_covariance(self._information, np.radians(tilt_sigmas_deg), self.steps, self.lever())
@@ -170,34 +169,10 @@ class FrameSlopes:
         information = np.zeros((6, 6))
         for box in self._boxes():
             for common, inside, variance in self._parts(box):
-                columns = partial(self._columns_of_pose, inside)
+                columns = partial(self._pixels.by_pose, inside)
                 rows = self._rows(common, variance, 6 + len(inside) + 1, columns)
                 information += marginal(rows[:6], rows[6:])
         return information
-
-    def _columns_of_pose(self, inside: Sequence[MovingLed], tile: Roi) -> tuple[Array, list[int]]:
-        """Of some pixels, slopes by the pose and by brightness and level, electrons, and the numbers of these columns:
-        6, one for each of `inside`, and one.
-        """
-        lit = [number for number, led in enumerate(inside) if led.roi.overlaps(tile)]
-        columns = np.zeros((6 + len(lit) + 1, *tile.shape))
-        if self.halo_of is not None:
-            for unknown in range(6):
-                columns[unknown] = self._halo(inside, 1 + unknown, tile)
-            for column, number in zip(columns[6:], lit, strict=False):
-                column[:] = self._halo([inside[number]], 0, tile)
-        for column, number in zip(columns[6:], lit, strict=False):
-            roi = inside[number].roi.intersection(tile)
-            here, (light, *changes) = tile.slices(roi), inside[number].pixels(roi)
-            column[here] += light
-            column *= self.exposure_s
-            for slope, change in zip(columns, changes, strict=False):
-                slope[here] += change
-        for slope, step in zip(columns, self.steps, strict=False):
-            slope *= self.exposure_s
-            slope /= 2 * step
-        columns[-1] = 1.0
-        return columns, [*range(6), *(6 + number for number in lit), 6 + len(inside)]
 
     def hybrid_bound_m2(
         self, tilt_sigmas_deg: tuple[float, float], leds: Leds, uncertainty: Uncertainty
@@ -271,7 +246,7 @@ class FrameSlopes:
         for box in self._boxes():
             for common, inside, variance in self._parts(box):
                 free = len(inside) + 1
-                columns = partial(self._columns_of_places, inside, leds, index_of)
+                columns = partial(self._pixels.by_places, inside, leds, index_of)
                 rows = self._rows(common, variance, free + 2 * len(inside), columns)
                 for number, led in enumerate(inside):
                     i = index_of[led.led_id]
@@ -282,21 +257,6 @@ class FrameSlopes:
             for i, of_led in information.items()
             if np.isfinite(of_led).all() and np.linalg.cond(of_led) < MAX_CONDITION
         }
-
-    def _columns_of_places(
-        self, inside: Sequence[MovingLed], leds: Leds, index_of: Mapping[int, int], tile: Roi
-    ) -> tuple[Array, list[int]]:
-        """Of some pixels, slopes by brightness and level, and by a shift along u and v of each of `inside`; and the
-        numbers of these columns.
-        """
-        lit = [number for number, led in enumerate(inside) if led.roi.overlaps(tile)]
-        columns = np.ones((3 * len(lit) + 1, *tile.shape))
-        shifts = columns[len(lit) + 1 :].reshape(len(lit), 2, *tile.shape)
-        for light, shift, number in zip(columns, shifts, lit, strict=False):
-            light[:], by_position = self._light_and_slopes(tile, inside[number])
-            shift[:] = self.shift_slopes(tile, leds, index_of[inside[number].led_id], by_position)
-        free = len(inside) + 1
-        return columns, [*lit, len(inside), *(free + 2 * number + axis for number in lit for axis in range(2))]
 
     def lever(self) -> Array:
         """Jacobian of the camera's position to the unknowns of the pose of `main`, (3, 6)."""
@@ -331,29 +291,6 @@ class FrameSlopes:
         at_once = self.halo_of is not None or common.pixels <= PIXELS_AT_ONCE
         return all_columns(common, width, scaled) if at_once else triangle_of_tiles(common, width, scaled)
 
-    def _halo(self, leds: Sequence[MovingLed], change: int, roi: Roi) -> Array | float:
-        """The halo of the light of some LEDs in a region, electrons a second, or the change of this number of it."""
-        if self.halo_of is None:
-            return 0.0
-        image, whole = np.zeros(roi.shape), [led.pixels(led.roi)[change] for led in leds]
-        for sign in (1.0, -1.0):  # a halo is that of light, which is positive
-            light = [
-                LightOfLed(led.led_id, led.roi, np.maximum(sign * pixels, 0.0))
-                for led, pixels in zip(leds, whole, strict=True)
-            ]
-            image += sign * self.halo_of(light, roi)
-        return image
-
-    def _light_and_slopes(self, roi: Roi, led: MovingLed) -> tuple[Array, Array]:
-        """Light of one LED in a region, electrons, and its slopes by the camera's x and y, (2, rows, columns)."""
-        light, *by_position = led.within(roi)[:3]
-        light = (self._halo([led], 0, roi) + light) * self.exposure_s
-        slopes = [
-            (self._halo([led], 1 + unknown, roi) + change) * self.exposure_s / (2 * self.steps[unknown])
-            for unknown, change in enumerate(by_position)
-        ]
-        return light, np.stack(slopes)
-
     def _box_factor(
         self, box: Roi, leds: Leds, index_of: Mapping[int, int], uncertainty: Uncertainty
     ) -> tuple[Array, list[int]]:
@@ -383,7 +320,7 @@ class FrameSlopes:
         """Factor of the information of some pixels about gradients (2 k) and faces (6 k), without other unknowns."""
         k, free = len(of_box), len(inside) + 1
         places = [of_box.index(index_of[led.led_id]) for led in inside]
-        columns = partial(self._columns_of_faces, inside, places, leds, index_of, k)
+        columns = partial(self._pixels.by_faces, inside, places, leds, index_of, k)
         factor = triangle_of(self._rows(common, variance, free + 2 * k + FACE_NUMBERS * k, columns).T)
         # The part that is orthogonal to brightness and background, as in `marginal`.
         basis, lengths, _ = np.linalg.svd(factor[:, :free], full_matrices=False)
@@ -391,64 +328,6 @@ class FrameSlopes:
         rest = factor[:, free:]
         orthogonal: Array = rest - basis @ (basis.T @ rest)
         return orthogonal
-
-    def _columns_of_faces(
-        self,
-        inside: Sequence[MovingLed],
-        places: Sequence[int],
-        leds: Leds,
-        index_of: Mapping[int, int],
-        k: int,
-        tile: Roi,
-    ) -> tuple[Array, list[int]]:
-        """Of some pixels, slopes by brightness and level, by the gradients and by the faces of k LEDs, of which
-        `places` are the numbers of those inside; and the numbers of these columns.
-        """
-        first, columns, which = len(inside) + 1, [np.ones(tile.shape)], [len(inside)]
-        seen = SeenPixels(self.mounted.posed(self.main), tile)
-        for number, (place, led) in enumerate(zip(places, inside, strict=True)):
-            if not led.roi.overlaps(tile):
-                continue
-            light, by_position = self._light_and_slopes(tile, led)
-            i = index_of[led.led_id]
-            x, y, rim_x, rim_y = self._on_face(seen, leds, i)
-            columns.append(light)
-            which.append(number)
-            if leds.diffusers[i] is None:
-                columns.extend(light * np.clip(np.stack([x, y]) / leds.half_widths_m[i], -1, 1))
-                which.extend(range(first + 2 * place, first + 2 * place + 2))
-            by_shift = -by_position
-            columns.extend(slope * arm for arm in (1.0, rim_x, rim_y) for slope in by_shift)
-            face = first + 2 * k + FACE_NUMBERS * place
-            which.extend(range(face, face + FACE_NUMBERS))
-        return np.stack(columns), which
-
-    def _on_face(self, seen: SeenPixels, leds: Leds, i: int) -> tuple[Array, Array, Array, Array]:
-        """Of each pixel's centre, the point (x, y) on an LED's plane and the point of the rim next to it, from the
-        face's centre, m.
-
-        An LED's light changes at the rim, however far the lens blurs the change.
-        """
-        face = face_of_led(leds, i)
-        x, y = seen.on_plane(seen.roi, face.center_m)
-        return x, y, *face.shape.nearest_on_rim(x, y)
-
-    def shift_slopes(self, roi: Roi, leds: Leds, i: int, by_position: Array) -> Array:
-        """Slopes of one LED's light by a shift of its image along u and v, (2, rows, columns), electrons per pixel.
-
-        by_position: slopes by the camera's x and y, (2, rows, columns). A move of the camera by (dx, dy) shifts the
-        point of the LED's plane that a pixel sees by (dx, dy); a shift of the image by du shifts it by -du times the
-        derivative of the point by u.
-        """
-        posed = self.mounted.posed(self.main)
-        center_m = face_of_led(leds, i).center_m
-        u, v = roi.centers_px()
-        slopes = []
-        for du, dv in ((0.5, 0.0), (0.0, 0.5)):
-            x1, y1 = intersections_with_plane(posed, center_m, u + du, v + dv)
-            x0, y0 = intersections_with_plane(posed, center_m, u - du, v - dv)
-            slopes.append(-((x1 - x0) * by_position[0] + (y1 - y0) * by_position[1]))
-        return np.stack(slopes)
 
 
 def _position_covariance(information: Array, tilt_sigmas: Array, steps: Sequence[float], lever: Array) -> Array | None:
