@@ -172,7 +172,8 @@ class FrameSlopes:
                 columns = partial(self._pixels.by_pose, inside)
                 rows = self._rows(common, variance, 6 + len(inside) + 1, columns)
                 information += marginal(rows[:6], rows[6:])
-        return information
+        by_unit = self.exposure_s / (2 * np.array(self.steps))
+        return information * np.outer(by_unit, by_unit)
 
     def hybrid_bound_m2(
         self, tilt_sigmas_deg: tuple[float, float], leds: Leds, uncertainty: Uncertainty
@@ -284,8 +285,8 @@ class FrameSlopes:
 
         def scaled(tile: Roi) -> tuple[Array, list[int]]:
             columns, which = columns_of(tile)
-            weight = 1 / variance.image[variance.roi.slices(tile)].astype(np.float64)
-            return columns.reshape(len(columns), -1) * np.sqrt(weight).ravel(), which
+            columns *= 1 / np.sqrt(variance.image[variance.roi.slices(tile)].astype(np.float64))
+            return columns.reshape(len(columns), -1), which
 
         # a halo is of whole images: it is not made for each tile
         at_once = self.halo_of is not None or common.pixels <= PIXELS_AT_ONCE

@@ -119,10 +119,12 @@ class LedImage:
         pattern = _pattern(self.leds, self.index, self.posed, self.roi)
         u, v = self.roi.centers_px()
         light = np.empty(self.roi.shape, dtype=precision)
+        known = None if self.seen is None else self.weight
         for band in self.roi.bands():
             luminance = 1.0 if pattern is None else pattern(u, v[band])
             luminance = luminance * (profile if isinstance(profile, float) else profile[band])
-            light[band] = unit * coverage[band] * relative_illumination(camera, u, v[band]) * luminance
+            weight = relative_illumination(camera, u, v[band]) if known is None else known[band]
+            light[band] = unit * coverage[band] * weight * luminance
         return light
 
 
@@ -163,10 +165,12 @@ def led_images(
     regions: LedRegions | None,
     blurs: LedBlur,
     within: Roi | None = None,
+    at_rest: bool = True,
 ) -> dict[int, LedImage]:
     """By index, the image of each LED that lights a pixel of the regions or, by its blur, may light one.
 
-    within: LEDs whose image is outside this region are left out.
+    within: LEDs whose image is outside this region are left out. at_rest: whether these are the only images of the
+    view, so that what the pixels of a bare LED see is held for all that asks for it.
     """
     camera = posed.camera
     overscan = regions is not None and regions.overscan
@@ -208,6 +212,7 @@ def led_images(
                 visible_fraction=clear_fraction * image.visible_fraction,
                 imaged_fraction=clear_fraction * (1.0 if overscan else image.visible_fraction),
                 edges=edges,
+                seen=SeenPixels(posed, image.roi) if at_rest and leds.diffusers[i] is None else None,
             )
     return images
 

@@ -104,11 +104,11 @@ class LedMotion:
         inside = (u >= 0) & (u < roi.columns) & (v >= 0) & (v < roi.rows)
         if not inside.all():
             u, v, swept = u[inside], v[inside], swept[:, inside]
-        within: Iterable[Array | float] = repeat(0.0, len(swept))
+        within: Iterable[Array | None] = repeat(None, len(swept))
         if self.plane is not None:
             within = _within(self.plane, image)
         if not len(u):
-            yield from (LedSlope(np.broadcast_to(by_face, roi.shape), None) for by_face in within)
+            yield from (LedSlope(np.zeros(roi.shape) if by_face is None else by_face, None) for by_face in within)
             return
         full = image.full
         column, row = ((at * split).astype(np.int64) for at in (u, v))
@@ -117,12 +117,16 @@ class LedMotion:
         rows, columns = pixels // roi.columns, pixels % roi.columns
         parts = (number * split + row % split) * split + column % split
         for by_piece, by_face in zip(swept, within, strict=True):
-            by_rim, edges = np.bincount(cells, by_piece, roi.pixels).reshape(roi.shape), None
+            change: Array = np.bincount(cells, by_piece, roi.pixels).reshape(roi.shape).astype(np.float64, copy=False)
+            edges = None
             if split > 1:
                 of_parts = np.bincount(parts, by_piece, len(pixels) * split**2).reshape(-1, split, split) * split**2
-                excess = of_parts - by_rim[rows, columns][:, None, None]
+                excess = of_parts - change[rows, columns][:, None, None]
                 edges = LedEdges(rows + roi.row, columns + roi.column, excess).times(full, roi)
-            yield LedSlope(full * by_rim + by_face, edges)
+            change *= full
+            if by_face is not None:
+                change += by_face
+            yield LedSlope(change, edges)
 
 
 def led_motions(
@@ -187,7 +191,6 @@ def _swept(rim_px: Array, moved_px: Array, split: int) -> tuple[Array, Array, Ar
     sweeps by each change, (changes, m), pixels; positive where the face grows. Arguments as `_rims` returns them.
     """
     u, v = _subdivided(rim_px.T, split)
-    moved_u, moved_v = _subdivided(np.moveaxis(moved_px, -1, 0), split * NODE_STEP)
     du, dv = _steps(u), _steps(v)
     crossings = []
     for at, step in ((u, du), (v, dv)):
@@ -200,8 +203,10 @@ def _swept(rim_px: Array, moved_px: Array, split: int) -> tuple[Array, Array, Ar
     lengths = np.diff(cuts, axis=0)
     part, piece = np.nonzero(lengths > 0)
     length, middle = lengths[part, piece], (cuts[part, piece] + cuts[part + 1, piece]) / 2
+    node, after = np.divmod(piece + middle, split * NODE_STEP)
+    node, share = node.astype(np.int64), after / (split * NODE_STEP)
     along_u, along_v = (
-        moved.take(piece, axis=1) + _steps(moved).take(piece, axis=1) * middle for moved in (moved_u, moved_v)
+        moved.take(node, axis=1) + _steps(moved).take(node, axis=1) * share for moved in np.moveaxis(moved_px, -1, 0)
     )
     outward = np.copysign(length, np.nansum(u * dv - v * du))
     swept = along_u * (dv[piece] * outward) - along_v * (du[piece] * outward)
@@ -218,6 +223,8 @@ def _steps(line: Array) -> Array:
 
 def _subdivided(line: Array, parts: int) -> Array:
     """Numbers along a closed line (..., n) with `parts` - 1 more between each two, (..., n * parts)."""
+    if parts == 1:
+        return np.ascontiguousarray(line)
     steps, between = _steps(line), np.empty((*line.shape, parts))
     for part in range(parts):
         np.add(line, steps * (part / parts), out=between[..., part])

@@ -40,8 +40,11 @@ class PixelSlopes:
     """Halos of a lens with glare."""
 
     def by_pose(self, inside: Sequence[MovingLed], tile: Roi) -> tuple[Array, list[int]]:
-        """Of some pixels, slopes by the pose and by brightness and level, electrons, and the numbers of these columns:
-        6, one for each of `inside`, and one.
+        """Of some pixels, slopes by the pose and by brightness and level, and the numbers of these columns: 6, one for
+        each of `inside`, and one.
+
+        Those by the pose are changes from the step to one side to that to the other, electrons a second; the others
+        are electrons.
         """
         lit = [number for number, led in enumerate(inside) if led.roi.overlaps(tile)]
         columns = np.zeros((6 + len(lit) + 1, *tile.shape))
@@ -57,9 +60,6 @@ class PixelSlopes:
             column *= self.exposure_s
             for slope, change in zip(columns, changes, strict=False):
                 slope[here] += change
-        for slope, step in zip(columns, self.steps, strict=False):
-            slope *= self.exposure_s
-            slope /= 2 * step
         columns[-1] = 1.0
         return columns, [*range(6), *(6 + number for number in lit), 6 + len(inside)]
 

@@ -136,7 +136,10 @@ class Renderer:
         for each in cameras:
             check_inside(self.scene, each.pose)
         within = None if knot is None else knot.lines.padded(blurs.radius_px)
-        images = [led_images(self.scene.leds, self._occlusion, each, regions, blurs, within) for each in cameras]
+        at_rest = knot is None and len(cameras) == 1
+        images = [
+            led_images(self.scene.leds, self._occlusion, each, regions, blurs, within, at_rest) for each in cameras
+        ]
         return LedBand(cameras, tuple(images), knot)
 
     def image_of(self, view: "LedView", rois: Sequence[Roi], room_apart: bool = False) -> ExpectedImage:

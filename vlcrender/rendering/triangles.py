@@ -66,6 +66,14 @@ def marginal(pose_part: Array, nuisance_part: Array) -> Array:
 
     pose_part: (n, pixels), nuisance_part: (m, pixels), derivatives of the image over each pixel's standard deviation.
     """
+    moving = np.flatnonzero(pose_part.any(axis=0))
+    if 2 * len(moving) < pose_part.shape[1]:
+        # of pixels that show the nuisances alone, as few numbers as have the same products
+        at_rest = nuisance_part.copy()
+        at_rest[:, moving] = 0.0
+        few = triangle_of(at_rest.T).T
+        nuisance_part = np.concatenate([nuisance_part.take(moving, axis=1), few], axis=1)
+        pose_part = np.concatenate([pose_part.take(moving, axis=1), np.zeros((len(pose_part), few.shape[1]))], axis=1)
     # The part of each slope that is orthogonal to all nuisances.
     basis, lengths, _ = np.linalg.svd(nuisance_part.T, full_matrices=False)
     basis = basis[:, lengths > 1e-9 * lengths.max()]
