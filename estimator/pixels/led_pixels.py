@@ -58,25 +58,15 @@ MAX_EXTENT = 3.0
 
 
 @dataclass(frozen=True, eq=False)
-class LedPixels:
-    """Readings around n LEDs, m in all: edge pixels, and sums over blocks of the uniform pixels inside.
-
-    A group of readings has a common amplitude and background: an LED, or an LED's pixels of one colour; there are g.
-    The readings of a group follow each other, from `starts[k]` to `starts[k + 1]`, (g + 1,); each group has an edge
-    pixel. `led` (g,) is the LED of each group, an index to `leds`.
+class LedPixels(Readings):
+    """Readings around n LEDs, and the model of their images. The regions of the readings are the LEDs, in order.
 
     `index` (n,) is the number of each LED in the map, `model` the image model of the LEDs, `state` the state that the
-    pixels were sorted by, `rendered` the images there. `edges` (e,) are the readings that are edge pixels, `cells` (e,)
-    their cells in `model.rois`. `pixel_counts` (m,) is the number of pixels of a reading, `electrons` (m,) their sum.
-
-    With the coordinates (a, b) of a pixel on the face, in half widths from its centre: `background` (m, 4) is the
-    lens's fall-off times 1, a, b and a^2 + b^2; `face` (m, 3) is the mean of a, b and a^2 + b^2 - 1/2 over a reading.
-    `uniform_light` (m,) is the light inside the LED image summed over the pixels of a reading, 0 for edge pixels, whose
-    light depends on the state. `gains` are those of the readings where an LED sends, None where all are steady.
-    `radius_px` (n,) is half the larger side of an LED image's bounding box. Images may move by `max_move_px` before
-    their pixels have to be sorted anew. `more` says whether other LEDs of the map may be in view, whose images the
-    state does not determine well enough. `excess_e2` is the variance of a pixel beside that which the device states
-    (`estimator.spots.excess_noise`).
+    pixels were sorted by, `rendered` the images there; the cells are those of `model.rois`. `radius_px` (n,) is half
+    the larger side of an LED image's bounding box. Images may move by `max_move_px` before their pixels have to be
+    sorted anew. `more` says whether other LEDs of the map may be in view, whose images the state does not determine
+    well enough. `excess_e2` is the variance of a pixel beside that which the device states
+    (`estimator.spots.excess_noise`). `gains` are those of the readings where an LED sends, None where all are steady.
     """
 
     leds: tuple[Led, ...]
@@ -84,15 +74,6 @@ class LedPixels:
     model: LedImageModel
     state: ImageState
     rendered: RenderedLeds
-    edges: Ints
-    cells: Ints
-    pixel_counts: Floats
-    electrons: Floats
-    background: Floats
-    face: Floats
-    uniform_light: Floats
-    starts: Ints
-    led: Ints
     radius_px: Floats
     max_move_px: float
     more: bool
@@ -204,20 +185,12 @@ def gather_led_pixels(frame: DeviceFrame, view: LedsInView, parameters: Ints = P
         (rois.roi(electrons, k), rois.roi(wholly, k)) for k, led in enumerate(leds) if led.id not in frame.gains
     )
     return LedPixels(
+        **vars(readings),
         leds=leds,
         index=view.index,
         model=model,
         state=state,
         rendered=rendered,
-        edges=readings.edges,
-        cells=readings.cells,
-        pixel_counts=readings.pixel_counts,
-        electrons=readings.electrons,
-        background=readings.background,
-        face=readings.face,
-        uniform_light=readings.uniform_light,
-        starts=readings.starts,
-        led=readings.led,
         radius_px=(footprints.high - footprints.low).max(axis=1) / 2,
         max_move_px=EDGE_PX - 1,
         more=view.more,

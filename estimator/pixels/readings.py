@@ -119,10 +119,17 @@ class Faces:
 
 @dataclass(frozen=True, eq=False)
 class Readings:
-    """Readings of g groups, m in all; see `LedPixels`.
+    """Readings in regions around LEDs, m in all: edge pixels, and sums over blocks of the uniform pixels inside.
 
-    `led` (g,) is the region of each group, `edges` (e,) the readings that are single pixels, `cells` (e,) their cells.
-    `lines` (m,) are those of the readings of an LED that sends, else 0.
+    A group of readings has a common amplitude and background: an LED, or an LED's pixels of one colour; there are g.
+    The readings of a group follow each other, from `starts[k]` to `starts[k + 1]`, (g + 1,); each group has an edge
+    pixel. `led` (g,) is the region of each group. `edges` (e,) are the readings that are edge pixels, `cells` (e,)
+    their cells in the regions. `pixel_counts` (m,) is the number of pixels of a reading, `electrons` (m,) their sum.
+
+    With the coordinates (a, b) of a pixel on the face, in half widths from its centre: `background` (m, 4) is the
+    lens's fall-off times 1, a, b and a^2 + b^2; `face` (m, 3) is the mean of a, b and a^2 + b^2 - 1/2 over a reading.
+    `uniform_light` (m,) is the light inside the LED image summed over the pixels of a reading, 0 for edge pixels, whose
+    light depends on the pose. `lines` (m,) are those of the readings of an LED that sends, else 0.
     """
 
     led: Ints
