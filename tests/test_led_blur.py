@@ -248,3 +248,14 @@ def test_kernels_of_parts_differ_where_deviations_say(camera: Camera) -> None:
     share = np.abs(edges.excess).mean(axis=(1, 2)).sum()
     assert np.abs(ours - expected).max() < MIN_DEVIATION * share
     assert parts.deviations.shape[-1] <= m
+
+
+def test_edge_pixels_spread_by_sevens_light_what_they_light_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    camera = diffracting(1.0)
+    coverage, roi, edges = sharp_image(camera)
+    parts = split_kernel(camera, OVERHEAD_M)
+    assert parts is not None
+    together = LedKernel(parts.whole, parts).spread(coverage, roi, [edges], 1.0)
+    assert len(edges.rows) % 7 > 0
+    monkeypatch.setattr("vlcrender.rendering.led_blur.EDGE_PIXELS_AT_ONCE", 7)
+    assert np.array_equal(LedKernel(parts.whole, parts).spread(coverage, roi, [edges], 1.0), together)

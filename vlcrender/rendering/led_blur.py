@@ -28,6 +28,8 @@ BLUR_MARGIN_PX = 500
 """Distance from the sensor within which an LED's blur is computed, since it may light the sensor."""
 DEPTH_STEP = 0.005
 """Depths within this relative step share a kernel: 0.2 px of a defocus disc of 35 px. So do off-axis blurs."""
+EDGE_PIXELS_AT_ONCE = 500
+"""Edge pixels whose light is spread together: what they light takes a few megabytes at most."""
 MIN_DEPTH_M = 0.05
 MIN_SIGMA_PX = 1e-3
 """An off-axis blur narrower than this moves less light than one part of 64 across a pixel shows."""
@@ -70,10 +72,13 @@ class LedKernel:
         kernels, first = self.parts.deviations.reshape(n * n, m * m), self.radius_px - m // 2
         for edge in edges:
             excess = light_per_excess / n**2 * edge.excess.reshape(-1, n * n)
-            rows, columns = edge.rows - roi.row + first, edge.columns - roi.column + first
-            for row, column, of_pixel in zip(rows.tolist(), columns.tolist(), excess, strict=True):
+            rows, columns = (edge.rows - roi.row + first).tolist(), (edge.columns - roi.column + first).tolist()
+            for begin in range(0, len(rows), EDGE_PIXELS_AT_ONCE):
+                some = slice(begin, begin + EDGE_PIXELS_AT_ONCE)
                 # not `@`: the last bits of a matrix product may depend on threads and processor
-                result[row : row + m, column : column + m] += np.einsum("p,pq->q", of_pixel, kernels).reshape(m, m)
+                light_of = np.einsum("ep,pq->eq", excess[some], kernels).reshape(-1, m, m)
+                for row, column, added in zip(rows[some], columns[some], light_of, strict=True):
+                    result[row : row + m, column : column + m] += added
         return result
 
 

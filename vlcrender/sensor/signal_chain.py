@@ -27,6 +27,16 @@ def variance_e2(
     where its mean is at the full well or the upper limit of the ADC. Rounding adds gain^2 / 12, except where digital
     numbers are counts of electrons. Hot pixels, which are few, are left out: they hold less information.
     """
+    variance = np.empty(expected_e.shape)
+    for band in Roi(0, 0, *expected_e.shape).bands():
+        variance[band] = _variance_e2(sensor, expected_e[band], exposure_s, added_dn)
+    return variance
+
+
+def _variance_e2(
+    sensor: Sensor, expected_e: NDArray[np.float32], exposure_s: float, added_dn: float
+) -> NDArray[np.float64]:
+    """`variance_e2` of a few rows, which the cache holds."""
     gain, full = sensor.gain_at_iso_e_per_dn, sensor.noise == "full"
     mean = expected_e.astype(np.float64)
     level = mean + sensor.dark_electrons(exposure_s) if full else mean
