@@ -80,7 +80,8 @@ class LedImage:
     @property
     def weight(self) -> Array:
         """Relative illumination of each pixel."""
-        return _weight(self.posed, self.roi) if self.seen is None else self.seen.weight(self.roi)
+        seen = self.seen or SeenPixels(self.posed, self.roi)
+        return seen.weight(self.roi)
 
     @property
     def beam(self) -> Array | float:
@@ -200,9 +201,10 @@ def led_images(
             clear_fraction = float((image.coverage * share).sum() / image.coverage.sum())
             edges = edges and edges.times(share, image.roi)
         if clear_fraction > 0:
+            seen = SeenPixels(posed, image.roi)
             if edges is not None:
                 pattern = luminance_pattern(leds, i, posed, image.roi)
-                edges = edges.times(_weight(posed, image.roi) * pattern, image.roi)
+                edges = edges.times(seen.weight(image.roi) * pattern, image.roi)
             images[i] = LedImage(
                 leds=leds,
                 index=i,
@@ -212,7 +214,7 @@ def led_images(
                 visible_fraction=clear_fraction * image.visible_fraction,
                 imaged_fraction=clear_fraction * (1.0 if overscan else image.visible_fraction),
                 edges=edges,
-                seen=SeenPixels(posed, image.roi) if at_rest and leds.diffusers[i] is None else None,
+                seen=seen if at_rest and leds.diffusers[i] is None else None,
             )
     return images
 
@@ -277,11 +279,6 @@ def _max_pixel_width_m(roi: Roi, on_plane: Callable[[Array, Array], tuple[Array,
     v = np.linspace(roi.row + 0.5, roi.end_row - 0.5, GRID_POINTS)[:, None]
     sides = (on_plane(u - 0.5, v), on_plane(u + 0.5, v)), (on_plane(u, v - 0.5), on_plane(u, v + 0.5))
     return max(float(np.abs(b - a).max()) for before, after in sides for a, b in zip(before, after, strict=True))
-
-
-def _weight(posed: PosedCamera, roi: Roi) -> Array:
-    """Relative illumination of each pixel of a region."""
-    return _in_bands(roi, partial(relative_illumination, posed.camera))
 
 
 def _in_bands(roi: Roi, function: Callable[[Array, Array], Array]) -> Array:

@@ -39,9 +39,10 @@ class SeenPixels:
 
     @cached_property
     def _weight(self) -> Array:
-        weight: Array = np.broadcast_to(
-            relative_illumination(self.posed.camera, *self.roi.centers_px()), self.roi.shape
-        )
+        u, v = self.roi.centers_px()
+        weight = np.empty(self.roi.shape)
+        for band in self.roi.bands():
+            weight[band] = relative_illumination(self.posed.camera, u, v[band])
         return weight
 
 
