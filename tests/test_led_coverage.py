@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from vlcrender.camera.distortion import Distortion
 from vlcrender.camera.intrinsics import Camera, Pose
 from vlcrender.camera.posed_camera import PosedCamera
+from vlcrender.camera.roi import Roi
 from vlcrender.core.planar_shapes import Disc, Rectangle, circle_polygon_area, rectangle_polygon_area
 from vlcrender.rendering.led_coverage import (
     CoverageBlocks,
@@ -392,3 +393,17 @@ def test_no_pixel_at_a_disc_s_edge_is_left_out() -> None:
         quads = np.stack([[x[row + i, column + j], y[row + i, column + j]] for i, j in corners]).transpose(2, 0, 1)
         assert disc.shared_area(quads).max() < 1e-12
         assert np.count_nonzero(mixed) < 2 * 8 * 7.005  # a circle of radius r enters at most about 8 r cells
+
+
+@pytest.mark.parametrize("shape", [Disc(1.0), Rectangle((2.0, 2.0)), Rectangle((2.0, 2.0), yaw_deg=30.0)])
+@pytest.mark.parametrize("width_px", [40, 400])
+@pytest.mark.parametrize("tilt_deg", [0.0, 6.0])
+def test_a_face_that_fills_the_sensor_covers_all_of_every_pixel(
+    shape: Disc | Rectangle, width_px: int, tilt_deg: float
+) -> None:
+    camera = Camera(width_px=width_px, height_px=width_px * 3 // 4, pixel_pitch_um=4800 / width_px)
+    posed = PosedCamera(camera, Pose((1.0, 1.0, 1.0), tilt_x_deg=tilt_deg))
+    image = coverage_of_led(posed, LedFace(np.array([1.0, 1.0, 2.5]), shape))
+    assert image is not None
+    assert image.roi == Roi.of_sensor(camera)
+    assert np.array_equal(image.coverage, np.ones(image.roi.shape))

@@ -113,7 +113,7 @@ class Rectangle:
                 mixed &= ~_corner_extreme(beyond, np.logical_and)
         mixed &= ~whole
         for own in (x, y):  # only a cell with a corner beyond the horizon is as large as that
-            if np.ptp(own) >= BEYOND_HORIZON_M / 2:
+            if own.size and np.ptp(own) >= BEYOND_HORIZON_M / 2:
                 mixed[mixed] = np.ptp(corners_of_cells(own, mixed), axis=-1) < BEYOND_HORIZON_M / 2
         return whole, mixed
 
