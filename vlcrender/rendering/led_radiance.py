@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from vlcrender.camera.intrinsics import Camera
 from vlcrender.camera.posed_camera import PosedCamera
 from vlcrender.camera.roi import LedRegions, Roi
-from vlcrender.camera.vignetting import relative_illumination
 from vlcrender.core.backend import dr, exact_math
 from vlcrender.core.planar_shapes import Disc, Rectangle
 from vlcrender.rendering.diffuser_light import light_of_diffuser
@@ -116,16 +115,14 @@ class LedImage:
         """Light of each pixel, (rows, columns): `unit` in one that the LED fills at its mean luminance on the axis."""
         if self.leds.diffusers[self.index] is not None:
             return next(light_of_diffusers([self], [unit], precision))
-        camera, coverage, profile = self.posed.camera, self.coverage, self.face.profile
+        coverage, weight, profile = self.coverage, self.weight, self.face.profile
         pattern = _pattern(self.leds, self.index, self.posed, self.roi)
         u, v = self.roi.centers_px()
         light = np.empty(self.roi.shape, dtype=precision)
-        known = None if self.seen is None else self.weight
         for band in self.roi.bands():
             luminance = 1.0 if pattern is None else pattern(u, v[band])
             luminance = luminance * (profile if isinstance(profile, float) else profile[band])
-            weight = relative_illumination(camera, u, v[band]) if known is None else known[band]
-            light[band] = unit * coverage[band] * weight * luminance
+            light[band] = unit * coverage[band] * weight[band] * luminance
         return light
 
 
